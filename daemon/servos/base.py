@@ -1,0 +1,41 @@
+"""The interface of every servo backend, and its errors."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from daemon.records import Goal, Reading
+
+
+class ServoError(Exception):
+    """The servos can't be used: port missing or busy, a servo absent or set up wrongly.
+
+    The message lists everything that was found wrong, one line each, with what mends it.
+    """
+
+
+class Servos(Protocol):
+    """Joints of the hand, in current-based position mode.
+
+    ``connect`` checks and never stiffens or moves the hand. ``read`` and ``write`` are called
+    once a tick; a failed exchange is told by ``valid`` and the counters, not by an exception,
+    unless the port itself is gone.
+    """
+
+    def connect(self) -> None:
+        """Open and check everything. Raises ServoError with the whole list of what is wrong."""
+
+    def read(self, reading: Reading) -> None:
+        """Fill ``reading`` in place; ``valid`` is False and the numbers keep when it failed."""
+
+    def set_torque(self, on: bool) -> None:
+        """Torque on (goal first set to the present angle) or off. Raises ServoError on failure."""
+
+    def write(self, goal: Goal) -> None:
+        """Send the goal angle and the current bound of each joint."""
+
+    def counters(self) -> dict[str, int]:
+        """Exchanges that went wrong since connect, by kind: ``timeouts``, ``crc``, …"""
+
+    def close(self) -> None:
+        """Torque off as far as the bus allows, then close. Never raises."""

@@ -1,0 +1,218 @@
+"""Settings: TOML in, one validated `Settings` out, or one report with everything that is wrong.
+
+Holds the sections with their defaults, bounds and units, and nothing that acts on them. The
+defaults alone are the built-in simulated hand; ``config/sim.toml`` spells them out. Lengths are m,
+angles rad, currents A, rates Hz; pairs are (left, right).
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Finger = Literal["left", "right"]
+
+
+class SettingsError(Exception):
+    """The settings can't be used. The message lists every error: file, key, found, expected."""
+
+
+class Section(BaseModel):
+    """What all sections share: unknown keys are errors, values are not converted, nothing changes.
+
+    A whole number is accepted where a float is asked for; a string never is.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class Scene(Section):
+    """What takes part. A backend set to ``none`` takes the servos or the sensors out."""
+
+    fingers: Annotated[list[Finger], Field(min_length=1, max_length=2)] = ["left", "right"]
+    object_model: bool = True  # estimate the object's angle and width from the two contacts
+
+
+class Hand(Section):
+    """Two rotational fingers in a plane: pivots at (∓pivot_separation/2, 0), q > 0 closes."""
+
+    pivot_separation: Positive = 0.100
+    finger_length: Positive = 0.080
+    finger_offset: Finite = 0.0
+    q_min: tuple[Finite, Finite] = (-0.5, -0.5)
+    q_max: tuple[Finite, Finite] = (1.0, 1.0)
+    open_angle: tuple[Finite, Finite] = (0.0, 0.0)  # where release goes
+
+
+class Tip(Section):
+    """The soft hemispherical fingertip."""
+
+    radius: Positive = 0.020
+
+
+class MaterialLaw(Section):
+    """Stress-strain law of the tip: the paper's Table I, a constant modulus, or measured points."""
+
+    law: Literal["table_i", "constant", "points"] = "table_i"
+    modulus: Positive = 0.304e6  # Pa, for law = "constant"
+    strain: list[Finite] = []  # for law = "points"
+    stress: list[Finite] = []  # Pa, for law = "points"
+
+
+class Table(Section):
+    """The contact table: largest relative error of force, energy and their partials."""
+
+    tolerance: Annotated[float, Field(ge=1e-13, le=1e-2)] = 1e-9
+
+
+class ServoSettings(Section):
+    """The joints."""
+
+    backend: Literal["simulated", "dynamixel", "none"] = "simulated"
+    port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
+    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000
+    model: str = "XM430-W350"
+    ids: tuple[Annotated[int, Field(ge=0, le=252)], Annotated[int, Field(ge=0, le=252)]] = (1, 2)
+    direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
+    zero: tuple[int, int] = (2048, 2048)  # counts at q = 0
+    gear_ratio: Positive = 1.0  # servo turns for one joint turn
+    reply_timeout: Positive = 0.004  # s, a missing reply costs no more
+    fault_after: Positive = 0.05  # s without a good exchange → fault
+    watchdog: NonNegative = 0.1  # s, the servo's own bus watchdog; 0 leaves it off
+
+
+class TactileSettings(Section):
+    """The pressure grids under the tips."""
+
+    backend: Literal["simulated", "flexitac", "none"] = "simulated"
+    port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")
+    baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
+    rows: Annotated[int, Field(ge=4, le=256)] = 44
+    cols: Annotated[int, Field(ge=4, le=256)] = 44
+    pitch: Positive = 0.058 / 44
+    centre: tuple[Finite, Finite] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
+    pascal_per_count: Positive = 4.0
+    rate: Positive = 100.0  # frames a second that are expected
+    noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
+    open_timeout: Positive = 2.0  # s to wait for a first good frame
+
+
+class EstimatorSettings(Section):
+    """How d and θ come from a frame."""
+
+    method: Literal["moments", "ml"] = "ml"
+    free_gain: bool = False  # estimate measured/modelled pressure too
+
+
+class Loop(Section):
+    """The tick. ``virtual`` runs as fast as the machine can and needs simulated backends."""
+
+    rate: Annotated[float, Field(ge=10, le=5000)] = 500.0
+    clock: Literal["real", "virtual"] = "real"
+
+
+class Stream(Section):
+    """The publisher. A topic's rate is exact: every n-th tick."""
+
+    address: str = "tcp://127.0.0.1:9872"
+    state_rate: Positive = 100.0
+    tactile_rate: Positive = 25.0
+    queue: Annotated[int, Field(ge=1, le=100_000)] = 200  # messages kept for a slow subscriber
+
+
+class CommandSettings(Section):
+    """The command server."""
+
+    address: str = "tcp://127.0.0.1:9873"
+    lease: Positive = 2.0  # s a commander keeps the hand after its last command
+    max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
+
+
+class Control(Section):
+    """Gains and rates of the control law; each default was chosen in simulation."""
+
+    torque_constant: Positive = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
+    approach_speed: Positive = 0.3  # rad/s
+    move_speed: Positive = 1.0  # rad/s
+    contact_force: Positive = 0.5  # N at which a finger counts as touching
+    force_default: Positive = 5.0  # N, grasp without force=
+    force_bandwidth: Positive = 1.0  # Hz of the force integral
+    rotate_bandwidth: Positive = 0.5  # Hz of the angle integral
+    rotate_speed: Positive = 0.3  # rad/s of the object's angle target
+    joint_stiffness: Positive = 6.0  # N·m/rad, on the antisymmetric motion
+    joint_damping: NonNegative = 0.15  # N·m·s/rad
+
+
+class Safety(Section):
+    """Limits. The goal is bounded by them; crossing a hard one latches a fault."""
+
+    current_max: Positive = 1.2  # A
+    current_move: Positive = 0.4  # A, while nothing is grasped
+    force_max: Positive = 30.0  # N
+    d_max: Positive = 0.012  # m
+    theta_margin: NonNegative = 0.05  # rad kept from the domain's limit
+    velocity_max: Positive = 6.0  # rad/s
+    frame_age_hold: Positive = 3.0  # frame periods: goals freeze
+    frame_age_fault: Positive = 10.0  # frame periods: fault
+    overruns_fault: Annotated[int, Field(ge=1)] = 100  # ticks late in a row → fault
+
+
+class ObjectSettings(Section):
+    """What the daemon assumes of the object."""
+
+    width: Positive = 0.040
+
+
+class Simulation(Section):
+    """The plant behind simulated backends and the emulator; these defaults are our own choice."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    object_mass: Positive = 0.10  # kg
+    object_width: Positive = 0.040
+    object_height: Positive = 0.060
+    object_position: tuple[Finite, Finite] = (0.0, 0.080)  # m, in the hand's plane
+    object_angle: Finite = 0.0
+    gravity: tuple[Finite, Finite] = (0.0, 0.0)  # m/s² in the plane: the hand lies on a table
+    table_friction: NonNegative = 0.3  # Coulomb, object on the table it lies on
+    tip_friction: NonNegative = 0.6  # Coulomb, tip on object
+    modulus_scale: Positive = 1.0  # the real tip over the settings' material
+    tactile_noise: NonNegative = 1520.0  # Pa a cell
+    tactile_delay: NonNegative = 0.010  # s from the middle of a scan to its arrival
+
+
+class Task(Section):
+    """What the daemon does by itself after start."""
+
+    name: Literal["none", "demo"] = "none"
+    force: Positive = 8.0
+    angle: Finite = 0.14
+
+
+class Settings(Section):
+    """All sections. ``Settings()`` is the built-in simulated hand."""
+
+    scene: Scene = Scene()
+    hand: Hand = Hand()
+    tip: Tip = Tip()
+    material: MaterialLaw = MaterialLaw()
+    table: Table = Table()
+    servos: ServoSettings = ServoSettings()
+    tactile: TactileSettings = TactileSettings()
+    estimator: EstimatorSettings = EstimatorSettings()
+    loop: Loop = Loop()
+    stream: Stream = Stream()
+    commands: CommandSettings = CommandSettings()
+    control: Control = Control()
+    safety: Safety = Safety()
+    object: ObjectSettings = ObjectSettings()
+    simulation: Simulation = Simulation()
+    task: Task = Task()

@@ -1,0 +1,1 @@
+"""The simulated hand: its physics, and its servos and tactile boards as bytes on ptys."""

@@ -1,0 +1,27 @@
+"""The interface of every tactile backend, and its errors."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from daemon.records import Frame
+
+
+class TactileError(Exception):
+    """The sensor can't be used: port missing, busy, silent, or a grid of another size."""
+
+
+class TactileSensor(Protocol):
+    """The pressure grid under one fingertip. Reading runs outside the tick."""
+
+    def open(self) -> None:
+        """Open the sensor and wait for a first good frame. Raises TactileError if none comes."""
+
+    def latest(self) -> Frame | None:
+        """The newest complete frame, or None before the first. The same object until a newer came."""
+
+    def counters(self) -> dict[str, int]:
+        """What went by or went wrong since open: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
+
+    def close(self) -> None:
+        """Stop reading and close. Never raises."""
