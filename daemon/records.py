@@ -1,7 +1,8 @@
 """The plain records that the pipeline's stages hand to each other, and nothing else.
 
-Per-finger arrays have length 2, left finger first; a finger that the scene lacks stays 0 and is
-flagged by ``valid``. SI units. Positive joint angle closes. ``t`` is the clock's time in seconds.
+Per-finger arrays and lists have length 2, left finger first; a finger that the scene lacks stays 0
+and is flagged by ``valid``. SI units. Positive joint angle closes. ``t`` is the clock's time in
+seconds.
 """
 
 from __future__ import annotations
@@ -45,6 +46,35 @@ class Frame:
 
 
 @dataclass(slots=True)
+class Contact:
+    """What one fingertip feels: the estimate from its newest frame and the table's answer to it."""
+
+    seq: int = 0  # of the frame
+    t: float = 0.0  # when that frame was sampled [s]
+    valid: bool = False  # a frame has come and its estimate is sound
+    contact: bool = False  # something touches the tip
+    d: float = 0.0  # maximum displacement [m]
+    theta: float = 0.0  # the object's angle in the tip's frame, in the hand's plane [rad]
+    tilt_y: float = 0.0  # and across it [rad]
+    d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
+    theta_std: float = 0.0
+    gain: float = 1.0  # measured pressure over modelled pressure
+    force: float = 0.0  # F(d, θ) [N]
+    energy: float = 0.0  # U(d, θ) [J]
+    inside: bool = True  # (d, θ) lies inside the model's domain
+    q: float = 0.0  # the finger's joint angle when the frame was sampled [rad]
+
+
+@dataclass(slots=True)
+class ObjectPose:
+    """The object's angle [rad] and width [m], from the two contacts."""
+
+    valid: bool = False
+    angle: float = 0.0
+    width: float = 0.0
+
+
+@dataclass(slots=True)
 class Goal:
     """What the servos shall do. Filled in place by the control law, bounded by safety."""
 
@@ -53,3 +83,34 @@ class Goal:
     valid: bool = False
     q: FloatArray = field(default_factory=_pair)  # goal angle [rad]
     current: FloatArray = field(default_factory=_pair)  # bound on the current's magnitude [A]
+
+
+@dataclass(slots=True)
+class Timing:
+    """What the loop knows about its own ticks [s]."""
+
+    tick_s: float = 0.0  # from this tick's start to the last one's
+    compute_s: float = 0.0  # work of the last tick
+    wake_late_s: float = 0.0  # this tick's start after its deadline
+    overruns: int = 0  # ticks whose work outlasted the period
+
+
+def _contacts() -> list[Contact]:
+    return [Contact(), Contact()]
+
+
+@dataclass(slots=True)
+class State:
+    """All of the above for one tick: what is published."""
+
+    seq: int = 0
+    t: float = 0.0
+    wall: float = 0.0  # Unix time [s]
+    mode: str = "disarmed"
+    fault: str = ""
+    torque: bool = False
+    reading: Reading = field(default_factory=Reading)
+    contacts: list[Contact] = field(default_factory=_contacts)
+    object: ObjectPose = field(default_factory=ObjectPose)
+    goal: Goal = field(default_factory=Goal)
+    timing: Timing = field(default_factory=Timing)

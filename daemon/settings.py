@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -38,7 +38,7 @@ class Section(BaseModel):
 class Scene(Section):
     """What takes part. A backend set to ``none`` takes the servos or the sensors out."""
 
-    fingers: Annotated[list[Finger], Field(min_length=1, max_length=2)] = ["left", "right"]
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, max_length=2)] = ("left", "right")
     object_model: bool = True  # estimate the object's angle and width from the two contacts
 
 
@@ -64,8 +64,8 @@ class MaterialLaw(Section):
 
     law: Literal["table_i", "constant", "points"] = "table_i"
     modulus: Positive = 0.304e6  # Pa, for law = "constant"
-    strain: list[Finite] = []  # for law = "points"
-    stress: list[Finite] = []  # Pa, for law = "points"
+    strain: tuple[Finite, ...] = ()  # for law = "points"
+    stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
 
 
 class Table(Section):
@@ -216,3 +216,120 @@ class Settings(Section):
     object: ObjectSettings = ObjectSettings()
     simulation: Simulation = Simulation()
     task: Task = Task()
+
+
+def load(path: Path | None = None, directory: Path | None = None) -> Settings:
+    """Read and check a profile; None gives the built-in simulated hand.
+
+    ``directory`` replaces ``{dir}`` in the ports. Raises SettingsError with one line for every
+    unknown key, wrong type and broken bound.
+    """
+    name = str(path) if path else "built-in settings"
+    try:
+        text = path.read_text(encoding="utf-8") if path else ""
+        raw = tomllib.loads(text)
+    except OSError as error:
+        raise SettingsError(f"{name}: can't be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{name}: not TOML: {error}") from None
+    data = _tuples(raw)
+    problems: list[str] = []
+    try:
+        settings = Settings.model_validate(data)
+    except ValidationError as error:
+        problems = [_line(name, details) for details in error.errors()]
+    else:
+        problems = [f"{name}: {problem}" for problem in _contradictions(settings, directory)]
+    if problems:
+        raise SettingsError("\n".join(problems))
+    return settings if directory is None else _with_directory(settings, directory)
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def _line(name: str, details: ErrorDetails) -> str:
+    location = [str(part) for part in details["loc"]]
+    key = ".".join(location)
+    if details["type"] == "extra_forbidden":
+        known = _known_keys(location[:-1])
+        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
+        return f"{name}: {key}: found an unknown key, expected a known one; nearest: {near[0]}"
+    expected = details["msg"].removeprefix("Input should ").removeprefix("be ")
+    expected = expected.removeprefix("Tuple should have ").replace(" after validation", "")
+    expected = expected.replace("a valid tuple", "an array").replace("a valid ", "a ")
+    return f"{name}: {key}: found {_shown(details['input'])}, expected {expected}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_shown(item) for item in value) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _known_keys(location: list[str]) -> list[str]:
+    model: type[BaseModel] = Settings
+    for part in location:
+        inner = model.model_fields[part].annotation
+        assert isinstance(inner, type) and issubclass(inner, BaseModel)
+        model = inner
+    return list(model.model_fields)
+
+
+def _contradictions(settings: Settings, directory: Path | None) -> list[str]:
+    """What each key allows but all of them together don't."""
+    found = []
+    scene, hand, material = settings.scene, settings.hand, settings.material
+    if len(set(scene.fingers)) != len(scene.fingers):
+        found.append(f"scene.fingers: found {_shown(scene.fingers)}, expected each finger once")
+    if settings.servos.backend == "none" and settings.tactile.backend == "none":
+        found.append("servos.backend, tactile.backend: found none and none, expected at least one")
+    for index, finger in enumerate(("left", "right")):
+        low, open_, high = hand.q_min[index], hand.open_angle[index], hand.q_max[index]
+        if not low < high:
+            found.append(f"hand.q_max: found {high:g} for {finger}, expected above q_min {low:g}")
+        elif not low <= open_ <= high:
+            found.append(
+                f"hand.open_angle: found {open_:g} for {finger}, expected {low:g} to {high:g}"
+            )
+    if settings.servos.ids[0] == settings.servos.ids[1] and len(scene.fingers) == 2:
+        found.append(f"servos.ids: found {_shown(settings.servos.ids)}, expected two different ids")
+    if material.law == "points" and len(material.strain) != len(material.stress):
+        found.append(
+            f"material.stress: found {len(material.stress)} numbers, "
+            f"expected {len(material.strain)} as in material.strain"
+        )
+    simulated = {settings.servos.backend, settings.tactile.backend} <= {"simulated", "none"}
+    if settings.loop.clock == "virtual" and not simulated:
+        found.append('loop.clock: found "virtual", expected "real" with hardware backends')
+    ports = []
+    if settings.servos.backend == "dynamixel":
+        ports.append(("servos.port", settings.servos.port))
+    if settings.tactile.backend not in ("simulated", "none"):
+        ports += [("tactile.port", port) for port in settings.tactile.port]
+    if directory is None:
+        found += [
+            f"{key}: found {_shown(port)}, expected --dir to say which folder {{dir}} is"
+            for key, port in ports
+            if "{dir}" in port
+        ]
+    return found
+
+
+def _with_directory(settings: Settings, directory: Path) -> Settings:
+    def filled(port: str) -> str:
+        return port.replace("{dir}", str(directory))
+
+    left, right = settings.tactile.port
+    servos = settings.servos.model_copy(update={"port": filled(settings.servos.port)})
+    tactile = settings.tactile.model_copy(update={"port": (filled(left), filled(right))})
+    return settings.model_copy(update={"servos": servos, "tactile": tactile})

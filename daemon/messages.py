@@ -1,0 +1,133 @@
+"""What goes over the wire: records in, msgpack maps out, and the schema's number.
+
+A map has string keys. A field that is a float is always sent as a float, a field is never left out,
+and fields are only ever added. SI units.
+
+``hand/state``
+    ``schema, seq, timestamp`` (Unix s), ``mono_ns, mode, fault, torque, tick_s, compute_s,
+    wake_late_s, overruns``; under ``left`` and ``right``: ``valid`` (the finger takes part and its
+    numbers are fresh), ``q`` [rad], ``dq`` [rad/s], ``current`` [A], ``goal_q`` [rad],
+    ``goal_current`` [A], ``d`` [m], ``theta`` [rad], ``tilt_y`` [rad], ``force`` [N],
+    ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq, frame_age_s``;
+    under ``object``: ``valid, angle`` [rad], ``width`` [m].
+``hand/tactile``
+    ``schema, seq, timestamp, finger, rows, cols, pitch`` [m], ``unit`` (``"count"``), ``scale``
+    (Pa a count), ``data``: rows × cols little-endian uint16, row-major.
+``hand/event``
+    ``schema, seq, timestamp, mono_ns, level`` (``info``, ``warning``, ``error``), ``kind, text``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+
+from daemon.records import FINGERS, Contact, Frame, State
+
+SCHEMA = 1
+STATE = b"hand/state"
+TACTILE = b"hand/tactile"
+EVENT = b"hand/event"
+
+pack = msgpack.Packer(use_bin_type=True).pack
+
+
+def state_message(state: State, fingers: tuple[bool, bool]) -> dict[str, Any]:
+    """The ``hand/state`` map. ``fingers``: which ones take part in the scene."""
+    timing = state.timing
+    reading = state.reading
+    joints = zip(
+        reading.q.tolist(),
+        reading.dq.tolist(),
+        reading.current.tolist(),
+        state.goal.q.tolist(),
+        state.goal.current.tolist(),
+        strict=True,
+    )
+    left, right = (
+        _finger(state, contact, joint, taking_part)
+        for contact, joint, taking_part in zip(state.contacts, joints, fingers, strict=True)
+    )
+    return {
+        "schema": SCHEMA,
+        "seq": state.seq,
+        "timestamp": state.wall,
+        "mono_ns": int(state.t * 1e9),
+        "mode": state.mode,
+        "fault": state.fault,
+        "torque": state.torque,
+        "tick_s": timing.tick_s,
+        "compute_s": timing.compute_s,
+        "wake_late_s": timing.wake_late_s,
+        "overruns": timing.overruns,
+        "left": left,
+        "right": right,
+        "object": {
+            "valid": state.object.valid,
+            "angle": state.object.angle,
+            "width": state.object.width,
+        },
+    }
+
+
+def _finger(
+    state: State,
+    contact: Contact,
+    joint: tuple[float, float, float, float, float],
+    taking_part: bool,
+) -> dict[str, Any]:
+    q, dq, current, goal_q, goal_current = joint
+    return {
+        "valid": taking_part and (state.reading.valid or contact.valid),
+        "q": q,
+        "dq": dq,
+        "current": current,
+        "goal_q": goal_q,
+        "goal_current": goal_current,
+        "d": contact.d,
+        "theta": contact.theta,
+        "tilt_y": contact.tilt_y,
+        "force": contact.force,
+        "energy": contact.energy,
+        "d_std": contact.d_std,
+        "theta_std": contact.theta_std,
+        "gain": contact.gain,
+        "contact": contact.contact,
+        "frame_seq": contact.seq,
+        "frame_age_s": state.t - contact.t if contact.seq else 0.0,
+    }
+
+
+def tactile_message(
+    frame: Frame, finger: int, pitch: float, scale: float, wall: float
+) -> dict[str, Any]:
+    """The ``hand/tactile`` map of one finger's frame; ``wall`` is the Unix time it was sampled."""
+    rows, cols = frame.data.shape
+    return {
+        "schema": SCHEMA,
+        "seq": frame.seq,
+        "timestamp": wall,
+        "finger": FINGERS[finger],
+        "rows": rows,
+        "cols": cols,
+        "pitch": pitch,
+        "unit": "count",
+        "scale": scale,
+        "data": frame.data.astype("<u2", copy=False).tobytes(),
+    }
+
+
+def event_message(
+    seq: int, wall: float, t: float, level: str, kind: str, text: str
+) -> dict[str, Any]:
+    """The ``hand/event`` map."""
+    return {
+        "schema": SCHEMA,
+        "seq": seq,
+        "timestamp": wall,
+        "mono_ns": int(t * 1e9),
+        "level": level,
+        "kind": kind,
+        "text": text,
+    }

@@ -1,0 +1,56 @@
+"""Binding the daemon's sockets so that a second daemon is told and nobody's socket is taken."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from typing import Any
+
+import zmq
+
+
+class AddressError(Exception):
+    """A socket can't be bound: the address is in use or can't be had."""
+
+
+class Bound:
+    """A bound ZeroMQ socket and, for ipc, the lock file that keeps the address ours.
+
+    libzmq replaces an ipc file that another process listens on without a word, hence the lock.
+    """
+
+    def __init__(self, context: zmq.Context[Any], kind: int, address: str, key: str) -> None:
+        self._lock = -1
+        if address.startswith("ipc://"):
+            self._lock = _lock(address.removeprefix("ipc://"), address, key)
+        self.socket: zmq.Socket[Any] = context.socket(kind)
+        self.socket.setsockopt(zmq.LINGER, 200)
+        try:
+            self.socket.bind(address)
+        except zmq.ZMQError as error:
+            self.close()
+            if error.errno == zmq.EADDRINUSE:
+                raise AddressError(
+                    f"{key}: {address} is in use; is another softfinger running?"
+                ) from None
+            raise AddressError(f"{key}: can't bind {address}: {error}") from None
+
+    def close(self) -> None:
+        """Close the socket and give the address back."""
+        self.socket.close()
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+
+def _lock(path: str, address: str, key: str) -> int:
+    try:
+        descriptor = os.open(path + ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise AddressError(f"{key}: can't bind {address}: {error}") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise AddressError(f"{key}: {address} is in use; is another softfinger running?") from None
+    return descriptor

@@ -1,0 +1,68 @@
+"""The publisher: two-frame messages ``[topic, msgpack map]`` on an XPUB socket.
+
+A subscriber that comes late, stops reading or dies changes nothing here: sends never wait, and a
+slow subscriber's queue is bounded, beyond which its messages are dropped. Topics that nobody
+subscribes to are not packed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import zmq
+
+from daemon import messages
+from daemon.records import Frame, State
+from daemon.sockets import Bound
+
+
+class Publisher:
+    """Publishes state, tactile frames and events. One thread, the loop's, may call it."""
+
+    def __init__(self, context: zmq.Context[Any], address: str, queue: int) -> None:
+        self._bound = Bound(context, zmq.XPUB, address, "stream.address")
+        self._socket = self._bound.socket
+        self._socket.setsockopt(zmq.SNDHWM, queue)
+        self._subscriptions: set[bytes] = set()
+        self.wants_state = False
+        self.wants_tactile = False
+        self._events = 0
+
+    def refresh(self) -> None:
+        """Learn who came and went. XPUB tells a topic's first subscriber and its last one gone."""
+        while self._socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:  # type: ignore[operator]
+            change = self._socket.recv(zmq.NOBLOCK)
+            if change[:1] == b"\x01":
+                self._subscriptions.add(change[1:])
+            else:
+                self._subscriptions.discard(change[1:])
+        self.wants_state = self._wanted(messages.STATE)
+        self.wants_tactile = self._wanted(messages.TACTILE)
+
+    def _wanted(self, topic: bytes) -> bool:
+        return any(topic.startswith(prefix) for prefix in self._subscriptions)
+
+    def state(self, state: State, fingers: tuple[bool, bool]) -> None:
+        """Publish ``hand/state``."""
+        self._send(messages.STATE, messages.state_message(state, fingers))
+
+    def tactile(self, frame: Frame, finger: int, pitch: float, scale: float, wall: float) -> None:
+        """Publish one finger's frame on ``hand/tactile``."""
+        self._send(messages.TACTILE, messages.tactile_message(frame, finger, pitch, scale, wall))
+
+    def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
+        """Publish ``hand/event``."""
+        self._events += 1
+        message = messages.event_message(self._events, wall, t, level, kind, text)
+        self._send(messages.EVENT, message)
+
+    def _send(self, topic: bytes, message: dict[str, Any]) -> None:
+        try:
+            self._socket.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
+            self._socket.send(messages.pack(message), zmq.NOBLOCK)
+        except zmq.Again:
+            pass  # XPUB drops rather than waits; should libzmq ever refuse, the loop goes on
+
+    def close(self) -> None:
+        """Send what is queued (for 0.2 s at most) and close."""
+        self._bound.close()
