@@ -103,6 +103,7 @@ class TactileSettings(Section):
     pascal_per_count: Positive = 4.0
     rate: Positive = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
+    latency: NonNegative = 0.005  # s from the middle of a scan to the first byte on the wire
     open_timeout: Positive = 2.0  # s to wait for a first good frame
 
 
@@ -280,7 +281,8 @@ def _known_keys(location: list[str]) -> list[str]:
     model: type[BaseModel] = Settings
     for part in location:
         inner = model.model_fields[part].annotation
-        assert isinstance(inner, type) and issubclass(inner, BaseModel)
+        assert isinstance(inner, type)
+        assert issubclass(inner, BaseModel)
         model = inner
     return list(model.model_fields)
 
