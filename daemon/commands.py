@@ -37,7 +37,7 @@ class CommandServer:
 
     def serve(self, handler: Handler) -> bool:
         """Answer one waiting command through ``handler``; False when nobody waits."""
-        if not self._socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:  # type: ignore[operator]
+        if not self._bound.readable():
             return False
         frames = self._socket.recv_multipart(zmq.NOBLOCK)
         # A REQ socket sends [identity, empty, payload]. Without the empty frame, as from a DEALER,

@@ -51,6 +51,7 @@ class Contact:
 
     seq: int = 0  # of the frame
     t: float = 0.0  # when that frame was sampled [s]
+    t_arrival: float = 0.0  # and when it was complete here [s]
     valid: bool = False  # a frame has come and its estimate is sound
     contact: bool = False  # something touches the tip
     d: float = 0.0  # maximum displacement [m]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from typing import Any
+from typing import Any, cast
 
 import zmq
 
@@ -34,6 +34,10 @@ class Bound:
                     f"{key}: {address} is in use; is another softfinger running?"
                 ) from None
             raise AddressError(f"{key}: can't bind {address}: {error}") from None
+
+    def readable(self) -> bool:
+        """A message waits. Half a microsecond; no system call unless something happened."""
+        return bool(cast(int, self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
     def close(self) -> None:
         """Close the socket and give the address back."""

@@ -30,7 +30,7 @@ class Publisher:
 
     def refresh(self) -> None:
         """Learn who came and went. XPUB tells a topic's first subscriber and its last one gone."""
-        while self._socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:  # type: ignore[operator]
+        while self._bound.readable():
             change = self._socket.recv(zmq.NOBLOCK)
             if change[:1] == b"\x01":
                 self._subscriptions.add(change[1:])

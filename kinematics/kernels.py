@@ -41,7 +41,8 @@ def fast_kernel(function: Function) -> Function:
 
 
 def _compile(function: Function, fastmath: bool | set[str]) -> Function:
-    dispatcher = numba.njit(cache=True, error_model="numpy", fastmath=fastmath)(function)
+    compiler = numba.njit(cache=True, error_model="numpy", fastmath=fastmath)
+    dispatcher: Any = compiler(function)
     # Numba compares this stamp with the one it saved; it offers no public way to widen it.
     index = dispatcher._cache._cache_file
     index._source_stamp = source_digest(Path(inspect.getfile(function)))

@@ -1,0 +1,192 @@
+"""From settings to a running daemon: builds, connects and warms up everything, in the safe order.
+
+Sockets are bound first, so that a second daemon ends before it has touched any hardware. Kernels are
+compiled and warm before the loop exists, and so before torque can be on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import zmq
+
+from daemon.clock import Clock, RealClock, VirtualClock
+from daemon.commands import CommandServer
+from daemon.loop import EventSink, Loop
+from daemon.perception import FingerPerception, JointHistory, ObjectPerception
+from daemon.records import FINGERS, Contact, ObjectPose
+from daemon.servos import make_servos
+from daemon.servos.base import Servos
+from daemon.settings import MaterialLaw, Settings, SettingsError
+from daemon.stream import Publisher
+from daemon.tactile import make_sensor
+from kinematics.contact import Fingertip
+from kinematics.estimator import ContactEstimator
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+from kinematics.table import ContactTable
+
+
+class Daemon:
+    """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
+
+    Raises SettingsError, AddressError, ServoError or TactileError when it can't be made ready;
+    whatever was opened until then is closed again.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        on_event: EventSink | None = None,
+        wire: bool = True,
+        table_cache: Path | None = None,
+    ) -> None:
+        self.settings = settings
+        self.clock: Clock = VirtualClock() if settings.loop.clock == "virtual" else RealClock()
+        self._closers: list[Callable[[], None]] = []
+        try:
+            self._assemble(on_event, wire, table_cache)
+        except BaseException:
+            self.close()
+            raise
+
+    def _assemble(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
+        settings = self.settings
+        publisher, server = self._bind() if wire else (None, None)
+        self.material = make_material(settings.material)
+        self.table = make_table(settings, self.material, cache)
+        self.hand = None
+        if "simulated" in (settings.servos.backend, settings.tactile.backend):
+            from daemon.simulation.hand import SimulatedHand
+
+            self.hand = SimulatedHand(settings, self.clock.now())
+        self.servos = make_servos(settings, self.clock, self.hand)
+        perceptions = self._make_perceptions()
+        objects = None
+        if settings.scene.object_model and len(perceptions) == 2 and self.servos is not None:
+            objects = ObjectPerception(settings)
+        warm_up(settings, perceptions, objects)
+        if self.servos is not None:
+            self._connect(self.servos)
+        for perception in perceptions:
+            self._closers.append(perception.sensor.close)
+            perception.sensor.open()
+        self.loop = Loop(
+            settings, self.clock, self.servos, perceptions, objects, publisher, server, on_event
+        )
+
+    def _bind(self) -> tuple[Publisher, CommandServer]:
+        context: zmq.Context[Any] = zmq.Context()
+        self._closers.append(context.term)
+        stream, commands = self.settings.stream, self.settings.commands
+        publisher = Publisher(context, stream.address, stream.queue)
+        self._closers.append(publisher.close)
+        server = CommandServer(context, commands.address, commands.max_bytes)
+        self._closers.append(server.close)
+        return publisher, server
+
+    def _make_perceptions(self) -> list[FingerPerception]:
+        settings = self.settings
+        tactile = settings.tactile
+        made = []
+        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+            sensor = make_sensor(settings, self.clock, self.hand, finger)
+            if sensor is None:
+                continue
+            estimator = make_estimator(settings, self.material)
+            made.append(
+                FingerPerception(finger, sensor, estimator, self.table, tactile.pascal_per_count)
+            )
+        return made
+
+    def _connect(self, servos: Servos) -> None:
+        self._closers.append(servos.close)
+        servos.connect()
+
+    def close(self) -> None:
+        """Torque off, then everything closed, last opened first. Never raises."""
+        while self._closers:
+            self._closers.pop()()
+
+    def __enter__(self) -> Daemon:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def make_material(law: MaterialLaw) -> Material:
+    """The settings' stress-strain law. Raises SettingsError when the points are no such law."""
+    if law.law == "constant":
+        return Material.constant(law.modulus)
+    if law.law == "table_i":
+        return Material.table_i()
+    try:
+        return Material.from_points(np.array(law.strain), np.array(law.stress))
+    except ValueError as error:
+        raise SettingsError(f"material.strain, material.stress: {error}") from None
+
+
+def make_table(settings: Settings, material: Material, cache: Path | None) -> ContactTable:
+    """The contact table, from its file in ``cache`` where one fits."""
+    tip = Fingertip(radius=settings.tip.radius)
+    tolerance = settings.table.tolerance
+    if cache is None:
+        return ContactTable.build(tip, material, tolerance=tolerance)
+    return ContactTable.load_or_build(cache, tip, material, tolerance=tolerance)
+
+
+def make_grid(settings: Settings) -> SensorGrid:
+    """The sensor's cells."""
+    tactile = settings.tactile
+    return SensorGrid(
+        rows=tactile.rows, cols=tactile.cols, pitch=tactile.pitch, centre=tactile.centre
+    )
+
+
+def make_estimator(settings: Settings, material: Material) -> ContactEstimator:
+    """An estimator of its own for each finger, since it starts from its last estimate."""
+    return ContactEstimator(
+        Fingertip(radius=settings.tip.radius),
+        material,
+        make_grid(settings),
+        noise=settings.tactile.noise,
+        method=settings.estimator.method,
+        free_gain=settings.estimator.free_gain,
+    )
+
+
+def warm_up(
+    settings: Settings, perceptions: list[FingerPerception], objects: ObjectPerception | None
+) -> None:
+    """Run every kernel of the loop once on a made-up contact, on estimators' scratch alone."""
+    if not perceptions:
+        return
+    tactile = settings.tactile
+    pressure = make_grid(settings).pressure(
+        Fingertip(radius=settings.tip.radius),
+        make_material(settings.material),
+        0.1 * settings.tip.radius,
+        0.1,
+        0.0,
+    )
+    counts = np.clip(np.round(pressure / tactile.pascal_per_count), 0, 65535).astype(np.uint16)
+    contacts = [Contact(), Contact()]
+    for perception in perceptions:
+        for frame in (counts, counts, np.zeros_like(counts)):
+            perception.estimate(frame, contacts[perception.finger])
+    if objects is not None:
+        for contact in contacts:
+            contact.valid = contact.contact = True
+        objects.update(contacts, ObjectPose())
+    JointHistory(0.1, 0.01).append(0.0, [0.0, 0.0])

@@ -1,0 +1,263 @@
+"""The control law's modes: commands in, one goal for the servos a tick out.
+
+Holds what each mode does and when it passes into the next. Which command is heard when stands in
+`daemon.modes`, the grip law in `daemon.grip`, limits that must not be trusted to a control law in
+`daemon.safety`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from daemon.commands import Refused
+from daemon.grip import Grip, Joints
+from daemon.modes import Command, Mode
+from daemon.records import FINGERS, Contact, Goal, ObjectPose, Reading
+from daemon.settings import Settings
+
+Event = tuple[str, str, str]  # level, kind, text
+
+_REACH = 0.35  # rad beyond the present angle: far enough that the servo's current bound decides
+_ARRIVED = 0.03  # rad from the goal
+_GRACE = 1.0  # s after the ramp's end in which a joint that friction holds may still arrive
+_SETTLED_FORCE = 0.03  # share of the force target
+_SETTLED_ANGLE = 0.5 * math.pi / 180.0
+_SETTLED_FOR = 0.2  # s
+_LOST_AFTER = 0.1  # s without contact in a grip
+
+
+class Control:
+    """Modes and their laws. ``command`` and ``step`` are called from the loop's thread only."""
+
+    def __init__(self, settings: Settings, has_servos: bool, has_sensors: bool) -> None:
+        self._settings = settings
+        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self._has_servos = has_servos
+        self._has_sensors = has_sensors
+        self._grip = Grip(settings)
+        self.mode = Mode.DISARMED
+        self.torque = False  # what the servos' torque shall be
+        self.events: list[Event] = []
+        self._joints = Joints([0.0, 0.0], [0.0, 0.0])
+        self._contacts = [Contact(), Contact()]
+        self._pose = ObjectPose()
+        self._goal_q = [0.0, 0.0]  # where the ramps have come to
+        self._target_q = [0.0, 0.0]  # where they go
+        self._touching = [False, False]
+        self._gripping = False
+        self._since = 0.0  # time in the present mode [s]
+        self._waiting = 0.0  # s since the ramps ended, or the grip has been settled
+        self._lost = 0.0  # s without contact in a grip
+
+    # Commands
+
+    def command(self, command: Command) -> dict[str, Any]:
+        """Carry out a command that `modes.parse` let through. Raises Refused with the reason."""
+        getattr(self, f"_{command.name}")(command.numbers)
+        return {"mode": self.mode.value}
+
+    def fail(self, reason: str) -> None:
+        """Latch a fault: torque off until ``clear``."""
+        self._enter(Mode.FAULT)
+        self.torque = False
+        self.events.append(("error", "fault", reason))
+
+    def _arm(self, _: dict[str, float]) -> None:
+        if not self._has_servos:
+            raise Refused("arm: this scene has no servos")
+        self._hold_here()
+        self.torque = True
+        self._enter(Mode.ARMED)
+
+    def _disarm(self, _: dict[str, float]) -> None:
+        self.torque = False
+        self._enter(Mode.DISARMED)
+
+    def _stop(self, _: dict[str, float]) -> None:
+        self.torque = False
+        if self.mode is not Mode.FAULT:
+            self._enter(Mode.DISARMED)
+
+    def _clear(self, _: dict[str, float]) -> None:
+        self._enter(Mode.DISARMED)
+
+    def _status(self, _: dict[str, float]) -> None:
+        pass
+
+    def _tare(self, _: dict[str, float]) -> None:
+        if not self._has_sensors:
+            raise Refused("tare: this scene has no tactile sensors")
+
+    def _move(self, numbers: dict[str, float]) -> None:
+        if not numbers:
+            raise Refused("move: left or right is missing")
+        hand = self._settings.hand
+        for name, q in numbers.items():
+            index = FINGERS.index(name)
+            if index not in self._fingers:
+                raise Refused(f"move: this scene has no {name} finger")
+            low, high = hand.q_min[index], hand.q_max[index]
+            if not low <= q <= high:
+                raise Refused(f"move: {name}: found {q:g} rad, expected {low:g} to {high:g}")
+        self._hold_here()
+        for name, q in numbers.items():
+            self._target_q[FINGERS.index(name)] = q
+        self._enter(Mode.MOVING)
+
+    def _grasp(self, numbers: dict[str, float]) -> None:
+        if not self._has_sensors:
+            raise Refused("grasp: each finger needs a tactile sensor in this scene")
+        force = numbers.get("force", self._settings.control.force_default)
+        low, high = self._settings.control.contact_force, 0.9 * self._settings.safety.force_max
+        if not low < force <= high:
+            raise Refused(f"grasp: force: found {force:g} N, expected above {low:g} to {high:g}")
+        if self._gripping:
+            self._grip.retarget(force)
+        else:
+            self._hold_here()
+            self._touching = [False, False]
+            self._grip.force_target = force
+        self._enter(Mode.GRASPING)
+
+    def _rotate(self, numbers: dict[str, float]) -> None:
+        if len(self._fingers) < 2 or not self._settings.scene.object_model:
+            raise Refused("rotate: needs both fingers and the object model in the scene")
+        angle = numbers["angle"]
+        bound = 0.5
+        if abs(angle) > bound:
+            raise Refused(
+                f"rotate: angle: found {angle:g} rad, expected −{bound:g} to {bound:g}"
+                " (a number with the unit, as 10deg, is taken in degrees by the command line)"
+            )
+        if not self._pose.valid:
+            raise Refused("rotate: the object's angle is not known")
+        self._grip.steer(self._pose.angle, angle)
+        self._enter(Mode.ROTATING)
+
+    def _release(self, _: dict[str, float]) -> None:
+        self._hold_here()
+        for index in self._fingers:
+            self._target_q[index] = self._settings.hand.open_angle[index]
+        self._gripping = False
+        self._enter(Mode.RELEASING)
+
+    def _enter(self, mode: Mode) -> None:
+        if mode is not self.mode:
+            self.events.append(("info", "mode", f"{self.mode.value} → {mode.value}"))
+        self.mode = mode
+        self._since = self._waiting = self._lost = 0.0
+        if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
+            self._gripping = False
+
+    def _hold_here(self) -> None:
+        self._goal_q = list(self._joints.q)
+        self._target_q = list(self._joints.q)
+
+    # One tick
+
+    def observe(self, reading: Reading, contacts: list[Contact], pose: ObjectPose) -> None:
+        """Take in what the servos and sensors said. Commands are carried out on this picture."""
+        self._joints = Joints(reading.q.tolist(), reading.dq.tolist())
+        self._contacts = contacts
+        self._pose = pose
+
+    def step(self, dt: float, goal: Goal) -> None:
+        """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
+        goal.valid = self.torque
+        if not self.torque:
+            return
+        self._since += dt
+        mode = self.mode
+        if mode is Mode.MOVING or mode is Mode.RELEASING:
+            self._travel(dt)
+        elif mode is Mode.GRASPING and not self._gripping:
+            self._approach(dt)
+        if self._gripping:
+            self._hold(dt, goal)
+        else:
+            bound = self._settings.safety.current_move
+            for index in self._fingers:
+                goal.q[index] = self._goal_q[index]
+                goal.current[index] = bound
+
+    def _travel(self, dt: float) -> None:
+        step = self._settings.control.move_speed * dt
+        if self._ramp(step):
+            return
+        self._waiting += dt
+        off = max(abs(self._joints.q[i] - self._target_q[i]) for i in self._fingers)
+        if off < _ARRIVED or self._waiting > _GRACE:
+            if off >= _ARRIVED:
+                text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
+                self.events.append(("warning", "short", text))
+            self._enter(Mode.ARMED)
+
+    def _ramp(self, step: float) -> bool:
+        """Move the goals one step toward their targets; False when all are there."""
+        going = False
+        for index in self._fingers:
+            left = self._target_q[index] - self._goal_q[index]
+            if left != 0.0:
+                going = True
+                self._goal_q[index] += min(max(left, -step), step)
+        return going
+
+    def _approach(self, dt: float) -> None:
+        """Close until every finger touches; a finger that touches waits for the other."""
+        law = self._settings.control
+        for index in self._fingers:
+            contact = self._contacts[index]
+            touches = contact.contact and contact.force > law.contact_force
+            if touches and not self._touching[index]:
+                self._goal_q[index] = self._joints.q[index]
+            self._touching[index] = touches
+            if not touches:
+                self._target_q[index] = self._settings.hand.q_max[index]
+            else:
+                self._target_q[index] = self._goal_q[index]
+        if all(self._touching[index] for index in self._fingers):
+            felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
+            self._gripping = True
+            self._grip.start(self._taking_part(), felt, self._grip.force_target)
+        elif not self._ramp(law.approach_speed * dt) and self._waited(dt) > _GRACE:
+            self.events.append(("warning", "grasp", "nothing to grasp within the joints' limits"))
+            self._hold_here()
+            self._enter(Mode.ARMED)
+
+    def _waited(self, dt: float) -> float:
+        self._waiting += dt
+        return self._waiting
+
+    def _hold(self, dt: float, goal: Goal) -> None:
+        contacts = [self._contacts[index] for index in self._fingers]
+        joints = self._taking_part()
+        torques = self._grip.torques(dt, joints, contacts, self._pose)
+        for index, q, torque in zip(self._fingers, joints.q, torques, strict=True):
+            current = torque / self._settings.control.torque_constant
+            goal.q[index] = q + math.copysign(_REACH, current)
+            goal.current[index] = abs(current)
+        self._watch_contact(dt, contacts)
+        self._watch_settling(dt, contacts)
+
+    def _watch_contact(self, dt: float, contacts: list[Contact]) -> None:
+        self._lost = 0.0 if all(contact.contact for contact in contacts) else self._lost + dt
+        if self._lost > _LOST_AFTER:
+            self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
+            self._hold_here()
+            self._enter(Mode.ARMED)
+
+    def _watch_settling(self, dt: float, contacts: list[Contact]) -> None:
+        if self.mode not in (Mode.GRASPING, Mode.ROTATING):
+            return
+        target = self._grip.force_target
+        settled = all(abs(c.force - target) < _SETTLED_FORCE * target for c in contacts)
+        if self.mode is Mode.ROTATING:
+            settled = abs(self._pose.angle - self._grip.angle_target) < _SETTLED_ANGLE
+        self._waiting = self._waiting + dt if settled else 0.0
+        if self._waiting > _SETTLED_FOR:
+            self._enter(Mode.HOLDING)
+
+    def _taking_part(self) -> Joints:
+        q, dq = self._joints
+        return Joints([q[i] for i in self._fingers], [dq[i] for i in self._fingers])

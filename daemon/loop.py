@@ -1,0 +1,271 @@
+"""The tick, and nothing else: read, feel, decide, bound, write, publish.
+
+The loop owns the order of the stages; the clock owns the time. Everything it calls has been built,
+connected and warmed up before (`daemon.assembly`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from daemon.clock import Clock
+from daemon.commands import CommandServer, Refused
+from daemon.control import Control
+from daemon.modes import Lease, parse
+from daemon.perception import FingerPerception, JointHistory, ObjectPerception
+from daemon.records import FINGERS, State
+from daemon.safety import Safety
+from daemon.servos.base import ServoError, Servos
+from daemon.settings import Settings
+from daemon.stream import Publisher
+from daemon.task import Task
+
+EventSink = Callable[[str, str, str], None]
+
+_REFRESH = 0.05  # s between two looks at who subscribes
+
+
+class Loop:
+    """Runs the pipeline on a clock. All of it happens in the thread that calls `run`."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        clock: Clock,
+        servos: Servos | None,
+        perceptions: list[FingerPerception],
+        objects: ObjectPerception | None,
+        publisher: Publisher | None,
+        server: CommandServer | None,
+        on_event: EventSink | None = None,
+    ) -> None:
+        self.state = State()
+        self.period = 1.0 / settings.loop.rate
+        self._settings = settings
+        self._clock = clock
+        self._servos = servos
+        self._perceptions = perceptions
+        self._objects = objects
+        self._publisher = publisher
+        self._server = server
+        self._on_event = on_event
+        self._control = Control(settings, servos is not None, bool(perceptions))
+        self._safety = Safety(settings, servos is not None, bool(perceptions))
+        self._lease = Lease(settings.commands.lease)
+        self._task = Task.named(settings.task)
+        self._history = JointHistory(0.5, self.period)
+        self._fingers = ("left" in settings.scene.fingers, "right" in settings.scene.fingers)
+        rate = settings.loop.rate
+        self._state_every = max(round(rate / settings.stream.state_rate), 1)
+        self._tactile_every = max(round(rate / settings.stream.tactile_rate), 1)
+        self._refresh_every = max(round(rate * _REFRESH), 1)
+        self._published = [0, 0]  # newest frame of each finger that went out
+        self._ending = False
+        self._stopping = False
+
+    # What may be asked from outside the tick, a signal handler included
+
+    def end(self) -> None:
+        """Leave `run` after this tick, with torque off."""
+        self._ending = True
+
+    def stop(self) -> None:
+        """Turn torque off at the next tick, as the command does."""
+        self._stopping = True
+
+    # Time
+
+    def run(self, duration: float | None = None) -> None:
+        """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards.
+
+        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst.
+        """
+        clock = self._clock
+        start = deadline = clock.now()
+        finish = None if duration is None else start + duration
+        self.state.reading.t = start
+        self.emit("info", "start", "running, disarmed")
+        last = start - self.period
+        try:
+            while not self._ending:
+                clock.sleep_until(deadline)
+                now = clock.now()
+                if finish is not None and now >= finish:
+                    break
+                timing = self.state.timing
+                timing.wake_late_s = now - deadline
+                timing.tick_s = now - last
+                last = now
+                self.tick(now)
+                done = clock.now()
+                timing.compute_s = done - now
+                deadline += self.period
+                if done > deadline:
+                    timing.overruns += 1
+                    self._safety.overruns_in_row += 1
+                    deadline = done
+                else:
+                    self._safety.overruns_in_row = 0
+        finally:
+            self._torque_off()
+            self.emit("info", "end", "ended, torque off")
+
+    # The tick
+
+    def tick(self, now: float) -> None:
+        """One pass of the pipeline at clock time ``now``."""
+        state = self.state
+        state.seq += 1
+        state.t = now
+        state.wall = self._clock.wall()
+        self._read(now)
+        self._feel()
+        self._decide()
+        self._write(now)
+        if self._publisher is not None:
+            self._publish(self._publisher)
+
+    def _read(self, now: float) -> None:
+        reading = self.state.reading
+        if self._servos is None:
+            return
+        try:
+            self._servos.read(reading)
+        except ServoError as error:
+            reading.valid = False
+            self._fail(str(error))
+        if reading.valid:
+            reading.t = now
+            self._history.append(now, reading.q.tolist())
+
+    def _feel(self) -> None:
+        new = False
+        for perception in self._perceptions:
+            contact = self.state.contacts[perception.finger]
+            new |= perception.update(contact, self._history)
+        if new and self._objects is not None:
+            self._objects.update(self.state.contacts, self.state.object)
+
+    def _decide(self) -> None:
+        state, control = self.state, self._control
+        control.observe(state.reading, state.contacts, state.object)
+        if self._stopping:
+            self._stopping = False
+            self.command({"command": "stop"})
+        if self._server is not None:
+            self._server.serve(self.command)
+        if self._task is not None:
+            request = self._task.next(state, self.period)
+            if request is not None:
+                self._try(request)
+        state.mode = control.mode
+        if control.torque:
+            cause = self._safety.cause(state)
+            if cause:
+                self._fail(cause)
+        if not self._safety.must_hold(state):
+            control.step(self.period, state.goal)
+        self._safety.bound(state.goal)
+        for event in control.events:
+            self.emit(*event)
+        control.events.clear()
+        state.mode = control.mode
+
+    def _write(self, now: float) -> None:
+        state, servos = self.state, self._servos
+        if servos is None:
+            return
+        wanted = self._control.torque
+        try:
+            if wanted != state.torque:
+                servos.set_torque(wanted)
+                state.torque = wanted
+            if state.torque and state.goal.valid:
+                state.goal.seq = state.seq
+                state.goal.t = now
+                servos.write(state.goal)
+        except ServoError as error:
+            self._fail(str(error))
+            self._torque_off()
+
+    def _publish(self, publisher: Publisher) -> None:
+        seq = self.state.seq
+        if seq % self._refresh_every == 0:
+            publisher.refresh()
+        if publisher.wants_state and seq % self._state_every == 0:
+            publisher.state(self.state, self._fingers)
+        if publisher.wants_tactile and seq % self._tactile_every == 0:
+            for perception in self._perceptions:
+                self._publish_frame(publisher, perception)
+
+    def _publish_frame(self, publisher: Publisher, perception: FingerPerception) -> None:
+        frame = perception.frame
+        if frame is None or frame.seq == self._published[perception.finger]:
+            return
+        self._published[perception.finger] = frame.seq
+        tactile = self._settings.tactile
+        wall = self.state.wall - (self.state.t - frame.t_sample)
+        publisher.tactile(frame, perception.finger, tactile.pitch, tactile.pascal_per_count, wall)
+
+    # Commands, events and faults
+
+    def command(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Carry out one request at the present tick. Raises Refused with the reason."""
+        control = self._control
+        command = parse(request, control.mode)
+        self._lease.take(command, self.state.t)
+        if command.name in ("arm", "clear"):
+            cause = self._safety.cause(self.state)
+            if cause:
+                raise Refused(f"{command.name}: {cause}")
+        reply = control.command(command)
+        if command.name == "tare":
+            for perception in self._perceptions:
+                perception.tare()
+        if command.name == "clear":
+            self.state.fault = ""
+        if command.name == "status":
+            reply |= self._status()
+        return reply
+
+    def _status(self) -> dict[str, Any]:
+        state = self.state
+        counters = {} if self._servos is None else {"servos": self._servos.counters()}
+        for perception in self._perceptions:
+            counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
+        return {
+            "fault": state.fault,
+            "torque": state.torque,
+            "seq": state.seq,
+            "overruns": state.timing.overruns,
+            "counters": counters,
+        }
+
+    def _try(self, request: dict[str, Any]) -> None:
+        try:
+            self.command(request)
+        except Refused as refusal:
+            self.emit("warning", "task", str(refusal))
+
+    def emit(self, level: str, kind: str, text: str) -> None:
+        """Publish an event and hand it to the log."""
+        if self._publisher is not None:
+            self._publisher.event(self.state.wall, self.state.t, level, kind, text)
+        if self._on_event is not None:
+            self._on_event(level, kind, text)
+
+    def _fail(self, reason: str) -> None:
+        if not self.state.fault:
+            self.state.fault = reason
+            self._control.fail(reason)
+
+    def _torque_off(self) -> None:
+        self._control.torque = False
+        if self._servos is None or not self.state.torque:
+            return
+        try:
+            self._servos.set_torque(False)
+            self.state.torque = False
+        except ServoError as error:
+            self.emit("error", "servos", f"torque could not be turned off: {error}")

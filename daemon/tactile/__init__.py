@@ -1,0 +1,29 @@
+"""Tactile backends by name. A backend's module is imported when a scene asks for it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daemon.clock import Clock
+from daemon.settings import Settings
+from daemon.tactile.base import TactileSensor
+
+if TYPE_CHECKING:
+    from daemon.simulation.hand import SimulatedHand
+
+
+def make_sensor(
+    settings: Settings, clock: Clock, hand: SimulatedHand | None, finger: int
+) -> TactileSensor | None:
+    """The settings' backend for one finger, not yet open; None when the scene has no sensors."""
+    backend = settings.tactile.backend
+    if backend == "simulated":
+        from daemon.tactile.simulated import SimulatedTactile
+
+        assert hand is not None
+        return SimulatedTactile(settings, hand, clock, finger)
+    if backend == "flexitac":
+        from daemon.tactile.flexitac import FlexiTac
+
+        return FlexiTac(settings.tactile, clock, finger)
+    return None

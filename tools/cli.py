@@ -1,0 +1,46 @@
+"""The command line: parses which subcommand is meant and hands over to its module.
+
+A subcommand's module is imported only when it is called, and has two functions:
+``add_arguments(parser)`` and ``run(arguments) -> exit status``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+SUBCOMMANDS = {
+    "run": "run the daemon; without a config, on the built-in simulated hand",
+    "emulate": "a stand-in hand in a process of its own: servos and tactile boards on ptys",
+    "send": "send one command to the running daemon",
+    "monitor": "live terminal page of the running daemon",
+    "bench": "measure run time, beside what a user would otherwise pick",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of ``softfinger``; returns the exit status."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog="softfinger",
+        description="Two rotational fingers with soft tips: daemon and tools.",
+    )
+    # Only the subcommand that is called is imported, for its arguments and for its work.
+    called = next((word for word in words if word in SUBCOMMANDS), None)
+    subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
+    module = None
+    for name, text in SUBCOMMANDS.items():
+        subparser = subparsers.add_parser(name, help=text, description=text)
+        if name == called:
+            module = importlib.import_module(f"tools.{name}")
+            module.add_arguments(subparser)
+    arguments = parser.parse_args(words)
+    assert module is not None  # argparse has refused everything else
+    status: int = module.run(arguments)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

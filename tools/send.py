@@ -1,0 +1,58 @@
+"""``softfinger send COMMAND [key=value …]``: one command to the daemon, its reply as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from typing import Any
+
+from daemon.commands import NoAnswer, send
+from daemon.settings import CommandSettings
+
+_EPILOG = """\
+commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
+stop, clear, status. Numbers are SI; an angle may carry its unit, as in angle=10deg.
+Exit status: 0 done, 1 refused, 2 no answer or not understood here."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``send``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("command", metavar="COMMAND")
+    parser.add_argument("values", metavar="key=value", nargs="*")
+    parser.add_argument("--address", default=CommandSettings().address, help="command socket")
+    parser.add_argument("--client", default="", help="name that owns the commander's lease")
+    parser.add_argument("--timeout", type=float, default=2.0, metavar="S")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Send, print the reply, tell by the exit status whether it was carried out."""
+    request: dict[str, Any] = {"command": arguments.command}
+    if arguments.client:
+        request["client"] = arguments.client
+    for word in arguments.values:
+        key, separator, text = word.partition("=")
+        value = _value(text)
+        if not separator or value is None:
+            print(f"send: found {word!r}, expected key=number", file=sys.stderr)
+            return 2
+        request[key] = value
+    try:
+        reply = send(arguments.address, request, arguments.timeout)
+    except NoAnswer as error:
+        print(f"send: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(reply, ensure_ascii=False))
+    return 0 if reply.get("ok") else 1
+
+
+def _value(text: str) -> float | None:
+    degrees = text.endswith("deg")
+    try:
+        number = float(text.removesuffix("deg"))
+    except ValueError:
+        return None
+    return math.radians(number) if degrees else number
