@@ -188,6 +188,11 @@ class Simulation(Section):
     modulus_scale: Positive = 1.0  # the real tip over the settings' material
     tactile_noise: NonNegative = 1520.0  # Pa a cell
     tactile_delay: NonNegative = 0.010  # s from the middle of a scan to its arrival
+    tip_loss: NonNegative = 0.002  # s, the tip's damping over its stiffness
+    joint_inertia: Positive = 0.010  # kg·m² at the joint: finger and reflected rotor
+    joint_damping: NonNegative = 0.02  # N·m·s/rad
+    joint_friction: NonNegative = 0.05  # N·m, Coulomb
+    compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only
 
 
 class Task(Section):
