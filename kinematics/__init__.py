@@ -2,3 +2,8 @@
 
 Pure mathematics: no input or output, no clock, no thread, no settings.
 """
+
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+
+__all__ = ["Fingertip", "Material"]
