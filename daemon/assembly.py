@@ -1,7 +1,7 @@
 """From settings to a running daemon: builds, connects and warms up everything, in the safe order.
 
-Sockets are bound first, so that a second daemon ends before it has touched any hardware. Kernels are
-compiled and warm before the loop exists, and so before torque can be on.
+Sockets are bound first, so that a second daemon ends before it has touched any hardware. Kernels
+are compiled and warm before the loop exists, and so before torque can be on.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class Command:
 
 
 def parse(request: dict[str, Any], mode: Mode) -> Command:
-    """Check a decoded request against the table. Raises Refused with what was found and expected."""
+    """Check a decoded request against the table. Raises Refused with found and expected."""
     name = request["command"]
     if name not in COMMANDS:
         raise Refused(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")

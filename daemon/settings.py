@@ -270,7 +270,11 @@ def _line(name: str, details: ErrorDetails) -> str:
         return f"{name}: {key}: found an unknown key, expected a known one; nearest: {near[0]}"
     expected = details["msg"].removeprefix("Input should ").removeprefix("be ")
     expected = expected.removeprefix("Tuple should have ").replace(" after validation", "")
-    expected = expected.replace("a valid tuple", "an array").replace("a valid ", "a ")
+    expected = (
+        expected.replace("a valid tuple", "an array")
+        .replace("a valid integer", "a whole number")
+        .replace("a valid ", "a ")
+    )
     return f"{name}: {key}: found {_shown(details['input'])}, expected {expected}"
 
 

@@ -1,0 +1,75 @@
+"""The transition table: what is heard when, and how a request must look."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from daemon.commands import Refused
+from daemon.modes import COMMANDS, Command, Lease, Mode, parse
+
+
+def heard(mode: Mode) -> set[str]:
+    return {name for name, (modes, _) in COMMANDS.items() if mode in modes}
+
+
+def test_stop_and_status_are_heard_in_every_mode() -> None:
+    assert all({"stop", "status"} <= heard(mode) for mode in Mode)
+
+
+def test_nothing_moves_the_hand_before_it_is_armed_or_in_a_fault() -> None:
+    assert heard(Mode.DISARMED) == {"arm", "disarm", "tare", "stop", "status"}
+    assert heard(Mode.FAULT) == {"clear", "stop", "status"}
+
+
+def test_a_good_request_is_parsed() -> None:
+    request = {"command": "grasp", "force": 5, "client": "notebook"}
+    assert parse(request, Mode.ARMED) == Command("grasp", {"force": 5.0}, "notebook")
+    assert parse({"command": "grasp"}, Mode.HOLDING) == Command("grasp", {}, "")
+
+
+@pytest.mark.parametrize(
+    ("request_", "mode", "text"),
+    [
+        ({"command": "jump"}, Mode.ARMED, "unknown command 'jump'; known: arm, disarm"),
+        ({"command": "grasp", "froce": 1.0}, Mode.ARMED, "unknown parameter 'froce'; expected fo"),
+        ({"command": "arm", "force": 1.0}, Mode.DISARMED, "expected no parameters"),
+        ({"command": "grasp", "force": "much"}, Mode.ARMED, "expected a number, found str"),
+        ({"command": "grasp", "force": True}, Mode.ARMED, "expected a number, found bool"),
+        ({"command": "grasp", "force": float("nan")}, Mode.ARMED, "finite number, found nan"),
+        ({"command": "rotate"}, Mode.HOLDING, "rotate: angle is missing"),
+        ({"command": "grasp"}, Mode.DISARMED, "grasp: not while disarmed; arm first"),
+        ({"command": "arm"}, Mode.FAULT, "arm: not while fault; clear the fault first"),
+        ({"command": "rotate", "angle": 0.1}, Mode.ARMED, "possible while holding, rotating"),
+        ({"command": "arm", "client": 7}, Mode.DISARMED, "client: expected a text"),
+        ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),
+    ],
+)
+def test_a_bad_request_is_refused_with_found_and_expected(
+    request_: dict[str, Any], mode: Mode, text: str
+) -> None:
+    with pytest.raises(Refused) as caught:
+        parse(request_, mode)
+    assert text in str(caught.value)
+
+
+def test_one_commander_at_a_time() -> None:
+    lease = Lease(2.0)
+    lease.take(Command("arm", {}, "a"), 0.0)
+    with pytest.raises(Refused, match=r"grasp: a commands the hand \(1\.0 s\)"):
+        lease.take(Command("grasp", {}, "b"), 1.0)
+    lease.take(Command("stop", {}, "b"), 1.0)
+    lease.take(Command("status", {}, ""), 1.0)
+    lease.take(Command("grasp", {}, "a"), 1.0)
+    with pytest.raises(Refused):
+        lease.take(Command("grasp", {}, "b"), 2.9)
+    lease.take(Command("grasp", {}, "b"), 3.0)
+
+
+def test_clients_without_a_name_share_one_lease() -> None:
+    lease = Lease(2.0)
+    lease.take(Command("arm", {}, ""), 0.0)
+    lease.take(Command("grasp", {}, ""), 0.1)
+    with pytest.raises(Refused, match="an unnamed client commands"):
+        lease.take(Command("grasp", {}, "a"), 0.2)
