@@ -5,5 +5,6 @@ Pure mathematics: no input or output, no clock, no thread, no settings.
 
 from kinematics.contact import Fingertip
 from kinematics.material import Material
+from kinematics.table import ContactTable
 
-__all__ = ["Fingertip", "Material"]
+__all__ = ["ContactTable", "Fingertip", "Material"]

@@ -199,9 +199,7 @@ class Material:
             rows.append(second)
             rows.append([value * j for j, value in enumerate(second)][1:] or [Fraction(0)])
         order = max(len(row) for row in rows)
-        return np.stack(
-            [self._expand([*row, *[Fraction(0)] * (order - len(row))]) for row in rows]
-        )
+        return np.stack([self._expand([*row, *[Fraction(0)] * (order - len(row))]) for row in rows])
 
     def _expand(self, polynomial: Sequence[Fraction]) -> FloatArray:
         """Expand a polynomial in ε about the pieces' starts, in u = ε·pieces − k; exact, rounded."""
