@@ -29,10 +29,8 @@ class CommandServer:
     """Answers at most one command a tick. Anything malformed gets a refusal, never an exception."""
 
     def __init__(self, context: zmq.Context[Any], address: str, max_bytes: int) -> None:
-        self._bound = Bound(context, zmq.ROUTER, address, "commands.address")
+        self._bound = Bound(context, zmq.ROUTER, address, "commands.address", _QUEUE)
         self._socket = self._bound.socket
-        self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
-        self._socket.setsockopt(zmq.SNDHWM, _QUEUE)
         self._max_bytes = max_bytes
 
     def serve(self, handler: Handler) -> bool:

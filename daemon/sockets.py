@@ -19,12 +19,17 @@ class Bound:
     libzmq replaces an ipc file that another process listens on without a word, hence the lock.
     """
 
-    def __init__(self, context: zmq.Context[Any], kind: int, address: str, key: str) -> None:
+    def __init__(
+        self, context: zmq.Context[Any], kind: int, address: str, key: str, queue: int
+    ) -> None:
         self._lock = -1
         if address.startswith("ipc://"):
             self._lock = _lock(address.removeprefix("ipc://"), address, key)
         self.socket: zmq.Socket[Any] = context.socket(kind)
         self.socket.setsockopt(zmq.LINGER, 200)
+        # A bound on the queues holds only for connections made after it was set, so before bind.
+        self.socket.setsockopt(zmq.SNDHWM, queue)
+        self.socket.setsockopt(zmq.RCVHWM, queue)
         try:
             self.socket.bind(address)
         except zmq.ZMQError as error:

@@ -20,9 +20,8 @@ class Publisher:
     """Publishes state, tactile frames and events. One thread, the loop's, may call it."""
 
     def __init__(self, context: zmq.Context[Any], address: str, queue: int) -> None:
-        self._bound = Bound(context, zmq.XPUB, address, "stream.address")
+        self._bound = Bound(context, zmq.XPUB, address, "stream.address", queue)
         self._socket = self._bound.socket
-        self._socket.setsockopt(zmq.SNDHWM, queue)
         self._subscriptions: set[bytes] = set()
         self.wants_state = False
         self.wants_tactile = False

@@ -1,0 +1,126 @@
+"""Command server and client on real sockets."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.commands import CommandServer, NoAnswer, Refused, decode, send
+from daemon.sockets import AddressError
+
+
+def echo(request: dict[str, Any]) -> dict[str, Any]:
+    if request["command"] == "no":
+        raise Refused("not now")
+    return {"heard": request["command"]}
+
+
+@pytest.fixture
+def server(context: zmq.Context[Any], addresses: tuple[str, str]) -> Iterator[CommandServer]:
+    server = CommandServer(context, addresses[1], max_bytes=200)
+    stop = threading.Event()
+
+    def serve() -> None:
+        while not stop.is_set():
+            server.serve(echo)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield server
+    stop.set()
+    thread.join()
+    server.close()
+
+
+def ask(address: str, payload: bytes) -> dict[str, Any]:
+    context: zmq.Context[Any] = zmq.Context()
+    socket = context.socket(zmq.REQ)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.connect(address)
+    socket.send(payload)
+    assert socket.poll(5000)
+    reply = msgpack.unpackb(socket.recv())
+    socket.close()
+    context.term()
+    assert isinstance(reply, dict)
+    return reply
+
+
+def test_a_plain_req_socket_gets_its_answer(
+    server: CommandServer, addresses: tuple[str, str]
+) -> None:
+    assert send(addresses[1], {"command": "arm"}) == {"ok": True, "heard": "arm"}
+    assert send(addresses[1], {"command": "no"}) == {"ok": False, "error": "not now"}
+
+
+@pytest.mark.parametrize(
+    ("payload", "error"),
+    [
+        (b"", "not msgpack"),
+        (b"\xc1\xff", "not msgpack"),
+        (msgpack.packb([1, 2]), "expected a map, found list"),
+        (msgpack.packb({"force": 1.0}), 'expected a text under "command"'),
+        (msgpack.packb({"command": 7}), 'expected a text under "command"'),
+        (msgpack.packb({"command": "arm", 3: 4}), "not msgpack"),
+        (msgpack.packb({"command": "x" * 300}), "bytes; at most 200"),
+    ],
+)
+def test_malformed_commands_are_refused_and_the_server_lives_on(
+    server: CommandServer, addresses: tuple[str, str], payload: bytes, error: str
+) -> None:
+    reply = ask(addresses[1], payload)
+    assert reply["ok"] is False
+    assert error in reply["error"]
+    assert ask(addresses[1], msgpack.packb({"command": "arm"}))["ok"] is True
+
+
+def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
+    server: CommandServer, context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    socket = context.socket(zmq.DEALER)
+    socket.connect(addresses[1])
+    socket.send_multipart([b"", b"a", b"b", b"c"])
+    assert socket.poll(5000)
+    assert msgpack.unpackb(socket.recv_multipart()[-1])["ok"] is False
+    socket.send(msgpack.packb({"command": "arm"}))
+    socket.close(linger=1000)
+    assert send(addresses[1], {"command": "arm"})["ok"] is True
+
+
+def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
+    with pytest.raises(NoAnswer, match="is softfinger running"):
+        send(addresses[1], {"command": "arm"}, timeout=0.05)
+
+
+@given(st.binary(max_size=64))
+@settings(max_examples=300, deadline=None)
+def test_random_bytes_are_decoded_or_refused(payload: bytes) -> None:
+    try:
+        request = decode(payload)
+    except Refused:
+        return
+    assert isinstance(request["command"], str)
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+def test_a_second_server_on_the_same_address_is_told(
+    context: zmq.Context[Any],
+    addresses: tuple[str, str],
+    tmp_path_factory: pytest.TempPathFactory,
+    transport: str,
+) -> None:
+    address = addresses[1]
+    if transport == "ipc":
+        address = f"ipc://{tmp_path_factory.mktemp('s')}/c"
+    first = CommandServer(context, address, 200)
+    with pytest.raises(AddressError, match="is another softfinger running"):
+        CommandServer(context, address, 200)
+    first.close()
+    CommandServer(context, address, 200).close()

@@ -1,0 +1,163 @@
+"""The publisher on a real socket: shapes and types on the wire, and subscribers of every kind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from daemon.messages import SCHEMA, state_message
+from daemon.records import Contact, Frame, State
+from daemon.stream import Publisher
+from tests.conftest import until
+
+BOTH = (True, True)
+FINGER_FLOATS = (
+    *("q", "dq", "current", "goal_q", "goal_current", "d", "theta", "tilt_y", "force", "energy"),
+    *("d_std", "theta_std", "gain", "frame_age_s"),
+)
+
+
+def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zmq.Socket[Any]:
+    socket = context.socket(zmq.SUB)
+    socket.setsockopt(zmq.SUBSCRIBE, topic)
+    socket.connect(address)
+    return socket
+
+
+def receive(socket: zmq.Socket[Any]) -> tuple[bytes, dict[str, Any]]:
+    assert socket.poll(5000)
+    topic, payload = socket.recv_multipart()
+    return topic, msgpack.unpackb(payload)
+
+
+def refreshed(publisher: Publisher) -> bool:
+    publisher.refresh()
+    return publisher.wants_state
+
+
+def test_state_has_every_field_of_the_public_face_with_its_type() -> None:
+    message = msgpack.unpackb(msgpack.packb(state_message(State(), (True, False))))
+    assert set(message) == {
+        *("schema", "seq", "timestamp", "mono_ns", "mode", "fault", "torque"),
+        *("tick_s", "compute_s", "wake_late_s", "overruns", "left", "right", "object"),
+    }
+    for key in ("timestamp", "tick_s", "compute_s", "wake_late_s"):
+        assert isinstance(message[key], float), key
+    for finger in ("left", "right"):
+        part = message[finger]
+        assert set(FINGER_FLOATS) | {"valid", "contact", "frame_seq"} == set(part)
+        assert all(isinstance(part[key], float) for key in FINGER_FLOATS)
+        assert isinstance(part["contact"], bool)
+    assert message["object"] == {"valid": False, "angle": 0.0, "width": 0.0}
+    assert message["schema"] == SCHEMA
+
+
+def test_a_finger_that_takes_no_part_keeps_its_shape_and_is_not_valid() -> None:
+    state = State()
+    state.reading.valid = True
+    message = state_message(state, (True, False))
+    assert message["left"].keys() == message["right"].keys()
+    assert message["left"]["valid"] is True
+    assert message["right"]["valid"] is False
+
+
+def test_frame_age_counts_from_the_sample() -> None:
+    state = State(t=3.0, contacts=[Contact(seq=4, t=2.96), Contact()])
+    message = state_message(state, BOTH)
+    assert message["left"]["frame_age_s"] == pytest.approx(0.04)
+    assert message["right"]["frame_age_s"] == 0.0
+
+
+def test_tactile_data_is_little_endian_uint16_row_major(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=10)
+    socket = subscribe(context, addresses[0], b"hand/tactile")
+    until(lambda: (publisher.refresh(), publisher.wants_tactile)[1])
+    assert not publisher.wants_state
+    data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+    publisher.tactile(Frame(7, 1.0, 1.1, True, data), 1, 0.002, 4.0, 99.0)
+    topic, message = receive(socket)
+    assert topic == b"hand/tactile"
+    assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
+    assert message == {
+        "schema": SCHEMA,
+        "seq": 7,
+        "timestamp": 99.0,
+        "finger": "right",
+        "rows": 3,
+        "cols": 4,
+        "pitch": 0.002,
+        "unit": "count",
+        "scale": 4.0,
+    }
+    publisher.close()
+
+
+def test_topics_nobody_subscribes_to_are_not_wanted(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=10)
+    publisher.refresh()
+    assert not publisher.wants_state
+    socket = subscribe(context, addresses[0], b"hand")
+    until(lambda: refreshed(publisher))
+    assert publisher.wants_tactile
+    socket.close()
+    until(lambda: not refreshed(publisher))
+    publisher.close()
+
+
+def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=50)
+    stuck = context.socket(zmq.SUB)
+    stuck.setsockopt(zmq.RCVHWM, 10)
+    stuck.setsockopt(zmq.RCVBUF, 4096)
+    stuck.setsockopt(zmq.SUBSCRIBE, b"")
+    stuck.connect(addresses[0])
+    reading = subscribe(context, addresses[0], b"hand/state")
+    until(lambda: refreshed(publisher))
+    state = State()
+    for seq in range(20_000):
+        state.seq = seq
+        publisher.state(state, BOTH)  # would never return if it waited for the stuck one
+        while reading.poll(0):
+            reading.recv_multipart()
+    kept = 0
+    while stuck.poll(200):
+        stuck.recv_multipart()
+        kept += 1
+    assert kept < 20_000, "the stuck subscriber's queue has no bound"
+    publisher.close()
+
+
+def test_a_late_subscriber_gets_what_is_published_from_then_on(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=10)
+    for seq in range(100):
+        publisher.state(State(seq=seq), BOTH)
+    late = subscribe(context, addresses[0], b"hand/state")
+    until(lambda: refreshed(publisher))
+    publisher.state(State(seq=100), BOTH)
+    assert receive(late)[1]["seq"] == 100
+    publisher.close()
+
+
+def test_events_are_numbered(context: zmq.Context[Any], addresses: tuple[str, str]) -> None:
+    publisher = Publisher(context, addresses[0], queue=10)
+    socket = subscribe(context, addresses[0])
+    until(lambda: refreshed(publisher))
+    publisher.event(5.0, 2.5, "info", "mode", "disarmed → armed")
+    topic, message = receive(socket)
+    assert topic == b"hand/event"
+    assert message["seq"] == 1
+    assert message["mono_ns"] == 2_500_000_000
+    assert (message["level"], message["kind"]) == ("info", "mode")
+    publisher.close()
