@@ -1,0 +1,153 @@
+"""A publisher and command server on real sockets, with a hand that is nothing but formulas.
+
+For tests of those who look at the stream from outside: everything here is chosen by the test.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from typing import Any
+
+import msgpack
+import numpy as np
+import zmq
+
+
+def finger(t: float, side: int) -> dict[str, Any]:
+    force = 10.0 + 2.0 * math.sin(1.3 * t + side)
+    return {
+        "valid": True,
+        "q": 0.42 + 0.02 * side,
+        "dq": 0.1 * math.cos(t),
+        "current": 0.213,
+        "goal_q": 0.44,
+        "goal_current": 0.35,
+        "d": 3.21e-3 + 0.1e-3 * side,
+        "theta": math.radians(5.0) * math.sin(0.5 * t) * (1 - 2 * side),
+        "force": force,
+        "energy": 12.34e-3,
+        "d_std": 0.02e-3,
+        "theta_std": math.radians(0.1),
+        "contact": True,
+        "frame_age_s": 0.012,
+    }
+
+
+def state(t: float, seq: int) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "seq": seq,
+        "timestamp": time.time(),
+        "mono_ns": time.monotonic_ns(),
+        "mode": "holding",
+        "fault": "",
+        "torque": True,
+        "tick_s": 0.002,
+        "compute_s": 11e-6,
+        "wake_late_s": 3e-6,
+        "overruns": 0,
+        "left": finger(t, 0),
+        "right": finger(t, 1),
+        "object": {"valid": True, "angle": math.radians(4.98), "width": 0.04},
+    }
+
+
+def frame(t: float, side: int, size: int = 44) -> dict[str, Any]:
+    y, x = np.mgrid[:size, :size] - (size - 1) / 2.0
+    x = x - 6.0 * math.sin(0.5 * t) * (1 - 2 * side)
+    shape = np.clip(1.0 - (x**2 + y**2) / 12.0**2, 0.0, None) * (45e3 / 4.0)
+    noise = np.random.default_rng(int(t * 1000)).normal(0.0, 380.0, shape.shape)
+    counts = np.clip(shape + noise, 0, 65535).astype("<u2")
+    return {
+        "schema": 1,
+        "seq": int(t * 25),
+        "timestamp": time.time(),
+        "finger": ("left", "right")[side],
+        "rows": size,
+        "cols": size,
+        "pitch": 0.058 / size,
+        "unit": "count",
+        "scale": 4.0,
+        "data": counts.tobytes(),
+    }
+
+
+def event(seq: int, kind: str, text: str, level: str = "info") -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "seq": seq,
+        "timestamp": time.time(),
+        "mono_ns": time.monotonic_ns(),
+        "level": level,
+        "kind": kind,
+        "text": text,
+    }
+
+
+class FakeDaemon:
+    """Publishes at 100 Hz (frames at 25 Hz) until closed. ``changes`` go into every state.
+
+    ``requests`` holds what the command socket was sent; ``replies`` maps a command to its reply.
+    """
+
+    def __init__(self) -> None:
+        self.changes: dict[str, Any] = {}
+        self.replies: dict[str, Any] = {}
+        self.requests: list[dict[str, Any]] = []
+        self.silent = threading.Event()
+        self._extra: list[list[bytes]] = []
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._publisher = self._context.socket(zmq.PUB)
+        self._server = self._context.socket(zmq.REP)
+        self.state_address = self._bound(self._publisher)
+        self.command_address = self._bound(self._server)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @staticmethod
+    def _bound(socket: zmq.Socket[Any]) -> str:
+        socket.setsockopt(zmq.LINGER, 0)
+        return f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Publish one message as it is."""
+        self._extra.append([topic, payload])
+
+    def send_event(self, kind: str, text: str, level: str = "info") -> None:
+        self.send(b"hand/event", msgpack.packb(event(1, kind, text, level)))
+
+    def _run(self) -> None:
+        began = time.monotonic()
+        seq = 0
+        while not self._over.wait(0.01):
+            while self._server.poll(0):
+                request = msgpack.unpackb(self._server.recv())
+                self.requests.append(request)
+                reply = self.replies.get(request["command"], {"ok": True})
+                self._server.send(msgpack.packb(reply))
+            while self._extra:
+                self._publisher.send_multipart(self._extra.pop(0))
+            if self.silent.is_set():
+                continue
+            t = time.monotonic() - began
+            message = {**state(t, 5 * seq), **self.changes}
+            self._publisher.send_multipart([b"hand/state", msgpack.packb(message)])
+            if seq % 4 == 0:
+                for side in (0, 1):
+                    payload = msgpack.packb(frame(t, side))
+                    self._publisher.send_multipart([b"hand/tactile", payload])
+            seq += 1
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join(5.0)
+        self._context.destroy(linger=0)
+
+    def __enter__(self) -> FakeDaemon:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

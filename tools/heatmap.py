@@ -1,0 +1,155 @@
+"""Pressure maps in a terminal: colour scale, resampling to fit, rows of half-block characters.
+
+Holds pictures of grids and nothing that knows of the stream or the page. A half-block character
+carries two pixels, one above the other, and a character cell is about twice as tall as wide, so
+the pixels come out square.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.color import Color
+from rich.segment import Segment
+from rich.style import Style
+
+FloatArray = NDArray[np.float64]
+
+LEVELS = 32  # colours told apart; fewer make longer runs of one style and lighter redraws
+SHADES = " ·░▒▓█"  # where the terminal has no colours to speak of
+
+# From dark to bright in even steps of lightness, blue to yellow: it reads the same in grey and
+# for people who don't tell red from green.
+_ANCHORS = (
+    (24, 18, 56),
+    (50, 46, 110),
+    (44, 88, 140),
+    (30, 128, 140),
+    (44, 165, 118),
+    (132, 198, 74),
+    (250, 230, 70),
+)
+
+
+def colour_map(levels: int = LEVELS) -> list[tuple[int, int, int]]:
+    """The scale's colours from zero to full, as (red, green, blue) of 0…255."""
+    at = np.linspace(0.0, len(_ANCHORS) - 1.0, levels)
+    knots = np.arange(len(_ANCHORS))
+    channels = [np.interp(at, knots, [anchor[c] for anchor in _ANCHORS]) for c in range(3)]
+    return [
+        (int(r), int(g), int(b)) for r, g, b in zip(*(np.rint(c) for c in channels), strict=True)
+    ]
+
+
+_COLOURS = [Color.from_rgb(*rgb) for rgb in colour_map()]
+
+
+@lru_cache(maxsize=LEVELS * LEVELS)
+def _pair_style(top: int, bottom: int) -> Style:
+    return Style(color=_COLOURS[top], bgcolor=_COLOURS[bottom])
+
+
+@lru_cache(maxsize=16)
+def _overlaps(cells: int, pixels: int) -> FloatArray:
+    """Share of each of ``cells`` in each of ``pixels`` on the same length; rows sum to 1."""
+    edges = np.arange(pixels + 1) * (cells / pixels)
+    low, high = edges[:-1, None], edges[1:, None]
+    cell = np.arange(cells)[None, :]
+    share = np.clip(np.minimum(high, cell + 1.0) - np.maximum(low, cell), 0.0, None)
+    result: FloatArray = share / share.sum(axis=1, keepdims=True)
+    return result
+
+
+def resample(grid: FloatArray, height: int, width: int) -> FloatArray:
+    """Area average of ``grid`` [rows, cols] on [height, width] pixels; keeps the mean."""
+    rows, cols = grid.shape
+    result: FloatArray = _overlaps(rows, height) @ grid @ _overlaps(cols, width).T
+    return result
+
+
+def fit(rows: int, cols: int, lines: int, columns: int) -> tuple[int, int]:
+    """Largest (lines, columns) of characters in the given box that shows square cells square."""
+    width = min(columns, max(1, round(2 * lines * cols / rows)))
+    height = min(lines, max(1, round(width * rows / cols / 2)))
+    return height, width
+
+
+def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
+    """Index into the colour map, 0 for nothing and below, LEVELS − 1 from ``full`` on."""
+    scaled = np.clip(np.nan_to_num(pixels / full), 0.0, 1.0)
+    return np.rint(scaled * (LEVELS - 1)).astype(np.int64)
+
+
+def half_blocks(grid: FloatArray, full: float, lines: int, columns: int) -> list[list[Segment]]:
+    """``grid`` as ``lines`` of ``columns`` characters, row 0 lowest as y points up.
+
+    ``full`` is the value that gets the brightest colour.
+    """
+    levels = levels_of(resample(grid, 2 * lines, columns), full)[::-1]
+    picture = []
+    for line in range(lines):
+        pairs = levels[2 * line] * LEVELS + levels[2 * line + 1]
+        picture.append(_runs(pairs))
+    return picture
+
+
+def _runs(pairs: NDArray[np.int64]) -> list[Segment]:
+    """One line, neighbours of the same two colours in one segment."""
+    starts = [0, *(np.flatnonzero(np.diff(pairs)) + 1).tolist(), len(pairs)]
+    segments = []
+    for start, end in pairwise(starts):
+        top, bottom = divmod(int(pairs[start]), LEVELS)
+        segments.append(Segment("▀" * (end - start), _pair_style(top, bottom)))
+    return segments
+
+
+def shades(grid: FloatArray, full: float, lines: int, columns: int) -> list[list[Segment]]:
+    """The same picture for a terminal without colours, one shaded character a pixel."""
+    levels = levels_of(resample(grid, lines, columns), full)[::-1]
+    index = np.ceil(levels * ((len(SHADES) - 1) / (LEVELS - 1))).astype(int)
+    return [[Segment("".join(SHADES[i] for i in row))] for row in index]
+
+
+def colour_bar(columns: int, colours: bool) -> list[Segment]:
+    """The scale from nothing to full, in one line."""
+    at = np.linspace(0.0, 1.0, columns)
+    if not colours:
+        index = np.rint(at * (len(SHADES) - 1)).astype(int)
+        return [Segment("".join(SHADES[i] for i in index))]
+    levels = np.rint(at * (LEVELS - 1)).astype(np.int64)
+    return _runs(levels * LEVELS + levels)
+
+
+def round_up(value: float) -> float:
+    """The next round number at or above ``value`` > 0, for the end of a scale."""
+    decade = 10.0 ** np.floor(np.log10(value))
+    for step in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0):
+        if value <= step * decade * (1.0 + 1e-9):
+            return float(step * decade)
+    return float(10.0 * decade)
+
+
+class FullScale:
+    """End of a scale that follows a signal's peak: up at once, down only after a while."""
+
+    def __init__(self, least: float, patience: float = 3.0) -> None:
+        self._least = least
+        self._patience = patience  # s below the next smaller scale before it shrinks
+        self._since: float | None = None
+        self.value = least
+
+    def follow(self, peak: float, now: float) -> float:
+        """The scale's end for a signal that peaks at ``peak`` at time ``now`` [s]."""
+        wanted = max(self._least, round_up(peak)) if peak > 0.0 else self._least
+        if wanted >= self.value:
+            self.value = wanted
+            self._since = None
+        elif self._since is None:
+            self._since = now
+        elif now - self._since > self._patience:
+            self.value = wanted
+            self._since = None
+        return self.value

@@ -1,0 +1,334 @@
+"""``softfinger monitor``: the hand on a terminal page, live, from the public wire.
+
+Holds the command's arguments and its loop: keys and signals in, redraws out, or plain lines when
+the output is no terminal. A process of its own: whatever happens here, the daemon's loop doesn't
+notice. The page itself is in ``monitor_page``, what it shows in ``feed``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import select
+import signal
+import sys
+import time
+from types import FrameType, TracebackType
+from typing import Any
+
+import zmq
+
+from tools.feed import FINGERS, Commander, Feed, Subscriber, field, number, text
+from tools.monitor_page import Page
+from tools.terminal import Keys, Terminal, TerminalGone
+
+REDRAW = 1.0 / 15.0  # s between redraws at most
+PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
+PLAIN_LINE = 1.0  # s between plain lines
+PATIENCE = 2.0  # s to wait for a first state with --no-wait
+STEP_ANGLE = math.radians(5.0)  # of the arrow keys
+
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this command's arguments to ``parser``."""
+    parser.description = (
+        "Show the hand on a live terminal page; keys arm, grasp, rotate, open and stop it. "
+        "Prints a plain line a second when the output is not a terminal."
+    )
+    parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
+    parser.add_argument("--commands", metavar="ADDRESS", help="where commands are taken")
+    parser.add_argument(
+        "--no-wait", action="store_true", help="end when no daemon is running, or when it ends"
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds")
+    parser.add_argument("--plain", action="store_true", help="plain lines, no page")
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when it closes
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until q, a signal, the duration or the daemon's end. 1 when no stream ever came."""
+    state, commands = args.state, args.commands
+    if state is None or commands is None:
+        from daemon.settings import CommandSettings, Stream
+
+        state = Stream().address if state is None else state
+        commands = CommandSettings().address if commands is None else commands
+    context: zmq.Context[Any] = zmq.Context(io_threads=1)
+    feed = Feed()
+    try:
+        subscriber = Subscriber(context, state, feed)
+        commander = Commander(context, commands)
+        try:
+            with _Ending(args) as ending:
+                if _is_page(args):
+                    _run_page(Page(feed, state), subscriber, commander, ending)
+                else:
+                    _run_plain(state, subscriber, ending)
+        finally:
+            commander.close()
+            subscriber.close()
+    except zmq.ZMQError as error:
+        print(f"softfinger monitor: {state}, {commands}: {error}", file=sys.stderr)
+        return 1
+    finally:
+        context.destroy(linger=0)
+    if ending.why:
+        print(f"softfinger monitor: {ending.why}", file=sys.stderr)
+    return 1 if args.no_wait and feed.state is None and ending.why else 0
+
+
+def _is_page(args: argparse.Namespace) -> bool:
+    if args.plain or os.environ.get("TERM", "dumb") == "dumb" or not sys.stdout.isatty():
+        return False
+    return (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
+
+
+class _Ending:
+    """A context that knows when to end, and wakes whoever waits in it when that changes."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.why = ""  # for the person, once the terminal is back; empty needs no word
+        self.over = False
+        self.suspend = False
+        self.terminal: Terminal | None = None
+        self._no_wait: bool = args.no_wait
+        self._lifeline: int | None = args.lifeline
+        self.beside = args.lifeline is not None  # a daemon is in our process group
+        self._deadline = math.inf if args.duration is None else time.monotonic() + args.duration
+        self._patience = time.monotonic() + PATIENCE
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Ending:
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._wakeup_before = signal.set_wakeup_fd(self._wake_write, warn_on_full_buffer=False)
+        for number_ in _ENDING:
+            self._before[number_] = signal.signal(number_, self._end)
+        self._before[signal.SIGWINCH] = signal.signal(signal.SIGWINCH, lambda *_: None)
+        self._before[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._pause)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number_, handler in self._before.items():
+            signal.signal(number_, handler)
+        signal.set_wakeup_fd(self._wakeup_before)
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _end(self, number_: int, frame: FrameType | None) -> None:
+        first = not self.over
+        self.over = True
+        if first and self.terminal is not None and self.terminal.writing:
+            raise TerminalGone("a signal came while the terminal took no output")
+
+    def _pause(self, number_: int, frame: FrameType | None) -> None:
+        self.suspend = True
+
+    def wait(self, timeout: float, keyboard: int | None = None) -> bool:
+        """Wait for the keyboard, a signal, the lifeline's end or the time. True for a key."""
+        poll = select.poll()
+        poll.register(self._wake_read, select.POLLIN)
+        for descriptor in (keyboard, self._lifeline):
+            if descriptor is not None:
+                poll.register(descriptor, select.POLLIN)
+        left = min(timeout, self._deadline - time.monotonic())
+        ready = [fd for fd, _ in poll.poll(max(0.0, left) * 1e3)]
+        if self._wake_read in ready:
+            with contextlib.suppress(BlockingIOError):
+                os.read(self._wake_read, 4096)
+        if self._lifeline in ready and os.read(self._lifeline or 0, 1) == b"":
+            self.over = True
+        if time.monotonic() >= self._deadline:
+            self.over = True
+        return keyboard is not None and keyboard in ready
+
+    def watch(self, feed: Feed, address: str, now: float) -> None:
+        """End where the stream's state asks for it."""
+        if not self._no_wait or self.over:
+            return
+        status = feed.status(now)
+        if status == "lost":
+            self.why = "the stream has ended"
+        elif status == "waiting" and now > self._patience:
+            self.why = f"no daemon publishes on {address}"
+        self.over = bool(self.why)
+
+
+def _run_page(page: Page, subscriber: Subscriber, commander: Commander, ending: _Ending) -> None:
+    keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
+    page.keys = keyboard is not None
+    terminal = Terminal(sys.stdout.fileno(), keyboard, suspendable=not ending.beside)
+    page.colours = terminal.rich_colours
+    ending.terminal = terminal
+    try:
+        while not ending.over:
+            with terminal:
+                _page_loop(page, terminal, keyboard, subscriber, commander, ending)
+            if ending.suspend and not ending.over:  # Ctrl-Z: the shell has its terminal meanwhile
+                ending.suspend = False
+                os.kill(os.getpid(), signal.SIGSTOP)
+    except TerminalGone:
+        pass  # nobody looks any more
+
+
+def _page_loop(
+    page: Page,
+    terminal: Terminal,
+    keyboard: int | None,
+    subscriber: Subscriber,
+    commander: Commander,
+    ending: _Ending,
+) -> None:
+    keys = Keys()
+    hand = _HandKeys(page.feed, commander)
+    due = time.monotonic()
+    while not (ending.over or ending.suspend):
+        if ending.wait(due - time.monotonic(), keyboard) and keyboard is not None:
+            typed = _read(keyboard)
+            if not typed:
+                keyboard = None  # the keyboard is gone, the page may go on
+            for key in keys.decode(typed):
+                if key == "q":
+                    ending.over = True
+                    return
+                hand.press(key, time.monotonic())
+        now = time.monotonic()
+        if now < due:
+            continue
+        keys.settle()
+        subscriber.drain(now)
+        commander.collect(now)
+        ending.watch(page.feed, page.address, now)
+        width, height = terminal.size()
+        terminal.draw(page.lines(width, height, now, commander.reply))
+        due = max(due + REDRAW, time.monotonic() + 0.5 * REDRAW)
+
+
+def _read(keyboard: int) -> bytes:
+    try:
+        return os.read(keyboard, 1024)
+    except OSError:
+        return b""
+
+
+class _HandKeys:
+    """What the keys do to the hand."""
+
+    def __init__(self, feed: Feed, commander: Commander) -> None:
+        self._feed = feed
+        self._commander = commander
+        self._target: float | None = None  # of the object's angle [rad]
+
+    def press(self, key: str, now: float) -> None:
+        """Send what ``key`` stands for; other keys do nothing."""
+        if key in ("left", "right"):
+            self._rotate(STEP_ANGLE if key == "right" else -STEP_ANGLE, now)
+            return
+        simple = {
+            "a": ("arm", "arm"),
+            "g": ("grasp", "grasp"),
+            "o": ("open", "release"),
+            " ": ("stop", "stop"),
+            "c": ("clear", "clear"),
+            "d": ("disarm", "disarm"),
+        }
+        if key in simple:
+            label, command = simple[key]
+            self._target = None
+            self._commander.send(now, label, command)
+
+    def _rotate(self, step: float, now: float) -> None:
+        """Several presses add up: they count from the last target, not from where it turns."""
+        state, reply = self._feed.state, self._commander.reply
+        refused = reply is not None and not reply.ok
+        turning = text(state, "mode") in ("rotating", "holding")
+        if self._target is None or refused or not turning:
+            known = field(state, "object", "valid") is not False
+            angle = number(state, "object", "angle") if known else math.nan
+            if not math.isfinite(angle):
+                self._target = None
+                self._commander.refuse(now, "rotate: the object's angle is not known")
+                return
+            self._target = angle
+        self._target += step
+        label = f"rotate to {math.degrees(self._target):.1f}°"
+        self._commander.send(now, label, "rotate", angle=self._target)
+
+
+def _run_plain(address: str, subscriber: Subscriber, ending: _Ending) -> None:
+    feed = subscriber.feed
+    with contextlib.suppress(BrokenPipeError):
+        said_status, shown, due = "live", 0, 0.0
+        while not ending.over:
+            ending.wait(PLAIN_STEP)
+            now = time.monotonic()
+            subscriber.drain(now)
+            ending.watch(feed, address, now)
+            status = feed.status(now)
+            if status != said_status:
+                said_status = status
+                _say(f"{_clock()} stream {status}: {address}")
+            for event in (
+                list(feed.events)[shown - feed.event_count :] if shown < (feed.event_count) else ()
+            ):
+                _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
+            shown = feed.event_count
+            if status in ("live", "stale") and now >= due:
+                due = now + PLAIN_LINE
+                _say(plain_line(feed, now))
+        return
+    # The reader has gone. Python flushes its output once more at exit: into nothing then.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def plain_line(feed: Feed, now: float) -> str:
+    """The hand in one short line."""
+    state = feed.state
+    parts = [_clock(), text(state, "mode") or "—"]
+    fault = text(state, "fault")
+    if fault:
+        parts.append(f"FAULT {fault}")
+    for name in FINGERS:
+        force = number(state, name, "force")
+        d = 1e3 * number(state, name, "d")
+        theta = math.degrees(number(state, name, "theta"))
+        parts.append(f"{name} {_number(force, 2)} N {_number(d, 2)} mm {_number(theta, 1, '+')}°")
+    angle = math.degrees(number(state, "object", "angle"))
+    parts.append(f"object {_number(angle, 1, '+')}°")
+    tick = feed.statistics(now)
+    parts.append(
+        f"tick {_number(tick.rate, 0)} Hz {_number(1e6 * tick.compute, 0)} µs "
+        f"overruns {_number(number(state, 'overruns'), 0)}"
+    )
+    if feed.skipped:
+        parts.append(f"unreadable {feed.skipped}")
+    return "  ".join(parts)
+
+
+def _number(value: float, decimals: int, sign: str = "") -> str:
+    return f"{value:{sign}.{decimals}f}" if math.isfinite(value) else "—"
+
+
+def _clock() -> str:
+    return time.strftime("%H:%M:%S")
+
+
+def _say(line: str) -> None:
+    data = f"{line}\n".encode(sys.stdout.encoding or "utf-8", "replace")
+    os.write(sys.stdout.fileno(), data)
+
+
+if __name__ == "__main__":
+    _parser = argparse.ArgumentParser(prog="softfinger monitor")
+    add_arguments(_parser)
+    sys.exit(run(_parser.parse_args()))

@@ -1,0 +1,427 @@
+"""The page of ``softfinger monitor``: from what the feed knows to lines of styled text.
+
+Holds layout, wording and colours; pure apart from the scales that follow the pressure and the
+force. Lengths are shown in mm, angles in degrees, energies in mJ, pressures in kPa.
+
+The page has the hand's own shape: the left finger's map to the left, the right one's to the
+right, the numbers of both between them, then the object they hold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from rich.cells import cell_len, set_cell_size
+from rich.segment import Segment
+from rich.style import Style
+
+from tools import heatmap
+from tools.feed import FINGERS, SCHEMA, Feed, Reply, TickStatistics, number, text
+from tools.feed import field as value_at
+
+WIDTH, HEIGHT = 80, 24  # the least that everything fits into
+CENTRE = 34  # columns of the numbers
+MAP_LINES = 11  # of each map at the least size
+OLD = 1.0  # s after which a frame on the page is called old
+REPLY_TIME = 12.0  # s a reply stays
+
+Line = list[Segment]
+
+PLAIN = Style()
+BOLD = Style(bold=True)
+DIM = Style(dim=True)
+GOOD = Style(color="#1fa883")
+WARN = Style(color="#e69f00")
+BAD = Style(color="#ff6a3d", bold=True)
+ALARM = Style(color="#ffffff", bgcolor="#b8360b", bold=True)
+KEY = Style(bold=True, color="#56b4e9")
+SIDE = {"left": Style(color="#56b4e9", bold=True), "right": Style(color="#e69f00", bold=True)}
+
+_BADGES = {
+    "disarmed": Style(color="#ffffff", bgcolor="#5a6068", bold=True),
+    "armed": Style(color="#ffffff", bgcolor="#0067a8", bold=True),
+    "holding": Style(color="#ffffff", bgcolor="#007a58", bold=True),
+    "fault": ALARM,
+}
+_BUSY = Style(color="#201800", bgcolor="#e6a817", bold=True)
+_LEVELS = {"info": DIM, "warning": WARN, "error": BAD}
+_BARS = " ▁▂▃▄▅▆▇█"
+
+# (label, field, factor, decimals, unit, field of the standard deviation); "" leaves a line
+_ROWS = (
+    ("d", "d", 1e3, 2, "mm", "d_std"),
+    ("θ", "theta", math.degrees(1.0), 2, "°", "theta_std"),
+    ("force", "force", 1.0, 2, "N", "force_std"),
+    ("energy", "energy", 1e3, 2, "mJ", "energy_std"),
+    ("age", "frame_age_s", 1e3, 1, "ms", ""),
+    ("", "", 0.0, 0, "", ""),
+    ("joint", "q", math.degrees(1.0), 2, "°", ""),
+    ("goal", "goal_q", math.degrees(1.0), 2, "°", ""),
+    ("velocity", "dq", math.degrees(1.0), 1, "°/s", ""),
+    ("current", "current", 1.0, 3, "A", ""),
+    ("bound", "goal_current", 1.0, 3, "A", ""),
+)
+
+
+@dataclass
+class Page:
+    """What a page needs beside the feed. ``now`` is monotonic seconds."""
+
+    feed: Feed
+    address: str
+    colours: bool = True  # at least 256 of them
+    keys: bool = True  # a keyboard is there
+    _pressure: heatmap.FullScale = field(
+        default_factory=lambda: heatmap.FullScale(least=5e3, patience=3.0)
+    )
+    _force: heatmap.FullScale = field(
+        default_factory=lambda: heatmap.FullScale(least=1.0, patience=0.0)
+    )
+    _statistics: TickStatistics = field(default_factory=TickStatistics)
+    _statistics_at: float = -math.inf
+
+    def lines(self, width: int, height: int, now: float, reply: Reply | None) -> list[Line]:
+        """The page as ``height`` lines of exactly ``width`` columns."""
+        if width < WIDTH or height < HEIGHT:
+            return _too_small(width, height)
+        if now - self._statistics_at >= 0.5:  # numbers that change faster can't be read
+            self._statistics = self.feed.statistics(now)
+            self._statistics_at = now
+        status = self.feed.status(now)
+        maps, trend, events = _shares(width, height)
+        page = [
+            self._header(width, now, status),
+            self._notice(width, now, status),
+            *self._body(width, maps, now),
+            _rule(width),
+            *self._trends(width, trend),
+            self._ticks(width),
+            _rule(width, "events", _reply(reply, now)),
+            *self._events(width, events),
+            self._footer(width),
+        ]
+        if status in ("stale", "lost"):
+            page[2:-1] = [_faded(line) for line in page[2:-1]]
+        return [_exactly(line, width) for line in page]
+
+    def _header(self, width: int, now: float, status: str) -> Line:
+        mode = text(self.feed.state, "mode")
+        fault = text(self.feed.state, "fault")
+        badge = ALARM if fault else _BADGES.get(mode, _BUSY if mode else _BADGES["disarmed"])
+        left = [
+            Segment(" softfinger ", BOLD),
+            Segment(f" {mode.upper() or '—'} ", badge),
+        ]
+        if status == "waiting":
+            right = [Segment("○ no stream yet ", WARN)]
+        elif status == "live":
+            rate = _short(self._statistics.messages, 0)
+            right = [Segment("● live ", GOOD), Segment(f"{rate} Hz ", DIM)]
+        else:
+            sign = "◐ stale" if status == "stale" else "○ lost"
+            age = _short(self.feed.age(now), 1)
+            right = [Segment(f"{sign} {age} s ", WARN if status == "stale" else BAD)]
+        room = width - _length(left) - _length(right) - 2
+        if len(self.address) <= room:
+            right = [Segment(f"{self.address}  ", DIM), *right]
+        return _apart(left, right, width)
+
+    def _notice(self, width: int, now: float, status: str) -> Line:
+        fault = text(self.feed.state, "fault")
+        if fault:
+            way = "c clears it " if self.keys else "softfinger send clear "
+            room = width - len(way) - 8
+            line = [Segment(f" FAULT {_cut(fault, room)}", ALARM)]
+            return _apart(line, [Segment(way, ALARM)], width, ALARM)
+        if status == "waiting":
+            what = " waiting for a daemon; start one with: softfinger run"
+            return [Segment(_cut(what, width), WARN)]
+        if status == "lost":
+            what = " nothing comes any more; what stands below is old"
+            return [Segment(what, BAD)]
+        schema = value_at(self.feed.state, "schema")
+        if self.feed.state is not None and schema != SCHEMA:
+            what = f" the stream has schema {schema!r:.12}, this page knows {SCHEMA}"
+            return [Segment(what + ": it shows the fields that it knows", WARN)]
+        return []
+
+    def _body(self, width: int, lines: int, now: float) -> list[Line]:
+        """Titles, maps with the numbers between them, and the maps' scale with the object."""
+        box = min(2 * lines, (width - CENTRE - 2) // 2)
+        grids = {name: frame.grid() for name, frame in self.feed.frames.items()}
+        peak = max((float(grid.max()) for grid in grids.values()), default=0.0)
+        full = self._pressure.follow(peak, now)
+        counts = any(math.isnan(frame.scale) for frame in self.feed.frames.values())
+        left, right = (self._map(name, lines, box, full, now, counts) for name in FINGERS)
+        top = max(0, (lines - len(_ROWS)) // 2)
+        numbers: list[Line] = [[] for _ in range(top)]
+        numbers += [self._row(*row) for row in _ROWS]
+        numbers += [[] for _ in range(lines - len(numbers))]
+        rows = [
+            self._heads(),
+            *numbers,
+            self._object(),
+        ]
+        gap = max(1, (width - 2 * box - CENTRE) // 2)
+        gap = min(gap, 6)
+        margin = Segment(" " * max(0, (width - 2 * box - 2 * gap - CENTRE) // 2))
+        space = Segment(" " * gap)
+        return [
+            [
+                margin,
+                *_exactly(a, box),
+                space,
+                *_exactly(b, CENTRE),
+                space,
+                *_exactly(c, box),
+            ]
+            for a, b, c in zip(left, rows, right, strict=True)
+        ]
+
+    def _map(
+        self, name: str, lines: int, box: int, full: float, now: float, counts: bool
+    ) -> list[Line]:
+        """Title, ``lines`` of picture and the scale, each at most ``box`` columns."""
+        frame = self.feed.frames.get(name)
+        unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
+        if frame is None:
+            empty = [_centred([Segment("no frames", DIM)], box) if i == lines // 2 else []
+                     for i in range(lines)]  # fmt: skip
+            return [[Segment(name.upper(), SIDE[name])], *empty, []]
+        grid = frame.grid()
+        old = now - frame.arrived > OLD
+        touch = value_at(self.feed.state, name, "contact")
+        said = "old" if old else "contact" if touch is True else "free" if touch is False else ""
+        style = WARN if old else GOOD if touch is True else DIM
+        peak = f"{grid.max() * factor:.{decimals}f} {unit}"
+        title = _apart(
+            [Segment(name.upper(), SIDE[name]), Segment(f" {said}", style)], [Segment(peak)], box
+        )
+        height, columns = heatmap.fit(frame.rows, frame.cols, lines, box)
+        draw = heatmap.half_blocks if self.colours else heatmap.shades
+        above = (lines - height) // 2
+        picture: list[Line] = [[] for _ in range(lines)]
+        for i, line in enumerate(draw(grid, full, height, columns)):
+            picture[above + i] = _centred([*line], box)
+        end = f" {full * factor:g} {unit}"
+        bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.colours)
+        return [title, *picture, [Segment("0 ", DIM), *bar, Segment(end, DIM)]]
+
+    def _heads(self) -> Line:
+        present = {name: value_at(self.feed.state, name, "valid") is not False for name in FINGERS}
+        heads = [
+            Segment(f"{name if present[name] else name + ' –':^11}", SIDE[name]) for name in FINGERS
+        ]
+        return [Segment(" " * 8), *heads]
+
+    def _row(self, label: str, key: str, factor: float, decimals: int, unit: str, std: str) -> Line:
+        if not label:
+            return []
+        line = [Segment(f"{label:<8}", DIM)]
+        for name in FINGERS:
+            finger = value_at(self.feed.state, name)
+            here = value_at(finger, "valid") is not False
+            shown = _aligned(factor * number(finger, key), decimals)
+            spread = number(finger, std) if std else math.nan
+            beside = "" if math.isnan(spread) else "±" + _narrow(factor * spread)
+            line.append(Segment(f"{shown:<6}", PLAIN if here else DIM))
+            line.append(Segment(f"{beside:<{11 - max(6, len(shown))}}", DIM))
+        line.append(Segment(f" {unit}", DIM))
+        return line
+
+    def _object(self) -> Line:
+        pose = value_at(self.feed.state, "object")
+        if value_at(pose, "valid") is False:  # what it says then is old or never was
+            pose = None
+        angle = math.degrees(number(pose, "angle"))
+        width = 1e3 * number(pose, "width")
+        return [
+            Segment(f"{'object':<8}", DIM),
+            Segment(f"{_aligned(angle, 2):<6}", BOLD),
+            Segment(f"{' °':<5}", DIM),
+            Segment(f"{_aligned(width, 2):<6}", BOLD),
+            Segment(" mm wide", DIM),
+        ]
+
+    def _trends(self, width: int, lines: int) -> list[Line]:
+        """Both forces over the last while, ``lines`` of bars each."""
+        columns = width - 24
+        recent = list(self.feed.history)[-columns:]
+        peak = max((v for pair in recent for v in pair if math.isfinite(v)), default=0.0)
+        full = self._force.follow(peak, 0.0)
+        result = []
+        for i, name in enumerate(FINGERS):
+            bars = _bars([pair[i] for pair in recent], full, lines)
+            for k, bar in enumerate(bars):
+                last = k == lines - 1
+                value = _aligned(number(self.feed.state, name, "force"), 2)
+                label = f" force {name:<6}" if last else ""
+                result.append(
+                    [
+                        Segment(f"{label:<13}", DIM),
+                        Segment(f"{value if last else '':<8}"),
+                        Segment(f"{bar:>{columns}}", SIDE[name]),
+                        Segment(f"{f'{full:g} N':>{_TAIL}}" if k == 0 and i == 0 else "", DIM),
+                    ]
+                )
+        return result
+
+    def _ticks(self, width: int) -> Line:
+        now = self._statistics
+        overruns = number(self.feed.state, "overruns")
+        line = [Segment(" tick ", DIM), Segment(f"{_short(now.rate, 0)} Hz")]
+        for label, median, worst in (
+            ("compute", now.compute, now.compute_max),
+            ("late", now.late, now.late_max),
+        ):
+            line += [
+                Segment(f"   {label} ", DIM),
+                Segment(f"{_short(1e6 * median, 0)} µs"),
+                Segment(f" max {_short(1e6 * worst, 0)}", DIM),
+            ]
+        line += [
+            Segment("   overruns ", DIM),
+            Segment(_short(overruns, 0), WARN if overruns > 0 else PLAIN),
+        ]
+        if self.feed.skipped:
+            line += [Segment("   unreadable ", DIM), Segment(str(self.feed.skipped), WARN)]
+        return line
+
+    def _events(self, width: int, count: int) -> list[Line]:
+        recent = list(self.feed.events)[-count:]
+        result: list[Line] = []
+        for event in recent:
+            style = _LEVELS.get(event.level, PLAIN)
+            kind = f" {event.kind:<9}"
+            line = [Segment(f" {event.clock()}", DIM), Segment(kind, style)]
+            said = PLAIN if event.level == "info" else style
+            line.append(Segment(" " + _cut(event.text, width - _length(line) - 1), said))
+            result.append(line)
+        return result + [[] for _ in range(count - len(result))]
+
+    def _footer(self, width: int) -> Line:
+        if not self.keys:
+            return [Segment(" no keyboard here: commands go through softfinger send", DIM)]
+        line = [Segment(" ")]
+        for key, what in (
+            ("a", "arm"),
+            ("g", "grasp"),
+            ("←→", "rotate 5°"),
+            ("o", "open"),
+            ("space", "stop"),
+            ("c", "clear"),
+            ("d", "disarm"),
+            ("q", "quit"),
+        ):
+            line += [Segment(key, KEY), Segment(f" {what}  ", DIM)]
+        return line
+
+
+_TAIL = 3
+
+
+def _shares(width: int, height: int) -> tuple[int, int, int]:
+    """Lines of (each map, each trend, the events) on a page of this size."""
+    spare = height - HEIGHT
+    widest = (width - CENTRE - 2) // 4  # the maps' width is twice their height
+    maps = min(widest, MAP_LINES + (2 * spare + 2) // 3)
+    maps = max(MAP_LINES, maps)
+    spare -= maps - MAP_LINES
+    trend = 1 + min(3, spare // 4)
+    spare -= 2 * (trend - 1)
+    return maps, trend, 3 + spare
+
+
+def _too_small(width: int, height: int) -> list[Line]:
+    said = [
+        "softfinger monitor",
+        f"needs {WIDTH} × {HEIGHT},",
+        f"this is {width} × {height}",
+        "q quits, space stops",
+    ]
+    above = max(0, (height - len(said)) // 2)
+    lines: list[Line] = [[] for _ in range(above)]
+    lines += [_centred([Segment(_cut(line, width), WARN)], width) for line in said]
+    lines += [[] for _ in range(height)]
+    return [_exactly(line, width) for line in lines[:height]]
+
+
+def _reply(reply: Reply | None, now: float) -> Line:
+    if reply is None or now - reply.at > REPLY_TIME:
+        return []
+    return [Segment(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)]
+
+
+def _bars(values: list[float], full: float, lines: int) -> list[str]:
+    """Values as bars of eighths of a line, highest line first; nothing where there is no value."""
+    steps = [
+        -1 if math.isnan(v) else round(min(max(v / full, 0.0), 1.0) * 8 * lines) for v in values
+    ]
+    rows = []
+    for row in reversed(range(lines)):
+        floor = 1 if row == 0 else 0  # a zero still shows as a thin line
+        cells = (max(floor, min(8, s - 8 * row)) if s >= 0 else 0 for s in steps)
+        rows.append("".join(_BARS[max(0, c)] for c in cells))
+    return rows
+
+
+def _aligned(value: float, decimals: int) -> str:
+    """The number with its decimal point in the fourth column, at most 7 wide."""
+    if not math.isfinite(value):
+        return "  —"
+    shown = f"{value:{4 + decimals}.{decimals}f}"
+    if len(shown) > 7:
+        shown = f"{value:.1e}"
+    return shown
+
+
+def _narrow(value: float) -> str:
+    """A standard deviation in 4 columns."""
+    return f"{value:.2f}" if value < 9.995 else f"{value:.0f}" if value < 9999.5 else "many"
+
+
+def _short(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
+
+
+def _cut(said: str, room: int) -> str:
+    """``said`` in at most ``room`` columns, with an ellipsis where it was cut."""
+    if cell_len(said) <= room:
+        return said
+    return set_cell_size(said, max(0, room - 1)) + ("…" if room > 0 else "")
+
+
+def _length(line: Iterable[Segment]) -> int:
+    return sum(segment.cell_length for segment in line)
+
+
+def _exactly(line: Line, width: int) -> Line:
+    """``line`` cropped or padded to ``width`` columns."""
+    return Segment.adjust_line_length(line, width, pad=True)
+
+
+def _apart(left: Line, right: Line, width: int, between: Style = PLAIN) -> Line:
+    """``left`` and ``right`` at the two ends of ``width`` columns."""
+    space = max(1, width - _length(left) - _length(right))
+    return [*left, Segment(" " * space, between), *right]
+
+
+def _centred(line: Line, width: int) -> Line:
+    return [Segment(" " * ((width - _length(line)) // 2)), *line]
+
+
+def _rule(width: int, title: str = "", note: Line | None = None) -> Line:
+    """A line across the page with a title at its left end and a note at its right end."""
+    head = f"─ {title} " if title else ""
+    if not note:
+        return [Segment(head + "─" * (width - len(head)), DIM)]
+    note = [Segment(_cut(s.text, width - len(head) - 6), s.style) for s in note]
+    fill = "─" * (width - len(head) - _length(note) - 3)
+    return [Segment(f"{head}{fill} ", DIM), *note, Segment(" ─", DIM)]
+
+
+def _faded(line: Line) -> Line:
+    """``line`` as something that is no longer true."""
+    return [Segment(s.text, (s.style or PLAIN) + DIM) for s in line]
