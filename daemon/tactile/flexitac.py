@@ -1,0 +1,256 @@
+"""FlexiTac boards: their framing, and the backend that reads one over a serial port.
+
+The stream, at 2,000,000 baud: ``AA 55``, then rows × cols bytes, row-major, one count each, frame
+after frame. There is no length, number or checksum, and ``AA 55`` may occur among the counts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Literal
+
+import numpy as np
+
+from daemon.clock import Clock
+from daemon.settings import TactileSettings
+from daemon.tactile.serial_reader import Decoded, SerialReader
+
+MARKER = b"\xaa\x55"
+_LEVELS = 12  # frames that a search may look back on before it drops the oldest
+_LOST_AFTER = 10  # frames' worth of bytes without a frame
+_MARKERS_KEPT = 96  # for recognising a grid of another size
+_SMALLEST_GRID = 16  # cells; closer markers are an image's own pattern
+
+
+class FlexiTacDecoder:
+    """Bytes of a FlexiTac stream in, frames out. Pure and incremental.
+
+    *Lock.* Nothing tells a marker from two counts ``AA 55`` but its place. So the search asks for
+    two markers one frame apart, and as long as other ``AA 55`` between them recur at that distance
+    too it waits for more frames, until only one place is left. An image that stands still to the
+    last bit and contains ``AA 55`` can't be locked on: it is counted as ``ambiguous``, never
+    guessed.
+
+    *Hold.* Once locked, a frame is handed over when the next marker stands where it must, which
+    tells that no byte of the frame was lost. On a line with gaps between frames that would cost a
+    frame's period; ``settle`` says that the line is quiet, and then a whole frame whose counts
+    contain no ``AA 55`` (the trace of the next frame in a torn one) is handed over as well.
+
+    *Loss.* A marker that isn't where it must be drops the frame before it and starts the search
+    anew. Every byte fed is part of a frame, counted as skipped, or still held.
+    """
+
+    def __init__(self, rows: int, cols: int) -> None:
+        self.rows = rows
+        self.cols = cols
+        self.frame_bytes = len(MARKER) + rows * cols
+        self._buffer = bytearray()
+        self._start = 0  # place of the buffer's first byte in the stream
+        self._locked = False
+        # Where in the stream each piece in the buffer ended, and when it was read.
+        self._pieces: deque[tuple[int, float]] = deque()
+        self._frames = 0
+        self._resyncs = 0
+        self._skipped = 0
+        self._ambiguous = 0
+        self._skipped_at_frame = 0
+        self._markers: deque[int] = deque(maxlen=_MARKERS_KEPT)  # places in the stream, no lock
+
+    def feed(self, data: bytes, t: float) -> Decoded | None:
+        """Take the next bytes, read at time ``t`` [s]; the newest frame that they completed."""
+        self._buffer += data
+        self._pieces.append((self._start + len(self._buffer), t))
+        newest = None
+        while self._locked or self._search():
+            if self._misplaced(0) or self._misplaced(self.frame_bytes):
+                self._lose()
+            elif len(self._buffer) >= self.frame_bytes + len(MARKER):
+                newest = self._take()
+            else:
+                break
+        return newest
+
+    def settle(self) -> Decoded | None:
+        """The line is quiet: hand over a held frame, unless its counts could hide a marker."""
+        if not self.pending:
+            return None
+        first, end = len(MARKER), self.frame_bytes
+        # The last count and the byte after it may be the two halves of a marker as well.
+        if self._buffer.find(MARKER, first) >= 0 or self._buffer.endswith(MARKER[:1], first, end):
+            return None
+        return self._take()
+
+    @property
+    def pending(self) -> bool:
+        """A whole frame waits for the marker after it."""
+        return self._locked and len(self._buffer) >= self.frame_bytes
+
+    @property
+    def missing(self) -> int:
+        """Bytes until the frame in hand is whole; 0 before its first byte and without a lock."""
+        held = len(self._buffer)
+        return max(self.frame_bytes - held, 0) if self._locked and held else 0
+
+    @property
+    def locked(self) -> bool:
+        """The frames' place in the stream is known."""
+        return self._locked
+
+    @property
+    def lost(self) -> bool:
+        """No frame within the last ten frames' worth of bytes."""
+        behind = self._skipped - self._skipped_at_frame + len(self._buffer)
+        return behind > _LOST_AFTER * self.frame_bytes
+
+    @property
+    def found_cells(self) -> int:
+        """Cells of a frame by the markers' spacing while there is no lock; 0 if it doesn't tell."""
+        ordered = list(self._markers)
+        places = set(ordered)
+        spans: dict[int, int] = {}  # spacing → bytes covered by its longest chain up to the end
+        for i, place in enumerate(ordered):
+            for earlier in ordered[:i]:
+                spacing = place - earlier
+                if spacing < _SMALLEST_GRID + len(MARKER) or ordered[-1] - place >= spacing:
+                    continue
+                while earlier - spacing in places:
+                    earlier -= spacing
+                if place - earlier >= 2 * spacing:
+                    spans[spacing] = max(spans.get(spacing, 0), place - earlier)
+        # A pattern within an image breaks off where the image ends, the frames' markers never do.
+        spacing = max(spans, key=lambda m: (spans[m], -m), default=0)
+        return spacing - len(MARKER) if spacing not in (0, self.frame_bytes) else 0
+
+    def counters(self) -> dict[str, int]:
+        """``frames``, ``resyncs`` (losses of the lock), ``skipped_bytes``, ``ambiguous``."""
+        return {
+            "frames": self._frames,
+            "resyncs": self._resyncs,
+            "skipped_bytes": self._skipped,
+            "ambiguous": self._ambiguous,
+        }
+
+    def diagnosis(self) -> str:
+        """What is wrong with a stream that gives no frames, in one line."""
+        expected = f"{self.rows} × {self.cols} = {self.rows * self.cols} cells"
+        found = self.found_cells
+        if found:
+            side = round(found**0.5)
+            shape = f"{found} cells" + (f" ({side} × {side} if square)" if side**2 == found else "")
+            return f"frames of {shape}, {expected} expected: set tactile.rows and tactile.cols"
+        if self._ambiguous:
+            return f"AA 55 stands at several places of every frame of {expected}: move the sensor"
+        if self._markers:
+            return f"some markers AA 55, but not at the spacing of {expected}"
+        return f"no marker AA 55 among them; frames of {expected} expected: another board or baud?"
+
+    def _search(self) -> bool:
+        """Bring the buffer's start to a marker that is one for sure; False when more is needed."""
+        buffer, stride = self._buffer, self.frame_bytes
+        while True:
+            place = buffer.find(MARKER)
+            if place < 0:
+                self._skip(len(buffer) - buffer.endswith(MARKER[:1]))
+                return False
+            self._skip(place)
+            self._note(0)
+            verdict = self._only_place()
+            if verdict == "undecided":
+                return False
+            if verdict == "yes":
+                self._locked = True
+                self._markers.clear()
+                return True
+            if verdict == "no":
+                self._skip(len(MARKER))
+                continue
+            self._ambiguous += 1
+            for rival in self._between():
+                self._note(rival)
+            self._skip(stride)
+
+    def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
+        """Is the marker at the buffer's start the frames', and no other ``AA 55`` as good?
+
+        Level by level, one frame further each, so that the answer depends on the stream alone and
+        not on how it was cut into pieces.
+        """
+        buffer, stride = self._buffer, self.frame_bytes
+        rivals = self._between()
+        for level in range(1, _LEVELS + 1):
+            here = level * stride
+            if len(buffer) < here + len(MARKER):
+                return "undecided"
+            if not buffer.startswith(MARKER, here):
+                return "no"
+            if rivals and len(buffer) < here + rivals[-1] + len(MARKER):
+                return "undecided"
+            rivals = [rival for rival in rivals if buffer.startswith(MARKER, here + rival)]
+            if not rivals:
+                return "yes"
+        return "ambiguous"
+
+    def _between(self) -> list[int]:
+        """Places of ``AA 55`` between the marker at the buffer's start and the next one."""
+        places = []
+        place = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
+        while place >= 0:
+            places.append(place)
+            place = self._buffer.find(MARKER, place + len(MARKER), self.frame_bytes)
+        return places
+
+    def _misplaced(self, place: int) -> bool:
+        """The buffer's bytes at ``place``, as far as they came, are not a marker's."""
+        return not MARKER.startswith(self._buffer[place : place + len(MARKER)])
+
+    def _take(self) -> Decoded:
+        count = self.rows * self.cols
+        data = np.frombuffer(self._buffer, np.uint8, count, len(MARKER)).astype(np.uint16)
+        end = self._start + self.frame_bytes
+        while self._pieces[0][0] < end:
+            self._pieces.popleft()
+        t = self._pieces[0][1]
+        del self._buffer[: self.frame_bytes]
+        self._start = end
+        self._frames += 1
+        self._skipped_at_frame = self._skipped
+        return Decoded(data.reshape(self.rows, self.cols), t)
+
+    def _lose(self) -> None:
+        self._locked = False
+        self._resyncs += 1
+        if self._buffer.startswith(MARKER):  # of a torn frame
+            self._note(0)
+            self._skip(len(MARKER))
+
+    def _skip(self, count: int) -> None:
+        if count:
+            del self._buffer[:count]
+            self._start += count
+            self._skipped += count
+            while self._pieces and self._pieces[0][0] <= self._start:
+                self._pieces.popleft()
+
+    def _note(self, place: int) -> None:
+        place += self._start
+        if not self._markers or place > self._markers[-1]:
+            self._markers.append(place)
+
+
+class FlexiTac(SerialReader):
+    """The FlexiTac board under one fingertip."""
+
+    def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
+        """``finger`` 0 is the left one; it chooses the port."""
+
+        def make_decoder() -> FlexiTacDecoder:
+            return FlexiTacDecoder(settings.rows, settings.cols)
+
+        super().__init__(
+            settings.port[finger],
+            settings.baud,
+            make_decoder,
+            clock,
+            latency=settings.latency,
+            open_timeout=settings.open_timeout,
+        )

@@ -1,0 +1,489 @@
+"""FlexiTac framing as pure bytes, and the backend on real ptys through pyserial."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pty
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import serial
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from daemon.clock import RealClock
+from daemon.records import Frame
+from daemon.settings import TactileSettings
+from daemon.tactile.base import TactileError
+from daemon.tactile.flexitac import MARKER, FlexiTac, FlexiTacDecoder
+
+ROWS, COLS = 4, 5
+CELLS = ROWS * COLS
+STRIDE = CELLS + 2
+
+payloads = st.binary(min_size=CELLS, max_size=CELLS)
+# Images made to contain the marker often, also split over a frame's first or last byte.
+nasty = st.lists(
+    st.sampled_from([b"\xaa", b"\x55", b"\xaa\x55", b"\x00", b"\x01"]), min_size=CELLS
+).map(lambda parts: b"".join(parts)[:CELLS])
+
+
+def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
+    """The frames handed over when all is fed a byte at a time.
+
+    A lock that took long may complete several frames at once; of these only the newest comes.
+    """
+    found = []
+    for piece in pieces:
+        for k in range(len(piece)):
+            decoded = decoder.feed(piece[k : k + 1], 0.0)
+            if decoded is not None:
+                assert decoded.data.shape == (decoder.rows, decoder.cols)
+                assert decoded.data.dtype == np.uint16
+                found.append(decoded.data.astype(np.uint8).tobytes())
+    return found
+
+
+def frame(payload: bytes) -> bytes:
+    return MARKER + payload
+
+
+def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
+    """Different images without a byte of the marker."""
+    return [bytes([(first + k) % 100]) * cells for k in range(count)]
+
+
+def balance(decoder: FlexiTacDecoder, fed: int) -> None:
+    """Every byte is part of a frame, counted as skipped, or still held."""
+    counters = decoder.counters()
+    held = len(decoder._buffer)
+    assert counters["frames"] * decoder.frame_bytes + counters["skipped_bytes"] + held == fed
+
+
+def test_a_clean_stream_gives_every_frame_as_soon_as_the_next_marker_confirms_it():
+    images = numbered(5)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decode(decoder, [frame(image) for image in images]) == images[:4]
+    assert decoder.pending
+    last = decoder.settle()
+    assert last is not None
+    assert last.data.astype(np.uint8).tobytes() == images[4]
+    assert decoder.settle() is None
+    assert decoder.counters() == {
+        "frames": 5,
+        "resyncs": 0,
+        "skipped_bytes": 0,
+        "ambiguous": 0,
+    }
+
+
+def test_one_marker_alone_is_never_locked_on():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decode(decoder, [frame(bytes(CELLS))]) == []
+    assert not decoder.locked
+    assert decoder.settle() is None
+    decoder.feed(MARKER, 0.0)
+    assert decoder.locked
+
+
+def test_counts_are_row_major():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    decoded = decoder.feed(frame(bytes(range(CELLS))) + MARKER, 0.0)
+    assert decoded is not None
+    assert np.array_equal(decoded.data, np.arange(CELLS).reshape(ROWS, COLS))
+
+
+def test_a_frame_keeps_the_time_its_last_byte_was_read_and_its_own_array():
+    images = numbered(3)
+    stream = b"".join(frame(image) for image in images)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decoder.feed(stream[: STRIDE - 1], 1.0) is None
+    assert decoder.missing == 0  # no lock yet
+    assert decoder.feed(stream[STRIDE - 1 : STRIDE], 2.0) is None
+    first = decoder.feed(stream[STRIDE : STRIDE + 3], 3.0)
+    assert first is not None
+    assert first.t == 2.0
+    assert decoder.missing == STRIDE - 3
+    kept = first.data.copy()
+    assert decoder.feed(stream[STRIDE + 3 : 2 * STRIDE], 4.0) is None
+    second = decoder.settle()
+    assert second is not None
+    assert second.t == 4.0
+    decoder.feed(stream[2 * STRIDE :] + b"\xff" * 500, 5.0)
+    assert np.array_equal(first.data, kept)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    images=st.lists(st.one_of(payloads, nasty), min_size=1, max_size=8),
+    start=st.integers(0, STRIDE),
+    cuts=st.lists(st.integers(0, 8 * STRIDE), max_size=12),
+)
+@example(images=[b"\xaa\x55" * 10] * 4, start=0, cuts=[])
+@example(images=[b"\x00" * 19 + b"\xaa"] * 4, start=0, cuts=[22, 44])
+def test_any_cut_of_a_stream_gives_the_same_frames(images, start, cuts):
+    stream = b"".join(frame(image) for image in images)[start:]
+    whole = FlexiTacDecoder(ROWS, COLS)
+    expected = decode(whole, [stream])
+    balance(whole, len(stream))
+
+    pieces = FlexiTacDecoder(ROWS, COLS)
+    newest = []
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    for left, right in itertools.pairwise(edges):
+        decoded = pieces.feed(stream[left:right], 0.0)
+        if decoded is not None:
+            newest.append(decoded.data.astype(np.uint8).tobytes())
+    assert pieces.counters() == whole.counters()
+    assert set(newest) <= set(expected)
+    if newest:
+        assert newest[-1] == expected[-1]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    images=st.lists(nasty, min_size=2, max_size=6),
+    start=st.integers(0, STRIDE),
+)
+def test_no_wrong_frame_whatever_the_images_hold(images, start):
+    """Entered anywhere, images full of AA 55: what comes out was sent, in its order."""
+    # Afterwards two frames that share no AA 55, so that a standing image can't stay ambiguous.
+    images = [*images, *numbered(2)]
+    stream = b"".join(frame(image) for image in images)[start:]
+    found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
+    assert found == images[len(images) - len(found) :]
+    assert images[-1] in found
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    garbage=st.one_of(st.binary(max_size=200), nasty),
+    images=st.lists(payloads, min_size=3, max_size=5),
+)
+def test_garbage_before_a_stream_costs_at_most_its_first_frames(garbage, images):
+    images = [*images, *numbered(3)]
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    stream = [garbage, *(frame(image) for image in images), MARKER]
+    found = decode(decoder, stream)
+    assert decoder.locked
+    assert found[-1] == images[-1]
+    assert found[-3:] == images[-3:] or decoder.counters()["resyncs"] > 0
+    balance(decoder, sum(map(len, stream)))
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    images=st.lists(nasty, min_size=4, max_size=8),
+    torn=st.integers(2, 3),
+    keep=st.integers(0, STRIDE - 1),
+)
+def test_a_truncated_frame_is_dropped_and_the_stream_found_again(images, torn, keep):
+    images = [*numbered(2, first=50), *images, *numbered(3)]
+    frames = [frame(image) for image in images]
+    frames[torn] = frames[torn][:keep]
+    # Nothing tells a splice that happens to carry AA 55 where its frame must end.
+    rest = b"".join(frames[torn:])
+    assume(rest[STRIDE : STRIDE + 2] != MARKER)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    found = decode(decoder, [*frames, MARKER])
+    sent = [image for k, image in enumerate(images) if k != torn]
+    # Images may repeat: what came out must be a subsequence of what was sent whole.
+    left = iter(sent)
+    assert all(image in left for image in found)
+    assert found[-1] == images[-1]
+    if keep:
+        assert decoder.counters()["resyncs"] >= 1
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.one_of(st.binary(max_size=300), nasty), max_size=12))
+def test_random_bytes_never_break_the_decoder(pieces):
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    for piece in pieces:
+        decoder.feed(piece, 0.0)
+        decoder.settle()
+        assert decoder.missing >= 0
+        decoder.diagnosis()
+    balance(decoder, sum(map(len, pieces)))
+    assert len(decoder._buffer) <= 15 * STRIDE
+
+
+def test_a_standing_image_with_the_marker_in_it_is_not_guessed_at():
+    image = bytearray(CELLS)
+    image[7:9] = MARKER
+    stream = frame(bytes(image)) * 30
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decode(decoder, [stream[5:]]) == []
+    assert decoder.counters()["ambiguous"] > 0
+    assert "several places" in decoder.diagnosis()
+    # As soon as the image changes there is one place left.
+    found = decode(decoder, [frame(image) for image in numbered(3)])
+    assert found[-1] == numbered(3)[1]
+
+
+def test_a_lock_holds_through_a_standing_image_with_the_marker_in_it():
+    image = bytearray(CELLS)
+    image[7:9] = MARKER
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    images = [*numbered(2), *[bytes(image)] * 40]
+    assert decode(decoder, [*map(frame, images), MARKER]) == images
+    assert decoder.counters()["resyncs"] == 0
+
+
+def test_a_quiet_line_frees_no_frame_that_could_be_torn():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    decode(decoder, [frame(image) for image in numbered(3)])
+    assert decoder.settle() is not None
+    torn = frame(bytes(CELLS))[:-1]
+    decoder.feed(torn + MARKER[:1], 0.0)  # one byte short, then the next marker's first half
+    assert decoder.pending
+    assert decoder.settle() is None
+    # A loss that swallowed the next marker: the frame is refuted by what follows at once.
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    decode(decoder, [frame(image) for image in numbered(3)])
+    spliced = frame(bytes(CELLS))[:-4] + bytes([9]) * (CELLS - 3)
+    assert decode(decoder, [spliced, *map(frame, numbered(3, first=20)), MARKER]) == [
+        numbered(3)[2],
+        *numbered(3, first=20),
+    ]
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(4, 4), (5, 5), (16, 16), (44, 44), (256, 256)])
+def test_a_grid_of_another_size_is_recognised_by_its_spacing(rows, cols):
+    rng = np.random.default_rng(3)
+    decoder = FlexiTacDecoder(32, 32)
+    cells = rows * cols
+    for _ in range(max(12, 15 * 1026 // cells)):
+        image = rng.integers(0, 200, cells, dtype=np.uint8).tobytes()
+        assert decoder.feed(frame(image), 0.0) is None
+    assert decoder.found_cells == cells
+    assert f"{cells} cells" in decoder.diagnosis()
+    assert "1024 cells" in decoder.diagnosis()
+
+
+def test_another_size_is_recognised_behind_a_standing_image_with_markers_in_it():
+    image = bytes(40) + MARKER + bytes(14) + MARKER + bytes(198)
+    decoder = FlexiTacDecoder(32, 32)
+    for _ in range(12):
+        decoder.feed(frame(image), 0.0)
+    assert decoder.found_cells == 256
+
+
+# --- on a pty, through pyserial -----------------------------------------------------------------
+
+
+def until(condition: Callable[[], bool], timeout: float = 5.0) -> None:
+    """Wait for a condition that another thread brings about."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        select.select([], [], [], 0.001)
+
+
+class Board:
+    """The far end of a pty, written to by the test; can stream in a thread of its own."""
+
+    def __init__(self) -> None:
+        self.master, self.slave = pty.openpty()
+        tty.setraw(self.slave)
+        self.path = os.ttyname(self.slave)
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def send(self, data: bytes) -> None:
+        while data:
+            select.select([], [self.master], [])
+            data = data[os.write(self.master, data) :]
+
+    def stream(self, images: Callable[[int], bytes], period: float = 0.002) -> None:
+        """Send the frames of images 0, 1, … until closed."""
+
+        def run() -> None:
+            k = 0
+            os.set_blocking(self.master, False)
+            while not self._stop.wait(period):
+                try:
+                    os.write(self.master, images(k))
+                except OSError:
+                    continue
+                k += 1
+
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def still(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def close(self) -> None:
+        self.still()
+        for end in (self.master, self.slave):
+            if end >= 0:
+                os.close(end)
+        self.master = self.slave = -1
+
+
+@pytest.fixture
+def board() -> Iterator[Board]:
+    board = Board()
+    yield board
+    board.close()
+
+
+def sensor(path: str, rows: int = 32, cols: int = 32, timeout: float = 2.0) -> FlexiTac:
+    tactile = TactileSettings(
+        backend="flexitac", port=("/dev/none", path), rows=rows, cols=cols, open_timeout=timeout
+    )
+    return FlexiTac(tactile, RealClock(), 1)
+
+
+def newest(tactile: FlexiTac) -> Frame:
+    found = tactile.latest()
+    assert found is not None
+    return found
+
+
+def test_frames_come_through_a_port_with_their_times(board):
+    board.stream(lambda k: frame(numbered(1, 1024, k)[0]))
+    tactile = sensor(board.path)
+    assert tactile.latest() is None
+    tactile.open()
+    first = newest(tactile)
+    assert first.valid
+    assert first.data.shape == (32, 32)
+    assert first.data.dtype == np.uint16
+    until(lambda: newest(tactile).seq >= first.seq + 20)
+    kept = first.data.copy()
+    now = newest(tactile)
+    assert now is not first
+    assert np.array_equal(first.data, kept)
+    assert now.t_arrival - now.t_sample == pytest.approx(1026 * 10 / 2e6 + 0.005)
+    assert 0.0 <= time.monotonic() - now.t_arrival < 1.0
+    assert len(set(now.data.ravel().tolist())) == 1
+    counters = tactile.counters()
+    assert counters["frames"] >= 20
+    assert counters["resyncs"] == counters["port_lost"] == 0
+    tactile.close()
+    tactile.close()
+    assert threading.active_count() == 2  # the board's own
+
+
+def test_a_frame_is_handed_over_while_the_line_is_quiet(board):
+    tactile = sensor(board.path, ROWS, COLS)
+    opener = threading.Thread(target=tactile.open)
+    opener.start()
+    until(lambda: tactile.counters()["bytes"] > 0 or _send(board, frame(bytes(CELLS)) * 2))
+    opener.join()
+    board.send(frame(b"\x07" * CELLS))  # nothing follows
+    until(lambda: newest(tactile).data[0, 0] == 7)
+    tactile.close()
+
+
+def _send(board: Board, data: bytes) -> bool:
+    board.send(data)
+    return False
+
+
+def test_a_missing_port_is_told(tmp_path):
+    with pytest.raises(TactileError, match=r"tactile-left: no such port"):
+        sensor(str(tmp_path / "tactile-left")).open()
+
+
+def test_a_path_that_is_no_port_is_told(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("")
+    with pytest.raises(TactileError, match="can't be opened as a serial port"):
+        sensor(str(path)).open()
+
+
+def test_a_busy_port_is_told(board):
+    with (
+        serial.Serial(board.path, 2_000_000, exclusive=True),
+        pytest.raises(TactileError, match="busy: another program"),
+    ):
+        sensor(board.path).open()
+
+
+def test_a_silent_port_is_told_with_its_name_and_the_timeout(board):
+    tactile = sensor(board.path, timeout=0.05)
+    with pytest.raises(TactileError, match=rf"{board.path}: no byte came within 0\.05 s"):
+        tactile.open()
+    assert threading.active_count() == 1
+    # And it can be opened once the board talks.
+    board.stream(lambda k: frame(bytes(1024)))
+    tactile.open()
+    tactile.close()
+
+
+def test_a_grid_of_another_size_is_told_with_both_sizes(board):
+    board.stream(lambda k: frame(bytes([k % 100]) * 256))
+    with pytest.raises(TactileError, match=r"256 cells \(16 × 16 if square\).*32 × 32 = 1024"):
+        sensor(board.path, timeout=0.3).open()
+
+
+def test_bytes_without_a_marker_are_told(board):
+    board.stream(lambda k: bytes(1024))
+    with pytest.raises(TactileError, match="no marker AA 55"):
+        sensor(board.path, timeout=0.1).open()
+
+
+def test_a_torn_stream_goes_on_and_is_counted(board):
+    def image(k: int) -> bytes:
+        whole = frame(numbered(1, 1024, k)[0])
+        return whole[: 37 * k % 1026] if k % 10 == 9 else whole
+
+    board.stream(image, period=0.001)
+    tactile = sensor(board.path)
+    tactile.open()
+    until(lambda: tactile.counters()["resyncs"] >= 5)
+    while tactile.counters()["resyncs"] < 10:
+        # Each image has one count everywhere: a splice of two would show.
+        assert np.ptp(newest(tactile).data) == 0
+    tactile.close()
+
+
+def test_a_stream_that_turns_to_noise_gives_an_invalid_frame(board):
+    rng = np.random.default_rng(0)
+    board.stream(lambda k: frame(bytes(1024)) if k < 10 else rng.bytes(1000))
+    tactile = sensor(board.path)
+    tactile.open()
+    until(lambda: not newest(tactile).valid)
+    assert newest(tactile).data.shape == (32, 32)
+    assert tactile.counters()["resyncs"] >= 1
+    assert "AA 55" in tactile.error
+    tactile.close()
+
+
+def test_a_port_that_disappears_gives_an_invalid_frame_and_no_crash(board):
+    board.stream(lambda k: frame(bytes(1024)))
+    tactile = sensor(board.path)
+    tactile.open()
+    seq = newest(tactile).seq
+    board.close()
+    until(lambda: not newest(tactile).valid)
+    assert newest(tactile).seq > seq
+    assert "gone" in tactile.error
+    assert tactile.counters()["port_lost"] == 1
+    tactile.close()
+    assert threading.active_count() == 1
+
+
+def test_the_reader_costs_little():
+    """A hundred frames a second must cost well below 1 % of a core to decode."""
+    decoder = FlexiTacDecoder(32, 32)
+    rng = np.random.default_rng(1)
+    frames = [frame(rng.integers(0, 160, 1024, dtype=np.uint8).tobytes()) for _ in range(1000)]
+    start = time.thread_time()
+    for data in frames:
+        decoder.feed(data, 0.0)
+    spent = time.thread_time() - start
+    assert decoder.counters()["frames"] == 999
+    assert spent / 1000 < 100e-6  # measured 4 µs; 100 µs would be 1 % of a core
