@@ -44,8 +44,8 @@ class Loop:
         self.period = 1.0 / settings.loop.rate
         self._settings = settings
         self._clock = clock
-        self._servos = servos
-        self._perceptions = perceptions
+        self.servos = servos
+        self.perceptions = perceptions
         self._objects = objects
         self._publisher = publisher
         self._server = server
@@ -128,10 +128,10 @@ class Loop:
 
     def _read(self, now: float) -> None:
         reading = self.state.reading
-        if self._servos is None:
+        if self.servos is None:
             return
         try:
-            self._servos.read(reading)
+            self.servos.read(reading)
         except ServoError as error:
             reading.valid = False
             self._fail(str(error))
@@ -141,7 +141,7 @@ class Loop:
 
     def _feel(self) -> None:
         new = False
-        for perception in self._perceptions:
+        for perception in self.perceptions:
             contact = self.state.contacts[perception.finger]
             new |= perception.update(contact, self._history)
         if new and self._objects is not None:
@@ -173,7 +173,7 @@ class Loop:
         state.mode = control.mode
 
     def _write(self, now: float) -> None:
-        state, servos = self.state, self._servos
+        state, servos = self.state, self.servos
         if servos is None:
             return
         wanted = self._control.torque
@@ -196,7 +196,7 @@ class Loop:
         if publisher.wants_state and seq % self._state_every == 0:
             publisher.state(self.state, self._fingers)
         if publisher.wants_tactile and seq % self._tactile_every == 0:
-            for perception in self._perceptions:
+            for perception in self.perceptions:
                 self._publish_frame(publisher, perception)
 
     def _publish_frame(self, publisher: Publisher, perception: FingerPerception) -> None:
@@ -221,7 +221,7 @@ class Loop:
                 raise Refused(f"{command.name}: {cause}")
         reply = control.command(command)
         if command.name == "tare":
-            for perception in self._perceptions:
+            for perception in self.perceptions:
                 perception.tare()
         if command.name == "clear":
             self.state.fault = ""
@@ -231,8 +231,8 @@ class Loop:
 
     def _status(self) -> dict[str, Any]:
         state = self.state
-        counters = {} if self._servos is None else {"servos": self._servos.counters()}
-        for perception in self._perceptions:
+        counters = {} if self.servos is None else {"servos": self.servos.counters()}
+        for perception in self.perceptions:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
         return {
             "fault": state.fault,
@@ -262,10 +262,10 @@ class Loop:
 
     def _torque_off(self) -> None:
         self._control.torque = False
-        if self._servos is None or not self.state.torque:
+        if self.servos is None or not self.state.torque:
             return
         try:
-            self._servos.set_torque(False)
+            self.servos.set_torque(False)
             self.state.torque = False
         except ServoError as error:
             self.emit("error", "servos", f"torque could not be turned off: {error}")

@@ -1,0 +1,1 @@
+"""The measurements behind ``softfinger bench``, one module each, with ``measure() -> rows``."""

@@ -1,0 +1,44 @@
+"""What a measurement returns, and the statistics that all of them share."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured quantity: its median and tail in ``unit``, from ``count`` samples."""
+
+    name: str
+    unit: str
+    median: float
+    p99: float
+    count: int
+    aim: float | None = None  # for the median, where there is one
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the JSON file."""
+        return asdict(self)
+
+
+def row(name: str, unit: str, samples: ArrayLike, aim: float | None = None) -> Row:
+    """Summarise samples that are already in ``unit``."""
+    values = np.asarray(samples, dtype=np.float64)
+    median, p99 = np.percentile(values, [50.0, 99.0])
+    return Row(name, unit, float(median), float(p99), len(values), aim)
+
+
+def table(rows: list[Row]) -> str:
+    """The rows as an aligned table."""
+    lines = [f"{'':58} {'median':>9} {'p99':>9} {'unit':>4} {'aim':>7} {'n':>7}"]
+    for each in rows:
+        aim = "" if each.aim is None else f"≤ {each.aim:g}"
+        lines.append(
+            f"{each.name:58} {each.median:9.3f} {each.p99:9.3f} {each.unit:>4} {aim:>7} "
+            f"{each.count:7d}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,141 @@
+"""The tick without serial: the pipeline alone on canned readings, and with the simulated hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import zmq
+
+from daemon.assembly import Daemon
+from daemon.clock import VirtualClock
+from daemon.loop import Loop
+from daemon.records import Frame, Goal, Reading
+from daemon.settings import Settings
+from tools.benchmarks.report import Row, row
+
+_TICKS = 20_000
+_GRIP = 8.0  # N
+
+
+def measure() -> list[Row]:
+    """Ticks of a hand that holds an object, in µs."""
+    rows = []
+    for subscribed in (False, True):
+        words = "state and frames subscribed" if subscribed else "nobody subscribed"
+        for canned in (True, False):
+            plant = "pipeline alone" if canned else "with the simulated hand's physics"
+            with _holding(subscribed) as daemon:
+                samples = _run(_can(daemon) if canned else daemon.loop, daemon)
+            aim = 20.0 if canned else None
+            rows.append(row(f"tick, {plant}, {words}", "µs", samples, aim))
+    return rows
+
+
+@contextmanager
+def _holding(subscribed: bool) -> Iterator[Daemon]:
+    """A daemon on virtual time that has grasped the simulated object."""
+    settings = Settings.model_validate(
+        {
+            "loop": {"clock": "virtual"},
+            "stream": {"address": "tcp://127.0.0.1:19872"},
+            "commands": {"address": "tcp://127.0.0.1:19873"},
+        }
+    )
+    context: zmq.Context[Any] = zmq.Context()
+    socket = context.socket(zmq.SUB)
+    with Daemon(settings) as daemon:
+        if subscribed:
+            socket.setsockopt(zmq.SUBSCRIBE, b"hand")
+            socket.connect(settings.stream.address)
+        daemon.loop.run(0.2)
+        daemon.loop.command({"command": "arm"})
+        _advance(daemon, 0.2)
+        daemon.loop.command({"command": "grasp", "force": _GRIP})
+        _advance(daemon, 3.0)
+        assert daemon.loop.state.mode == "holding", daemon.loop.state.mode
+        yield daemon
+    socket.close(linger=0)
+    context.term()
+
+
+def _advance(daemon: Daemon, seconds: float) -> None:
+    clock, loop = daemon.clock, daemon.loop
+    finish = clock.now() + seconds
+    while clock.now() < finish:
+        clock.sleep_until(clock.now() + loop.period)
+        loop.tick(clock.now())
+
+
+def _run(loop: Loop, daemon: Daemon) -> list[float]:
+    clock = daemon.clock
+    samples = []
+    for _ in range(_TICKS):
+        clock.sleep_until(clock.now() + loop.period)
+        before = time.perf_counter_ns()
+        loop.tick(clock.now())
+        samples.append((time.perf_counter_ns() - before) * 1e-3)
+    return samples
+
+
+class _CannedServos:
+    """Always the same good reading; goals go nowhere."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._q = reading.q.copy()
+        self._current = reading.current.copy()
+
+    def connect(self) -> None: ...
+
+    def read(self, reading: Reading) -> None:
+        reading.seq += 1
+        reading.valid = True
+        reading.q[:] = self._q
+        reading.current[:] = self._current
+
+    def set_torque(self, on: bool) -> None: ...
+
+    def write(self, goal: Goal) -> None: ...
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None: ...
+
+
+class _CannedSensor:
+    """The same counts again and again, a new frame at the sensor's rate."""
+
+    def __init__(self, counts: np.ndarray[Any, np.dtype[np.uint16]], period: float, clock: Any):
+        self._counts = counts
+        self._period = period
+        self._clock = clock
+        self._frame = Frame(1, clock.now(), clock.now(), True, counts)
+
+    def open(self) -> None: ...
+
+    def latest(self) -> Frame:
+        now = self._clock.now()
+        if now - self._frame.t_arrival >= self._period:
+            self._frame = Frame(self._frame.seq + 1, now, now, True, self._counts)
+        return self._frame
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None: ...
+
+
+def _can(daemon: Daemon) -> Loop:
+    """Put canned backends in place of the simulated ones, with what those last said."""
+    loop = daemon.loop
+    assert isinstance(daemon.clock, VirtualClock)
+    for perception in loop.perceptions:
+        assert perception.frame is not None
+        period = 1.0 / daemon.settings.tactile.rate
+        perception.sensor = _CannedSensor(perception.frame.data, period, daemon.clock)
+    loop.servos = _CannedServos(loop.state.reading)
+    return loop
