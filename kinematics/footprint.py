@@ -1,0 +1,133 @@
+"""Where the pressed tip touches: the footprint's outline on a grid of cells, as kernels.
+
+Holds the geometry that the forward model and the estimator share, and no pressure. Lengths are m in
+the sensor's axes, counted from the tip's centre. The object's face is the plane ``n·(x, y, z) = h``
+with ``h = a − d``; over the base point (x, y) it stands at ``z = u − v x − w y`` where
+
+    u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
+
+and the strain of the spring there is ``ε = 1 − (u − v x − w y)/√(a² − x² − y²)`` (eq. 2 of the
+parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc: an ellipse, or,
+beyond the domain's limit, an ellipse cut by the rim; convex in both cases.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinematics.kernels import kernel
+
+MAX_NODES = 12
+
+
+def _gauss_table() -> tuple[np.ndarray, np.ndarray]:
+    nodes = np.zeros((MAX_NODES + 1, MAX_NODES))
+    weights = np.zeros((MAX_NODES + 1, MAX_NODES))
+    for n in range(1, MAX_NODES + 1):
+        x, weight = np.polynomial.legendre.leggauss(n)
+        nodes[n, :n] = 0.5 * (x + 1.0)
+        weights[n, :n] = 0.5 * weight
+    return nodes, weights
+
+
+# Gauss-Legendre rules on [0, 1], row n holds the n-point rule.
+GAUSS_NODES, GAUSS_WEIGHTS = _gauss_table()
+
+
+@kernel
+def plane(a, d, n_x, n_y):
+    """(u, v, w) of the object's face; the normal's z component must be positive."""
+    n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
+    return (a - d) / n_z, n_x / n_z, n_y / n_z
+
+
+@kernel
+def line_span(u, v, w, a, y):
+    """Ends (left, right) in x of the footprint on the line ``y``; (inf, −inf) if it has none.
+
+    To cut along a line of constant x instead, exchange v and w.
+    """
+    rim = a * a - y * y
+    if rim <= 0.0:
+        return math.inf, -math.inf
+    q = u - w * y
+    e = 1.0 + v * v
+    root = e * rim - q * q
+    if root <= 0.0:
+        if q < 0.0:
+            half = math.sqrt(rim)
+            return -half, half
+        return math.inf, -math.inf
+    root = math.sqrt(root)
+    left = (v * q - root) / e
+    right = (v * q + root) / e
+    # A root under the base plane is no edge: there the spring is gone and the rim is the edge.
+    if q < v * left:
+        left = -math.sqrt(rim)
+    if q < v * right:
+        right = math.sqrt(rim)
+    return left, right
+
+
+@kernel
+def beyond_limit(u, v, w, a):
+    """Whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
+    return u <= 0.0 or u * u < (v * v + w * w) * a * a
+
+
+@kernel
+def extremes(u, v, w, a):
+    """(y of the lowest, y of the highest point, y of the leftmost, its x, y of the rightmost, its x).
+
+    Empty (inf, −inf, …) when the face is off the tip. Beyond the limit the two y are the rim's.
+    """
+    inf = math.inf
+    s = 1.0 + v * v + w * w
+    if s * a * a <= u * u and u > 0.0:
+        return inf, -inf, 0.0, inf, 0.0, -inf
+    if beyond_limit(u, v, w, a):
+        return -a, a, 0.0, -a, 0.0, a
+    root = s * a * a - u * u
+    reach = math.sqrt((1.0 + v * v) * root)
+    low = (u * w - reach) / s
+    high = (u * w + reach) / s
+    reach = math.sqrt((1.0 + w * w) * root)
+    left = (u * v - reach) / s
+    right = (u * v + reach) / s
+    e = 1.0 + w * w
+    return low, high, w * (u - v * left) / e, left, w * (u - v * right) / e, right
+
+
+@kernel
+def band_columns(u, v, w, a, ends, below, above, y0, y1, x_first, pitch_x, cols):
+    """Columns (a, b, c, d) of the cells in the band y0..y1: a..d touch the footprint, b..c lie in it.
+
+    ``ends`` is what :func:`extremes` gave, ``below`` and ``above`` the spans at y0 and y1. Cells a..b
+    and c..d may be cut by the outline, and beyond the limit some of them lie outside.
+    """
+    if beyond_limit(u, v, w, a):
+        nearest = 0.0 if y0 * y1 <= 0.0 else min(abs(y0), abs(y1))
+        outer_right = math.sqrt(max(a * a - nearest * nearest, 0.0))
+        outer_left = -outer_right
+    else:
+        outer_left = min(below[0], above[0])
+        outer_right = max(below[1], above[1])
+        if y0 <= ends[2] <= y1:
+            outer_left = ends[3]
+        if y0 <= ends[4] <= y1:
+            outer_right = ends[5]
+    if not outer_left < outer_right:
+        return 0, 0, 0, 0
+    first = min(max(math.floor((outer_left - x_first) / pitch_x), 0), cols)
+    last = min(max(math.ceil((outer_right - x_first) / pitch_x), first), cols)
+    inner_left = max(below[0], above[0])
+    inner_right = min(below[1], above[1])
+    if not inner_left < inner_right:
+        return first, last, last, last
+    inner_first = max(math.ceil((inner_left - x_first) / pitch_x), first)
+    inner_last = min(math.floor((inner_right - x_first) / pitch_x), last)
+    if inner_first >= inner_last:
+        return first, last, last, last
+    return first, inner_first, inner_last, last

@@ -1,0 +1,150 @@
+"""The forward model: what a pressure grid of given cells under a soft tip would read.
+
+Holds the sensor's geometry (`SensorGrid`) and the rendering of a contact on it. Every cell reads the
+pressure averaged over its area; sensor imperfections (noise, counts, dead cells) are not here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinematics.cells import MAX_BREAKS, cut_cell_stress, whole_cell_stress
+from kinematics.contact import Fingertip
+from kinematics.footprint import band_columns, extremes, line_span, plane
+from kinematics.kernels import kernel
+from kinematics.material import Material
+
+FloatArray = NDArray[np.float64]
+
+
+@kernel
+def render(geometry, law, gain, d, n_x, n_y, out):
+    """Write the pressure [Pa] of a contact, averaged over each cell, into ``out`` [rows, cols].
+
+    ``geometry`` is :meth:`SensorGrid.geometry`, ``law`` the material's, (n_x, n_y) the first two
+    components of the object's outward normal in the sensor's axes. d ≤ 0 gives zeros. Beyond the
+    domain's limit the footprint ends at the rim and the strain stays ≤ 1.
+    """
+    a, x_first, y_first, pitch_x, pitch_y = geometry
+    rows, cols = out.shape
+    out[:] = 0.0
+    if not (0.0 < d and n_x * n_x + n_y * n_y < 1.0):
+        return
+    u, v, w = plane(a, min(d, a), n_x, n_y)
+    ends = extremes(u, v, w, a)
+    breaks = np.empty(MAX_BREAKS)
+    first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows) if d > 0.0 else 0
+    last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), 0), rows)
+    above = line_span(u, v, w, a, y_first + first_row * pitch_y)
+    for i in range(first_row, last_row):
+        y0 = y_first + i * pitch_y
+        y1 = y_first + (i + 1) * pitch_y
+        below = above
+        above = line_span(u, v, w, a, y1)
+        first, inner_first, inner_last, last = band_columns(
+            u, v, w, a, ends, below, above, y0, y1, x_first, pitch_x, cols
+        )
+        for j in range(first, last):
+            x0 = x_first + j * pitch_x
+            x1 = x_first + (j + 1) * pitch_x
+            if inner_first <= j < inner_last:
+                stress = whole_cell_stress(law, u, v, w, a, x0, x1, y0, y1)
+            else:
+                stress = cut_cell_stress(law, u, v, w, a, x0, x1, y0, y1, breaks)
+            out[i, j] = gain * stress
+
+
+@dataclass(frozen=True)
+class SensorGrid:
+    """Rows × cols cells of a pressure sensor under a tip; rows run along y, columns along x.
+
+    ``pitch`` [m] is one number or (x, y). ``centre`` [m] is the tip's centre in the sensor's axes,
+    counted from the middle of the grid. ``rotation`` [rad] turns the sensor's axes against the
+    finger's, counter-clockwise seen along +z. Raises ValueError for values that make no grid.
+    """
+
+    rows: int
+    cols: int
+    pitch: float | tuple[float, float]
+    centre: tuple[float, float] = (0.0, 0.0)
+    rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.cols < 1:
+            raise ValueError(f"a grid needs rows and columns, got {self.rows} × {self.cols}")
+        if not all(math.isfinite(p) and p > 0.0 for p in self.pitches):
+            raise ValueError(f"pitch must be positive, got {self.pitch}")
+        if not all(math.isfinite(c) for c in (*self.centre, self.rotation)):
+            raise ValueError("centre and rotation must be finite")
+
+    @property
+    def pitches(self) -> tuple[float, float]:
+        """Cell size (x, y) [m]."""
+        if isinstance(self.pitch, tuple):
+            return self.pitch
+        return self.pitch, self.pitch
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols)."""
+        return self.rows, self.cols
+
+    def geometry(self, tip: Fingertip) -> tuple[float, float, float, float, float]:
+        """(a, x and y of the first cell's corner from the tip's centre, pitch x, pitch y) [m]."""
+        pitch_x, pitch_y = self.pitches
+        return (
+            float(tip.radius),
+            -0.5 * self.cols * pitch_x - self.centre[0],
+            -0.5 * self.rows * pitch_y - self.centre[1],
+            float(pitch_x),
+            float(pitch_y),
+        )
+
+    def to_sensor(self, n_x: float, n_y: float) -> tuple[float, float]:
+        """A vector's components along the finger's axes → along the sensor's."""
+        if self.rotation == 0.0:
+            return n_x, n_y
+        c, s = math.cos(self.rotation), math.sin(self.rotation)
+        return c * n_x + s * n_y, c * n_y - s * n_x
+
+    def pressure(
+        self,
+        tip: Fingertip,
+        material: Material,
+        d: float,
+        tilt_x: float = 0.0,
+        tilt_y: float = 0.0,
+        gain: float = 1.0,
+        out: FloatArray | None = None,
+    ) -> FloatArray:
+        """Pressure [Pa] averaged over each cell, float64 [rows, cols].
+
+        ``d`` [m] is the displacement, the tilts [rad] give the object's normal
+        (sin tilt_x, sin tilt_y, …). Accurate to 1e-6 of the modulus, cut cells included. ``out`` is
+        written and returned if given. Raises ValueError for a d that is not finite or exceeds the
+        radius, and for tilts whose normal would point into the tip.
+        """
+        n_x, n_y = normal(d, tilt_x, tilt_y, tip.radius)
+        if out is None:
+            out = np.empty(self.shape)
+        elif out.shape != self.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
+            raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
+        s_x, s_y = self.to_sensor(n_x, n_y)
+        render(self.geometry(tip), material.law, float(gain), float(d), s_x, s_y, out)
+        return out
+
+
+def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float, float]:
+    """(n_x, n_y) of tilts [rad], after checking that the contact is one. Raises ValueError."""
+    if not (math.isfinite(d) and math.isfinite(tilt_x) and math.isfinite(tilt_y)):
+        raise ValueError(f"d and tilts must be finite, got {d}, {tilt_x}, {tilt_y}")
+    if d > radius:
+        raise ValueError(f"d = {d} m is more than the tip's radius {radius} m")
+    n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
+    if abs(tilt_x) >= 0.5 * math.pi or abs(tilt_y) >= 0.5 * math.pi or n_x**2 + n_y**2 >= 1.0:
+        raise ValueError(f"tilts {tilt_x}, {tilt_y} rad don't make a normal out of the tip")
+    return n_x, n_y
