@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -59,18 +60,19 @@ def run(arguments: argparse.Namespace) -> int:
         settle()
         _on_signals(daemon.loop)
         log.line("info", "start", _ready(settings, daemon))
-        page = None
-        if arguments.monitor:
-            from tools.monitor import start_beside
-
-            page = start_beside(settings.stream.address, settings.commands.address)
-        try:
+        with _page(settings, daemon.loop) if arguments.monitor else nullcontext():
             daemon.loop.run(arguments.duration)
-        finally:
-            if page is not None:
-                page.terminate()
-                page.wait()
-    return 1 if daemon.loop.state.fault else 0
+    state = daemon.loop.state
+    if state.fault:
+        print(f"softfinger: ended with a fault: {state.fault}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
+    from tools.beside import start_beside
+
+    return start_beside(settings.stream.address, settings.commands.address, on_end=loop.end)
 
 
 def _scene(settings: Settings) -> str:
