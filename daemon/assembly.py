@@ -17,18 +17,14 @@ import zmq
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.loop import EventSink, Loop
-from daemon.perception import FingerPerception, JointHistory, ObjectPerception
+from daemon.model import make_estimator, make_grid, make_material, make_table, make_tip
+from daemon.perception import FingerPerception, ObjectPerception
 from daemon.records import FINGERS, Contact, ObjectPose
 from daemon.servos import make_servos
 from daemon.servos.base import Servos
-from daemon.settings import MaterialLaw, Settings, SettingsError
+from daemon.settings import Settings
 from daemon.stream import Publisher
 from daemon.tactile import make_sensor
-from kinematics.contact import Fingertip
-from kinematics.estimator import ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from kinematics.table import ContactTable
 
 
 class Daemon:
@@ -125,47 +121,6 @@ class Daemon:
         self.close()
 
 
-def make_material(law: MaterialLaw) -> Material:
-    """The settings' stress-strain law. Raises SettingsError when the points are no such law."""
-    if law.law == "constant":
-        return Material.constant(law.modulus)
-    if law.law == "table_i":
-        return Material.table_i()
-    try:
-        return Material.from_points(np.array(law.strain), np.array(law.stress))
-    except ValueError as error:
-        raise SettingsError(f"material.strain, material.stress: {error}") from None
-
-
-def make_table(settings: Settings, material: Material, cache: Path | None) -> ContactTable:
-    """The contact table, from its file in ``cache`` where one fits."""
-    tip = Fingertip(radius=settings.tip.radius)
-    tolerance = settings.table.tolerance
-    if cache is None:
-        return ContactTable.build(tip, material, tolerance=tolerance)
-    return ContactTable.load_or_build(cache, tip, material, tolerance=tolerance)
-
-
-def make_grid(settings: Settings) -> SensorGrid:
-    """The sensor's cells."""
-    tactile = settings.tactile
-    return SensorGrid(
-        rows=tactile.rows, cols=tactile.cols, pitch=tactile.pitch, centre=tactile.centre
-    )
-
-
-def make_estimator(settings: Settings, material: Material) -> ContactEstimator:
-    """An estimator of its own for each finger, since it starts from its last estimate."""
-    return ContactEstimator(
-        Fingertip(radius=settings.tip.radius),
-        material,
-        make_grid(settings),
-        noise=settings.tactile.noise,
-        method=settings.estimator.method,
-        free_gain=settings.estimator.free_gain,
-    )
-
-
 def warm_up(
     settings: Settings, perceptions: list[FingerPerception], objects: ObjectPerception | None
 ) -> None:
@@ -174,11 +129,7 @@ def warm_up(
         return
     tactile = settings.tactile
     pressure = make_grid(settings).pressure(
-        Fingertip(radius=settings.tip.radius),
-        make_material(settings.material),
-        0.1 * settings.tip.radius,
-        0.1,
-        0.0,
+        make_tip(settings), make_material(settings.material), 0.1 * settings.tip.radius, 0.1, 0.0
     )
     counts = np.clip(np.round(pressure / tactile.pascal_per_count), 0, 65535).astype(np.uint16)
     contacts = [Contact(), Contact()]
@@ -189,4 +140,3 @@ def warm_up(
         for contact in contacts:
             contact.valid = contact.contact = True
         objects.update(contacts, ObjectPose())
-    JointHistory(0.1, 0.01).append(0.0, [0.0, 0.0])

@@ -77,39 +77,42 @@ class Loop:
     # Time
 
     def run(self, duration: float | None = None) -> None:
-        """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards.
-
-        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst.
-        """
-        clock = self._clock
-        start = deadline = clock.now()
-        finish = None if duration is None else start + duration
-        self.state.reading.t = start
+        """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
+        self.state.t = self.state.reading.t = self._clock.now()
+        self.state.wall = self._clock.wall()
         self.emit("info", "start", "running, disarmed")
-        last = start - self.period
         try:
-            while not self._ending:
-                clock.sleep_until(deadline)
-                now = clock.now()
-                if finish is not None and now >= finish:
-                    break
-                timing = self.state.timing
-                timing.wake_late_s = now - deadline
-                timing.tick_s = now - last
-                last = now
-                self.tick(now)
-                done = clock.now()
-                timing.compute_s = done - now
-                deadline += self.period
-                if done > deadline:
-                    timing.overruns += 1
-                    self._safety.overruns_in_row += 1
-                    deadline = done
-                else:
-                    self._safety.overruns_in_row = 0
+            self.advance(duration)
         finally:
             self._torque_off()
             self.emit("info", "end", "ended, torque off")
+
+    def advance(self, duration: float | None = None) -> None:
+        """Tick for ``duration`` s, or until `end`, and leave the hand as it is then.
+
+        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst.
+        """
+        clock, timing = self._clock, self.state.timing
+        deadline = clock.now()
+        last = deadline - self.period
+        finish = None if duration is None else deadline + duration - 0.5 * self.period
+        while not self._ending and (finish is None or deadline < finish):
+            clock.sleep_until(deadline)
+            now = clock.now()
+            timing.wake_late_s = now - deadline
+            timing.tick_s = now - last
+            last = now
+            self.tick(now)
+            done = clock.now()
+            timing.compute_s = done - now
+            deadline += self.period
+            if done > deadline:
+                timing.overruns += 1
+                self._safety.overruns_in_row += 1
+                deadline = done
+            else:
+                self._safety.overruns_in_row = 0
+        clock.sleep_until(deadline)
 
     # The tick
 

@@ -18,7 +18,7 @@ class TactileSensor(Protocol):
         """Open the sensor and wait for a first good frame. Raises TactileError if none comes."""
 
     def latest(self) -> Frame | None:
-        """The newest complete frame, or None before the first. The same object until a newer came."""
+        """The newest complete frame, None before the first; the same object until a newer one."""
 
     def counters(self) -> dict[str, int]:
         """What went by or went wrong since open: ``frames``, ``resyncs``, ``skipped_bytes``, …"""

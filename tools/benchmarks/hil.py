@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from daemon.assembly import Daemon
 from daemon.loop import Loop
@@ -39,7 +40,10 @@ def measure() -> list[Row]:
 
 
 def _hold(loop: Loop, daemon: Daemon) -> list[Row]:
-    script = [(0.2, {"command": "arm"}), (0.5, {"command": "grasp", "force": 10.0})]
+    script: list[tuple[float, dict[str, Any]]] = [
+        (0.2, {"command": "arm"}),
+        (0.5, {"command": "grasp", "force": 10.0}),
+    ]
     compute, late, cpu = [], [], time.process_time()
     loop.run(0.05)
     clock = daemon.clock

@@ -51,23 +51,17 @@ def _holding(subscribed: bool) -> Iterator[Daemon]:
         if subscribed:
             socket.setsockopt(zmq.SUBSCRIBE, b"hand")
             socket.connect(settings.stream.address)
-        daemon.loop.run(0.2)
-        daemon.loop.command({"command": "arm"})
-        _advance(daemon, 0.2)
-        daemon.loop.command({"command": "grasp", "force": _GRIP})
-        _advance(daemon, 3.0)
-        assert daemon.loop.state.mode == "holding", daemon.loop.state.mode
+        loop = daemon.loop
+        loop.advance(0.2)
+        loop.command({"command": "arm"})
+        loop.advance(0.2)
+        loop.command({"command": "grasp", "force": _GRIP})
+        loop.advance(3.0)
+        if loop.state.mode != "holding":
+            raise RuntimeError(f"the hand did not hold: {loop.state.mode} {loop.state.fault}")
         yield daemon
     socket.close(linger=0)
     context.term()
-
-
-def _advance(daemon: Daemon, seconds: float) -> None:
-    clock, loop = daemon.clock, daemon.loop
-    finish = clock.now() + seconds
-    while clock.now() < finish:
-        clock.sleep_until(clock.now() + loop.period)
-        loop.tick(clock.now())
 
 
 def _run(loop: Loop, daemon: Daemon) -> list[float]:

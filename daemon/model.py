@@ -1,0 +1,60 @@
+"""From settings to the objects of `kinematics` that they describe, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from daemon.settings import MaterialLaw, Settings, SettingsError
+from kinematics.contact import Fingertip
+from kinematics.estimator import ContactEstimator
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+from kinematics.table import ContactTable
+
+
+def make_tip(settings: Settings) -> Fingertip:
+    """The fingertip."""
+    return Fingertip(radius=settings.tip.radius)
+
+
+def make_material(law: MaterialLaw) -> Material:
+    """The settings' stress-strain law. Raises SettingsError when the points are no such law."""
+    if law.law == "constant":
+        return Material.constant(law.modulus)
+    if law.law == "table_i":
+        return Material.table_i()
+    try:
+        return Material.from_points(np.array(law.strain), np.array(law.stress))
+    except ValueError as error:
+        raise SettingsError(f"material.strain, material.stress: {error}") from None
+
+
+def make_table(settings: Settings, material: Material, cache: Path | None) -> ContactTable:
+    """The contact table, from its file in ``cache`` where one fits."""
+    tip = make_tip(settings)
+    tolerance = settings.table.tolerance
+    if cache is None:
+        return ContactTable.build(tip, material, tolerance=tolerance)
+    return ContactTable.load_or_build(cache, tip, material, tolerance=tolerance)
+
+
+def make_grid(settings: Settings) -> SensorGrid:
+    """The sensor's cells."""
+    tactile = settings.tactile
+    return SensorGrid(
+        rows=tactile.rows, cols=tactile.cols, pitch=tactile.pitch, centre=tactile.centre
+    )
+
+
+def make_estimator(settings: Settings, material: Material) -> ContactEstimator:
+    """An estimator of its own for each finger, since it starts from its last estimate."""
+    return ContactEstimator(
+        make_tip(settings),
+        material,
+        make_grid(settings),
+        noise=settings.tactile.noise,
+        method=settings.estimator.method,
+        free_gain=settings.estimator.free_gain,
+    )
