@@ -1,0 +1,132 @@
+"""Servos of the simulated hand, in this process: the plant behind the real ones' resolution."""
+
+from __future__ import annotations
+
+import math
+
+from daemon.clock import Clock
+from daemon.records import FINGERS, Goal, Reading
+from daemon.servos.base import ServoError
+from daemon.servos.models import by_name
+from daemon.servos.units import JointScale
+from daemon.settings import Settings
+from daemon.simulation import layout
+from daemon.simulation.hand import SimulatedHand
+
+
+class SimulatedServos:
+    """The joints of a :class:`SimulatedHand`, read and told in the configured model's counts.
+
+    Every exchange brings the hand to the clock's time first. With a watchdog set, torque goes off
+    by itself that long after the last exchange, and only :meth:`set_torque` brings it back.
+    """
+
+    def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock) -> None:
+        self._settings = settings
+        self._hand = hand
+        self._clock = clock
+        self._joints = sorted(FINGERS.index(name) for name in settings.scene.fingers)
+        self._scales: list[JointScale] = []
+        self._watchdog = settings.servos.watchdog or math.inf
+        self._connected = False
+        self._torque = False
+        self._last = -math.inf
+        self._goal_q = [0.0, 0.0]
+        self._goal_current = [0.0, 0.0]
+        self._seq = 0
+        self._trips = 0
+
+    def connect(self) -> None:
+        """Take the servos, torque off. Raises ServoError when the model can't do the job."""
+        try:
+            model = by_name(self._settings.servos.model)
+        except KeyError as error:
+            raise ServoError(f"servos.model: {error.args[0]}") from None
+        if layout.CURRENT_BASED_POSITION_MODE not in model.modes:
+            raise ServoError(
+                f"servos.model: {model.name} has no current-based position mode; "
+                "choose a model that senses current"
+            )
+        self._scales = [JointScale.of(self._settings.servos, joint, model) for joint in range(2)]
+        self._connected = True
+        self._exchange()
+        self._switch(False)
+
+    def read(self, reading: Reading) -> None:
+        """Fill ``reading`` with angle, velocity and current, each to the servo's own count."""
+        if not self._connected:
+            reading.valid = False
+            return
+        reading.t = self._exchange()
+        hand = self._hand
+        for joint in self._joints:
+            scale = self._scales[joint]
+            reading.q[joint] = scale.angle(scale.position_counts(hand.q[joint]))
+            reading.dq[joint] = scale.rate(scale.velocity_counts(hand.dq[joint]))
+            reading.current[joint] = scale.amperes(scale.current_counts(hand.current[joint]))
+        self._seq += 1
+        reading.seq = self._seq
+        reading.alert = 0
+        reading.valid = True
+
+    def set_torque(self, on: bool) -> None:
+        """Torque on, with the goal at the present count and no current until a goal is written."""
+        if not self._connected:
+            raise ServoError("the simulated servos are not connected")
+        self._exchange()
+        if on:
+            for joint in self._joints:
+                scale = self._scales[joint]
+                self._goal_q[joint] = scale.angle(scale.position_counts(self._hand.q[joint]))
+                self._goal_current[joint] = 0.0
+        self._switch(on)
+
+    def write(self, goal: Goal) -> None:
+        """Give each servo its goal angle and current bound, rounded to what a register holds."""
+        if not self._connected:
+            return
+        self._exchange()
+        for joint in self._joints:
+            scale = self._scales[joint]
+            self._goal_q[joint] = scale.angle(scale.position_counts(goal.q[joint]))
+            counts = scale.bound_counts(goal.current[joint])
+            self._goal_current[joint] = counts * scale.current_unit
+        self._drive()
+
+    def counters(self) -> dict[str, int]:
+        """``timeouts`` and ``crc`` stay 0; ``watchdog`` counts how often torque went off by it."""
+        return {"timeouts": 0, "crc": 0, "watchdog": self._trips}
+
+    def close(self) -> None:
+        """Torque off."""
+        if self._connected:
+            self._exchange()
+            self._switch(False)
+            self._connected = False
+
+    def _exchange(self) -> float:
+        """Bring the hand to now, letting the watchdog act on the way, and start it anew."""
+        now = self._clock.now()
+        if self._torque and now > self._last + self._watchdog:
+            self._torque = False
+            self._trips += 1
+        self._hand.advance(now)
+        self._last = now
+        if self._torque:
+            self._hand.hold_torque_until(now + self._watchdog)
+        return now
+
+    def _switch(self, on: bool) -> None:
+        self._torque = on
+        self._hand.hold_torque_until(self._last + self._watchdog if on else math.inf)
+        self._drive()
+
+    def _drive(self) -> None:
+        for joint in self._joints:
+            self._hand.drive(
+                joint,
+                layout.CURRENT_BASED_POSITION_MODE,
+                self._torque,
+                self._goal_q[joint],
+                self._goal_current[joint],
+            )

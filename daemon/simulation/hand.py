@@ -1,0 +1,167 @@
+"""The simulated hand: the plant's state, what the servos tell it and what its tips feel.
+
+Time moves only by :meth:`SimulatedHand.advance`; the state depends on nothing but the settings and
+on when which command came, so that two runs are the same to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.settings import Settings
+from daemon.simulation import layout, plant, tip
+from daemon.simulation.parameters import parameters_of, stiff_step, table_of
+from kinematics.table import ContactTable
+
+FloatArray = NDArray[np.float64]
+
+SAMPLES_KEPT = 64
+LONGEST_ADVANCE = 10.0  # s of simulated time in one kernel call
+
+_MODES = (
+    layout.CURRENT_MODE,
+    layout.POSITION_MODE,
+    layout.CURRENT_BASED_POSITION_MODE,
+)
+
+
+class SimulatedHand:
+    """Two jointed fingers with soft tips and the object between them, in one plane.
+
+    Which tips take part is ``settings.scene.fingers``. With one finger the object is fixed to the
+    bench, as in a compression test. Without servos (``settings.servos.backend`` is ``none``) the
+    joints stay at ``settings.hand.open_angle``, and with ``simulation.compression_speed`` above 0
+    the object is moved to and fro, onto the left tip and onto the right one, 0.4 radii deep.
+
+    The arrays given out are views of the state, (2,) left first: valid until the next ``advance``.
+    """
+
+    def __init__(
+        self, settings: Settings, start: float = 0.0, table: ContactTable | None = None
+    ) -> None:
+        """Build the plant at rest, torque off, at time ``start`` [s].
+
+        ``table`` is the contact table of the settings' tip and material, built when not given.
+        """
+        self.table = table_of(settings) if table is None else table
+        self.step = stiff_step(settings, self.table)
+        self.start = start
+        self.params = parameters_of(settings, self.table, self.step)
+        self.state = np.zeros(layout.STATE)
+        simulation = settings.simulation
+        self.state[layout.POSITION : layout.POSITION + 2] = settings.hand.open_angle
+        self.state[layout.POSITION + 2 : layout.POSITION + 4] = simulation.object_position
+        self.state[layout.POSITION + 4] = simulation.object_angle
+        self.goals = np.zeros((2, layout.GOALS))
+        self.goals[:, layout.MODE] = layout.CURRENT_BASED_POSITION_MODE
+        self._ring = np.full((SAMPLES_KEPT, layout.SAMPLE), -1.0)
+        self._work = np.zeros((layout.WORK_ROWS, tip.WORK))
+        self._done = 0
+        self._torque_until = math.inf
+        self._per_step = 1.0 / self.step
+        state = self.state
+        self.q: FloatArray = state[layout.POSITION : layout.POSITION + 2]  # rad
+        self.dq: FloatArray = state[layout.VELOCITY : layout.VELOCITY + 2]  # rad/s
+        self.current: FloatArray = state[layout.CURRENT : layout.CURRENT + 2]  # A
+        self.object_pose: FloatArray = state[layout.POSITION + 2 : layout.POSITION + 5]  # x, y, φ
+        self.object_velocity: FloatArray = state[layout.VELOCITY + 2 : layout.VELOCITY + 5]
+        self.d: FloatArray = state[layout.CONTACT_D : layout.CONTACT_D + 2]  # m, negative: a gap
+        self.theta: FloatArray = state[layout.CONTACT_THETA : layout.CONTACT_THETA + 2]  # rad
+        self.force: FloatArray = state[layout.CONTACT_FORCE : layout.CONTACT_FORCE + 2]  # F [N]
+        self.normal: FloatArray = state[layout.CONTACT_NORMAL : layout.CONTACT_NORMAL + 2]  # N
+        self.tangential: FloatArray = state[
+            layout.CONTACT_TANGENTIAL : layout.CONTACT_TANGENTIAL + 2
+        ]
+        self.shear: FloatArray = state[layout.SHEAR : layout.SHEAR + 2]  # d_t [m]
+        # How far the backing plate's rim is pressed into the object: > 0 is past the tip's limit.
+        self.rim: FloatArray = state[layout.CONTACT_RIM : layout.CONTACT_RIM + 2]  # m
+        self._run(0)
+
+    @property
+    def t(self) -> float:
+        """Time the state belongs to [s]."""
+        return self.start + self._done * self.step
+
+    def advance(self, t: float) -> None:
+        """Step to the last sub-step at or before ``t`` [s]; nothing when that has passed."""
+        if t > self._torque_until:
+            self._advance(self._torque_until)
+            self.goals[:, layout.TORQUE_ON] = 0.0
+            self._torque_until = math.inf
+        self._advance(t)
+
+    def _advance(self, t: float) -> None:
+        # The small addend keeps ticks that are multiples of the sub-step on their sub-step.
+        behind = int((t - self.start) * self._per_step + 1e-6) - self._done
+        most = int(LONGEST_ADVANCE * self._per_step)
+        while behind > 0:
+            count = min(behind, most)
+            self._run(count)
+            behind -= count
+
+    def drive(
+        self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
+    ) -> None:
+        """Tell a servo its mode, torque, goal angle [rad] and goal current [A], from now on.
+
+        Modes have Dynamixel's numbers: 0 current, 3 position, 5 current-based position. Raises
+        ValueError for another mode or a goal that is not finite.
+        """
+        if mode not in _MODES:
+            raise ValueError(f"operating mode {mode} is not simulated; {_MODES} are")
+        if not (math.isfinite(goal_q) and math.isfinite(goal_current)):
+            raise ValueError(f"goals must be finite, not {goal_q!r} rad, {goal_current!r} A")
+        goal = self.goals[joint]
+        goal[layout.MODE] = mode
+        goal[layout.TORQUE_ON] = 1.0 if torque_on else 0.0
+        goal[layout.GOAL_Q] = goal_q
+        goal[layout.GOAL_CURRENT] = goal_current
+
+    def hold_torque_until(self, t: float) -> None:
+        """Let both servos drop their torque by themselves at ``t`` [s]; infinity ends it."""
+        self._torque_until = t
+
+    def push(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
+        """Push the object with this force [N] and torque [N·m] from now on; zeros end it."""
+        self.params[layout.PUSH : layout.PUSH + 3] = force_x, force_y, torque
+
+    @property
+    def samples(self) -> int:
+        """Contact samples taken so far; number k was taken at ``start`` + k / tactile.rate."""
+        return int(self.state[layout.SAMPLES])
+
+    def sample(self, number: int) -> FloatArray:
+        """Row of layout.SAMPLE columns: seq, t since start, then d, θ and gain of both tips.
+
+        Raises LookupError for one that is not taken yet or has left the ring.
+        """
+        row: FloatArray = self._ring[number % SAMPLES_KEPT]
+        if row[layout.SAMPLE_SEQ] != number:
+            raise LookupError(f"sample {number} is not kept; {self.samples} were taken")
+        return row
+
+    def energy(self) -> float:
+        """Kinetic, elastic and gravitational energy of joints, tips and object [J]."""
+        p, s = self.params, self.state
+        rates = s[layout.VELOCITY : layout.VELOCITY + 5]
+        inertia = p[
+            [layout.JOINT_INERTIA, layout.JOINT_INERTIA, layout.MASS, layout.MASS, layout.INERTIA]
+        ]
+        gravity = p[layout.GRAVITY : layout.GRAVITY + 2]
+        low, high = (p[i : i + 2] for i in (layout.STOP_LOW, layout.STOP_HIGH))
+        beyond = np.minimum(self.q - low, 0.0) + np.maximum(self.q - high, 0.0)
+        return float(
+            0.5 * inertia @ rates**2
+            - p[layout.MASS] * gravity @ self.object_pose[:2]
+            + 0.5 * p[layout.STOP_STIFFNESS] * beyond @ beyond
+            + self._work[0:2, tip.ENERGY].sum()
+        )
+
+    def _run(self, count: int) -> None:
+        plant.step(
+            self.state, self.params, self.goals, self.table.data, self._ring, self._work, count
+        )
+        self._done += count
