@@ -1,0 +1,124 @@
+"""What is looked at before the servos are used: every finding in one list, with what mends it.
+
+Pure functions over what was read; they send nothing. The reading itself belongs to
+:mod:`daemon.servos.dynamixel`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from daemon.servos import registers as reg
+from daemon.servos.models import ServoModel, by_number
+
+# Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
+RETURN_DELAY_MAX = 25
+MEND = "`softfinger doctor --fix`"
+WATCHDOG_FIRMWARE = 38
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """``errors`` keep the servos from being used, ``notices`` don't."""
+
+    errors: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+
+
+def check_servo(
+    name: str, model: ServoModel, table: bytes, watchdog: float, current_max: float
+) -> Findings:
+    """Judge one servo by the bytes of its registers 0 … 146.
+
+    Args:
+        name: how the servo is called in the report.
+        model: the model that the settings name.
+        table: its control table from address 0, at least up to the present temperature.
+        watchdog: s, the bus watchdog that the settings want, 0 for none.
+        current_max: A, the greatest current that safety may ask for.
+    """
+    number = _word(table, reg.MODEL_NUMBER)
+    firmware = table[reg.FIRMWARE_VERSION]
+    errors: list[str] = []
+    notices: list[str] = []
+    if number != model.number:
+        other = by_number(number)
+        found = other.name if other else f"model number {number}"
+        errors.append(f"{name}: is an {found}, not an {model.name}: set servos.model")
+        return Findings(tuple(errors))
+    mode = table[reg.OPERATING_MODE]
+    if reg.CURRENT_BASED_POSITION_MODE not in model.modes:
+        errors.append(
+            f"{name}: an {model.name} has no current-based position mode: use a model that senses "
+            "current"
+        )
+    elif mode != reg.CURRENT_BASED_POSITION_MODE:
+        errors.append(
+            f"{name}: operating mode is {reg.MODE_NAMES.get(mode, str(mode))} ({mode}), not "
+            f"current-based position (5): {MEND}"
+        )
+    delay = table[reg.RETURN_DELAY_TIME]
+    if delay > RETURN_DELAY_MAX:
+        errors.append(
+            f"{name}: return delay is {2 * delay} µs, more than {2 * RETURN_DELAY_MAX} µs: {MEND}"
+        )
+    if table[reg.STATUS_RETURN_LEVEL] == 0:
+        errors.append(f"{name}: status return level is 0, so reads stay unanswered: {MEND}")
+    status = table[reg.HARDWARE_ERROR_STATUS]
+    if status:
+        errors.append(
+            f"{name}: hardware error: {reg.hardware_error_names(status)}: "
+            "remove the cause, then `softfinger doctor --fix` reboots it"
+        )
+    volts = _word(table, reg.PRESENT_INPUT_VOLTAGE) * reg.VOLTAGE_UNIT
+    low = _word(table, reg.MIN_VOLTAGE_LIMIT) * reg.VOLTAGE_UNIT
+    high = _word(table, reg.MAX_VOLTAGE_LIMIT) * reg.VOLTAGE_UNIT
+    if not low <= volts <= high:
+        errors.append(
+            f"{name}: supply is {volts:.1f} V, not in {low:.1f} … {high:.1f} V: mend the supply"
+        )
+    if watchdog > 0.0 and not model.small and firmware < WATCHDOG_FIRMWARE:
+        errors.append(
+            f"{name}: firmware {firmware} has no bus watchdog: update it to {WATCHDOG_FIRMWARE} "
+            "or later, or set servos.watchdog = 0"
+        )
+    limit = _word(table, reg.CURRENT_LIMIT) * model.current_unit
+    if model.senses_current and limit < current_max:
+        errors.append(
+            f"{name}: current limit is {limit:.3f} A, below safety.current_max {current_max:g} A: "
+            f"lower safety.current_max or raise the limit"
+        )
+    notices += _notices(name, model, table, firmware)
+    return Findings(tuple(errors), tuple(notices))
+
+
+def _notices(name: str, model: ServoModel, table: bytes, firmware: int) -> list[str]:
+    notices = []
+    if table[reg.TORQUE_ENABLE]:
+        notices.append(f"{name}: torque is on already; it stays so until disarm or arm")
+    if table[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
+        notices.append(f"{name}: its bus watchdog had stopped it; arming clears that")
+    if not model.fast_read(firmware):
+        notices.append(
+            f"{name}: firmware {firmware} has no fast sync read (needs "
+            f"{model.fast_read_firmware}); the slower sync read is used"
+        )
+    hot = table[reg.TEMPERATURE_LIMIT] - 10
+    if table[reg.PRESENT_TEMPERATURE] >= hot:
+        notices.append(f"{name}: {table[reg.PRESENT_TEMPERATURE]} °C, near its limit")
+    return notices
+
+
+def check_latency(path: str, latency: float, reply_timeout: float) -> Findings:
+    """Judge a USB adapter's latency timer [s]; 0 means there is none."""
+    if latency <= 0.001:
+        return Findings()
+    line = (
+        f"{path}: the adapter's latency timer is {latency * 1e3:.0f} ms, so a read takes that "
+        f"long: {MEND} sets it to 1 ms"
+    )
+    return Findings(errors=(line,)) if latency >= reply_timeout else Findings(notices=(line,))
+
+
+def _word(table: bytes, at: int) -> int:
+    return table[at] | table[at + 1] << 8

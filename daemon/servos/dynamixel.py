@@ -1,0 +1,376 @@
+"""The hand's joints through dynamixel-sdk: check at connect, one read and one write a tick.
+
+Current, velocity, position and the alert bit of all servos come in one fast sync read (sync read
+where a firmware is older); goal current and goal position go in one sync write, side by side
+through indirect addresses, which live in RAM and are set whenever torque goes on. What a servo
+must be set to in EEPROM is checked and never changed here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import struct
+import time
+
+from dynamixel_sdk.group_sync_write import GroupSyncWrite
+from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
+
+from daemon.clock import Clock
+from daemon.records import FINGERS, Goal, Reading
+from daemon.servos import registers as reg
+from daemon.servos.base import ServoError
+from daemon.servos.checks import MEND, check_latency, check_servo
+from daemon.servos.models import ServoModel, by_name
+from daemon.servos.packets import GroupRead, PacketHandler
+from daemon.servos.port import PortGone, SerialPort
+from daemon.servos.units import JointScale
+from daemon.settings import Settings
+
+_log = logging.getLogger(__name__)
+
+_PRESENT = struct.Struct("<hii")  # current, velocity, position
+_GOAL = struct.Struct("<hi")  # current, position
+_GOAL_BYTES = (
+    reg.GOAL_CURRENT,
+    reg.GOAL_CURRENT + 1,
+    reg.GOAL_POSITION,
+    reg.GOAL_POSITION + 1,
+    reg.GOAL_POSITION + 2,
+    reg.GOAL_POSITION + 3,
+)
+_TRIES = 3  # for exchanges outside the tick
+_CHECKED = reg.BACKUP_READY  # registers 0 … 146 are looked at
+
+
+class DynamixelServos:
+    """Servo backend over a serial port; see :class:`daemon.servos.base.Servos`.
+
+    One thread, one owner. ``notices`` holds what connect found worth saying and not wrong.
+    """
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        servos = settings.servos
+        self.notices: tuple[str, ...] = ()
+        self._clock = clock
+        self._settings = servos
+        self._current_max = settings.safety.current_max
+        self._fingers = [FINGERS.index(finger) for finger in settings.scene.fingers]
+        self._ids = {finger: servos.ids[finger] for finger in self._fingers}
+        self._handler = PacketHandler()
+        self._port: SerialPort | None = None
+        self._fast = False
+        self._torque = False
+        self._last_sent = 0.0  # time.monotonic() of the last packet the servos must have heard
+        self._retries = 0
+        self._alerts = 0
+        self._present: GroupRead | None = None
+        self._goals: GroupSyncWrite | None = None
+        self._scales: dict[int, JointScale] = {}
+        self._bounds: dict[int, int] = {}  # greatest goal current in counts
+
+    # --- connect -----------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the port and check every servo of the scene; changes nothing in them.
+
+        Raises:
+            ServoError: all that is wrong, one line each. The port is closed again.
+        """
+        try:
+            model = by_name(self._settings.model)
+        except KeyError as error:
+            raise ServoError(f"servos.model: {error.args[0]}") from None
+        port = SerialPort(self._settings.port, self._settings.baud, self._settings.reply_timeout)
+        port.openPort()
+        self._port = port
+        try:
+            self._check(port, model)
+        except BaseException:
+            port.closePort()
+            self._port = None
+            raise
+        self._prepare(port, model)
+
+    def _check(self, port: SerialPort, model: ServoModel) -> None:
+        latency = check_latency(port.port_name, port.latency_timer(), port.reply_timeout)
+        errors, notices = list(latency.errors), list(latency.notices)
+        silent: list[int] = []
+        self._fast = True
+        for finger, servo_id in self._ids.items():
+            name = f"servo {servo_id} ({FINGERS[finger]})"
+            if not self._ping(port, servo_id):
+                silent.append(finger)
+                continue
+            table = self._read_span(port, servo_id, 0, _CHECKED)
+            if table is None:
+                errors.append(
+                    f"{name}: answers a ping but no read (status return level 0, or a bad line): "
+                    f"{MEND}"
+                )
+                continue
+            found = check_servo(name, model, table, self._settings.watchdog, self._current_max)
+            errors += found.errors
+            notices += found.notices
+            self._fast = self._fast and model.fast_read(table[reg.FIRMWARE_VERSION])
+            limit = int.from_bytes(table[reg.CURRENT_LIMIT : reg.CURRENT_LIMIT + 2], "little")
+            self._bounds[finger] = limit
+        if silent and len(silent) == len(self._ids):
+            raise ServoError(
+                f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
+                f"{', '.join(map(str, self._ids.values()))}): check power and wiring; "
+                "`softfinger doctor` looks for them at every rate"
+            )
+        for finger in silent:
+            errors.append(
+                f"servo {self._ids[finger]} ({FINGERS[finger]}): no answer at {port.baudrate} "
+                "baud: check its cable and ID; `softfinger doctor` looks for it at every rate"
+            )
+        if errors:
+            raise ServoError("\n".join(errors))
+        self.notices = tuple(notices)
+        for notice in notices:
+            _log.warning(notice)
+
+    def _prepare(self, port: SerialPort, model: ServoModel) -> None:
+        self._scales = {
+            finger: JointScale.of(self._settings, finger, model) for finger in self._fingers
+        }
+        span = reg.PRESENT_POSITION + 4 - reg.PRESENT_CURRENT
+        ids = list(self._ids.values())
+        self._present = GroupRead(port, self._handler, reg.PRESENT_CURRENT, span, ids)
+        # Every block of indirect data begins behind its addresses; the first serves all firmwares
+        # of a model but X330, where it moved.
+        self._goals = None
+        self._torque = False
+
+    # --- the tick ----------------------------------------------------------------------------
+
+    def read(self, reading: Reading) -> None:
+        """Fill ``reading`` from one group read; a damaged reply is asked for once more in time.
+
+        Raises:
+            ServoError: the port is gone.
+        """
+        present = self._present
+        if present is None:
+            raise ServoError("servos: not connected")
+        reading.seq += 1
+        begin = time.monotonic()
+        result = present.exchange(self._fast)
+        if result == COMM_RX_CORRUPT:
+            # Once more, with what is left of the first exchange's deadline.
+            port = self._open_port()
+            port.not_after = port.deadline
+            if time.monotonic() < port.deadline:
+                self._retries += 1
+                result = present.exchange(self._fast)
+            port.not_after = math.inf
+        reading.t = self._clock.now()
+        reading.valid = result == COMM_SUCCESS
+        if not reading.valid:
+            return
+        self._last_sent = begin
+        alert = 0
+        for finger, servo_id in self._ids.items():
+            current, velocity, position = _PRESENT.unpack(present.data_dict[servo_id])
+            scale = self._scales[finger]
+            reading.q[finger] = scale.angle(position)
+            reading.dq[finger] = scale.rate(velocity)
+            reading.current[finger] = scale.amperes(current)
+            if present.errors[servo_id] & 0x80:
+                alert |= 1 << finger
+        if alert:
+            self._alerts += 1
+        reading.alert = alert
+
+    def write(self, goal: Goal) -> None:
+        """Send goal angles and current bounds; nothing while torque was not switched on here.
+
+        Raises:
+            ServoError: the port is gone, or a servo's bus watchdog has stopped it.
+        """
+        goals = self._goals
+        if goals is None or not self._torque:
+            return
+        watchdog = self._settings.watchdog
+        if watchdog > 0.0 and time.monotonic() - self._last_sent > watchdog - reg.WATCHDOG_UNIT:
+            self._check_watchdog()
+        for finger, servo_id in self._ids.items():
+            scale = self._scales[finger]
+            bound = min(scale.bound_counts(float(goal.current[finger])), self._bounds[finger])
+            position = scale.position_counts(float(goal.q[finger]))
+            goals.changeParam(servo_id, _GOAL.pack(bound, position))
+        if goals.txPacket() == COMM_SUCCESS:
+            self._last_sent = time.monotonic()
+
+    # --- torque ------------------------------------------------------------------------------
+
+    def set_torque(self, on: bool) -> None:
+        """Switch torque and make sure of it; on: from the present angle, with no current yet.
+
+        Raises:
+            ServoError: it could not be done or not be verified; on → off then is tried.
+        """
+        port = self._open_port()
+        if not on:
+            self._torque = False
+            self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(self._ids, 0), "torque off")
+            self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(self._ids, 0), "watchdog off")
+            return
+        self._refuse_hardware_errors(port)
+        try:
+            self._switch_on(port)
+        except ServoError:
+            with contextlib.suppress(ServoError):
+                self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(self._ids, 0), "torque off")
+            raise
+
+    def _switch_on(self, port: SerialPort) -> None:
+        each = self._ids
+        # Writing 0 ends a watchdog's stop, in which goals are read-only.
+        self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, 0), "watchdog cleared")
+        self._map_goals(port)
+        self._store(reg.GOAL_CURRENT, "<h", dict.fromkeys(each, 0), "goal current")
+        self._store(reg.GOAL_POSITION, "<i", self._positions(port), "goal position")
+        self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(each, 1), "torque on")
+        watchdog = self._settings.watchdog
+        if watchdog > 0.0:
+            ticks = min(max(math.ceil(watchdog / reg.WATCHDOG_UNIT), 1), reg.WATCHDOG_MAX)
+            self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, ticks), "watchdog armed")
+        self._last_sent = time.monotonic()
+        self._torque = True
+
+    def _map_goals(self, port: SerialPort) -> None:
+        """Put goal current and goal position side by side in the indirect data."""
+        model = by_name(self._settings.model)
+        starts = set()
+        for finger, servo_id in self._ids.items():
+            firmware = self._read_span(port, servo_id, reg.FIRMWARE_VERSION, 1)
+            if firmware is None:
+                raise ServoError(f"servo {servo_id} ({FINGERS[finger]}): no answer")
+            address, data, _ = model.indirect_blocks(firmware[0])[0]
+            starts.add((address, data))
+        if len(starts) > 1:
+            raise ServoError(
+                "servos: their firmwares place indirect data differently: bring both to the same "
+                "version"
+            )
+        address, data = starts.pop()
+        pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
+        self._store_bytes(address, dict.fromkeys(self._ids, pointers), "indirect addresses")
+        self._goals = GroupSyncWrite(port, self._handler, data, _GOAL.size)
+        for servo_id in self._ids.values():
+            self._goals.addParam(servo_id, bytes(_GOAL.size))
+
+    def _positions(self, port: SerialPort) -> dict[int, int]:
+        positions = {}
+        for finger, servo_id in self._ids.items():
+            raw = self._read_span(port, servo_id, reg.PRESENT_POSITION, 4)
+            if raw is None:
+                raise ServoError(f"servo {servo_id} ({FINGERS[finger]}): position not read")
+            positions[finger] = int.from_bytes(raw, "little", signed=True)
+        return positions
+
+    def _refuse_hardware_errors(self, port: SerialPort) -> None:
+        lines = []
+        for finger, servo_id in self._ids.items():
+            name = f"servo {servo_id} ({FINGERS[finger]})"
+            raw = self._read_span(port, servo_id, reg.HARDWARE_ERROR_STATUS, 1)
+            if raw is None:
+                lines.append(f"{name}: no answer: check its cable and power")
+            elif raw[0]:
+                lines.append(
+                    f"{name}: hardware error: {reg.hardware_error_names(raw[0])}: remove the "
+                    "cause, then `softfinger doctor --fix` reboots it"
+                )
+        if lines:
+            raise ServoError("\n".join(lines))
+
+    def _check_watchdog(self) -> None:
+        port = self._open_port()
+        for finger, servo_id in self._ids.items():
+            raw = self._read_span(port, servo_id, reg.BUS_WATCHDOG, 1)
+            if raw is not None and raw[0] == reg.WATCHDOG_ERROR:
+                raise ServoError(
+                    f"servo {servo_id} ({FINGERS[finger]}): its bus watchdog stopped it, since no "
+                    "packet came in time: disarm, then arm"
+                )
+        self._last_sent = time.monotonic()
+
+    # --- exchanges outside the tick ----------------------------------------------------------
+
+    def _open_port(self) -> SerialPort:
+        if self._port is None:
+            raise ServoError("servos: not connected")
+        return self._port
+
+    def _ping(self, port: SerialPort, servo_id: int) -> bool:
+        return any(self._handler.ping(port, servo_id)[1] == COMM_SUCCESS for _ in range(_TRIES))
+
+    def _read_span(
+        self, port: SerialPort, servo_id: int, address: int, length: int
+    ) -> bytes | None:
+        for _ in range(_TRIES):
+            data, result, _ = self._handler.readTxRx(port, servo_id, address, length)
+            if result == COMM_SUCCESS and len(data) == length:
+                return bytes(data)
+        return None
+
+    def _store(self, address: int, form: str, values: dict[int, int], what: str) -> None:
+        packed = {finger: struct.pack(form, value) for finger, value in values.items()}
+        self._store_bytes(address, packed, what)
+
+    def _store_bytes(self, address: int, values: dict[int, bytes], what: str) -> None:
+        """Write each finger's servo and read back, which works at any status return level."""
+        port = self._open_port()
+        waiting = dict(values)
+        for _ in range(_TRIES):
+            length = len(next(iter(waiting.values())))
+            group = GroupSyncWrite(port, self._handler, address, length)
+            for finger, data in waiting.items():
+                group.addParam(self._ids[finger], data)
+            group.txPacket()
+            for finger, data in list(waiting.items()):
+                if self._read_span(port, self._ids[finger], address, length) == data:
+                    del waiting[finger]
+            if not waiting:
+                return
+        names = ", ".join(f"servo {self._ids[finger]} ({FINGERS[finger]})" for finger in waiting)
+        raise ServoError(f"{names}: {what} could not be set or not be verified")
+
+    # --- the end -----------------------------------------------------------------------------
+
+    def counters(self) -> dict[str, int]:
+        """Exchanges that went wrong since connect, by kind."""
+        handler = self._handler
+        return {
+            "timeouts": handler.timeouts,
+            "crc": handler.crc_errors,
+            "torn": handler.torn,
+            "retries": self._retries,
+            "skipped_bytes": handler.skipped_bytes,
+            "alerts": self._alerts,
+        }
+
+    def close(self) -> None:
+        """Torque off and verified as far as the bus allows, then close. Never raises.
+
+        A servo whose torque another program switched on is left as it was found.
+        """
+        port = self._port
+        if port is None:
+            return
+        try:
+            if self._torque:
+                self.set_torque(False)
+        except PortGone:
+            _log.error("servos: the port went away with torque on; their bus watchdog stops them")
+        except Exception as error:
+            _log.error("servos: torque off is not certain: %s", error)
+        self._torque = False
+        self._port = None
+        self._present = None
+        with contextlib.suppress(Exception):
+            port.closePort()
