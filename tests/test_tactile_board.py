@@ -1,0 +1,231 @@
+"""The emulated tactile board: what it puts on its pty, when, and what its faults do."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import struct
+import termios
+
+import numpy as np
+import pytest
+
+from daemon.records import Frame
+from daemon.simulation.bus_faults import FaultError
+from daemon.simulation.fault_words import Faults
+from daemon.simulation.tactile_board import BoardFault, FrameWriter, TactileBoard, encode_flexitac
+from daemon.tactile.flexitac import FlexiTacDecoder
+
+ROWS, COLS = 8, 6
+SIZE = ROWS * COLS + 2
+
+
+class Source:
+    """Frames made by the test."""
+
+    def __init__(self) -> None:
+        self.frame: Frame | None = None
+
+    def latest(self) -> Frame | None:
+        return self.frame
+
+    def make(self, seq: int) -> Frame:
+        counts = np.full((ROWS, COLS), seq % 150, np.uint16)
+        self.frame = Frame(seq, 0.0, 0.0, True, counts)
+        return self.frame
+
+
+class Client:
+    """Reads what a board wrote. A read of an empty tty first takes what is under way in it."""
+
+    def __init__(self, path: str) -> None:
+        self.fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+
+    def unread(self) -> int:
+        return struct.unpack("i", fcntl.ioctl(self.fd, termios.FIONREAD, b"\0\0\0\0"))[0]
+
+    def read(self) -> bytes:
+        parts = []
+        while True:
+            try:
+                parts.append(os.read(self.fd, 65536))
+            except BlockingIOError:
+                return b"".join(parts)
+
+    def expect(self, size: int) -> bytes:
+        """Wait for ``size`` bytes: the kernel hands them on in its own time."""
+        got = b""
+        while len(got) < size:
+            assert select.select([self.fd], [], [], 5.0)[0], f"only {len(got)} of {size} bytes"
+            got += os.read(self.fd, size - len(got))
+        return got
+
+
+def board(source: Source, *faults: str, rate: float = 100.0, delay: float = 0.01) -> TactileBoard:
+    parsed = tuple(BoardFault.parse(fault) for fault in faults)
+    return TactileBoard(source, encode_flexitac, rate, delay, parsed, seed=4)
+
+
+def stream(*faults: str, frames: int = 40) -> tuple[list[bytes], TactileBoard]:
+    """What a client that reads at once gets for each frame."""
+    source = Source()
+    made = board(source, *faults)
+    client = Client(made.path)
+    got = []
+    for k in range(frames):
+        source.make(k)
+        before = made.sent
+        made.service(k / 100 + 0.01)
+        data = client.read()
+        got.append(data if made.sent > before else b"")
+    os.close(client.fd)
+    made.close()
+    return got, made
+
+
+def test_a_flexitac_frame_is_the_marker_and_the_counts_row_major_saturated():
+    counts = np.array([[0, 1, 255], [256, 65535, 7]], np.uint16)
+    assert encode_flexitac(counts) == b"\xaa\x55\x00\x01\xff\xff\xff\x07"
+
+
+def test_each_frame_goes_out_once_and_the_decoder_reads_it():
+    source = Source()
+    made = board(source)
+    client = Client(made.path)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    made.service(0.0)
+    assert made.sent == 0
+    for k in range(5):
+        source.make(k + 1)
+        made.service(0.01 * k)
+        made.service(0.01 * k)
+        decoder.feed(client.expect(SIZE), 0.0)
+    decoded = decoder.settle()
+    assert decoded is not None
+    assert np.array_equal(decoded.data, np.full((ROWS, COLS), 5))
+    assert decoder.counters()["frames"] == made.sent == 5
+    os.close(client.fd)
+    made.close()
+
+
+def test_it_is_due_at_each_frame_delivery():
+    source = Source()
+    made = board(source, rate=100.0, delay=0.004)
+    assert made.next_event() == -np.inf
+    made.service(0.0)
+    assert made.next_event() == pytest.approx(0.004)
+    made.service(0.004)
+    assert made.next_event() == pytest.approx(0.014)
+    # A due time that rounding put just before the frame's must not come again at once.
+    made.service(np.nextafter(0.014, 0.0))
+    assert made.next_event() == pytest.approx(0.024)
+    made.service(0.0561)
+    assert made.next_event() == pytest.approx(0.064)
+    made.close()
+
+
+@pytest.mark.parametrize("cells", [48, 1024, 44 * 44, 128 * 128])
+def test_nobody_reading_costs_whole_frames_only(cells):
+    writer = FrameWriter()
+    rng = np.random.default_rng(0)
+    frame = rng.bytes(cells)
+    sent = [writer.send(frame) for _ in range(200)]
+    assert writer.dropped == sent.count(False) > 150
+    client = Client(writer.path)
+    got = b""
+    while writer.waiting or client.unread():
+        writer.flush()
+        got += client.expect(min(client.unread(), 4096) or 1)
+    assert got == frame * sent.count(True)
+    # And goes on as soon as somebody reads.
+    assert writer.send(frame)
+    while writer.waiting:
+        got += client.expect(1)
+        writer.flush()
+    os.close(client.fd)
+    writer.close()
+
+
+def test_what_a_client_writes_is_taken_and_not_echoed():
+    made = board(Source())
+    client = Client(made.path)
+    os.write(client.fd, b"\x03abc\n" * 100)
+    made.hear()
+    assert client.read() == b""
+    os.close(client.fd)
+    made.close()
+
+
+def test_torn_frames_lack_bytes():
+    got, made = stream("torn=0.5")
+    whole = [len(data) == SIZE for data in got]
+    assert 8 < sum(whole) < 32
+    assert all(len(data) <= SIZE for data in got)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    for data in got:
+        decoder.feed(data, 0.0)
+    assert decoder.counters()["resyncs"] > 0
+    assert made.dropped == 0
+
+
+def test_noisy_frames_have_bytes_before_them():
+    got, _ = stream("noisy=1")
+    assert all(len(data) > SIZE for data in got)
+    assert sum(data[-SIZE:].count(data[-1]) >= SIZE - 3 for data in got) >= 39
+
+
+def test_silent_and_frozen_begin_when_they_are_asked_to():
+    got, _ = stream("silent@0.2")
+    assert all(got[:20])
+    assert not any(got[20:])
+    got, _ = stream("frozen@0.2")
+    assert [data[-1] for data in got] == [*range(20), *[19] * 20]
+
+
+def test_wrong_size_is_half_the_grid():
+    got, _ = stream("wrong-size")
+    assert {len(data) for data in got} == {ROWS * COLS // 4 + 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "value", "start"),
+    [
+        ("torn", "torn", 0.1, 0.0),
+        ("torn=0.5@2", "torn", 0.5, 2.0),
+        (" wrong-size ", "wrong-size", 1.0, 0.0),
+        ("silent@1e1", "silent", 1.0, 10.0),
+    ],
+)
+def test_faults_in_words(text, kind, value, start):
+    assert BoardFault.parse(text) == BoardFault(kind, value, start)
+
+
+def test_faults_are_sorted_to_boards_and_servos():
+    faults = Faults(
+        ["silent=2@3", "silent", "left:torn=0.2", "right:frozen@1", "drop=0.1", "unplug@2"], (1, 2)
+    )
+    assert faults.boards[0] == [BoardFault("silent"), BoardFault("torn", 0.2)]
+    assert faults.boards[1] == [BoardFault("silent"), BoardFault("frozen", 1.0, 1.0)]
+    assert faults.servos == [(0.0, "drop=0.1"), (2.0, "unplug"), (3.0, "silent=2")]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("melted", "wrong-size"),
+        ("left:melted", "wrong-size"),
+        ("middle:torn", "left: or right:"),
+        ("torn=2", "0 … 1"),
+        ("torn=much", "not a number"),
+        ("torn@never", "not a number"),
+        ("torn@-1", "0 s or more"),
+        ("torn@inf", "0 s or more"),
+        ("drop=0.1@later", "no time"),
+        ("drop=7", "0 … 1"),
+        ("silent=9", "no servo has that ID"),
+    ],
+)
+def test_faults_that_cannot_be_understood_are_told(text, told):
+    with pytest.raises(FaultError, match=told):
+        Faults([text], (1, 2))
