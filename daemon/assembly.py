@@ -60,7 +60,7 @@ class Daemon:
         if "simulated" in (settings.servos.backend, settings.tactile.backend):
             from daemon.simulation.hand import SimulatedHand
 
-            self.hand = SimulatedHand(settings, self.clock.now())
+            self.hand = SimulatedHand(settings, self.clock.now(), self.table)
         self.servos = make_servos(settings, self.clock, self.hand)
         perceptions = self._make_perceptions()
         objects = None

@@ -1,0 +1,212 @@
+"""The command line, as real processes: run, send, signals, a second daemon, bad settings."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from tests.conftest import until
+
+Profile = Callable[[str], Path]
+SOFTFINGER = [sys.executable, "-m", "tools.cli"]
+README = Path(__file__).parent.parent / "README.md"
+
+
+def softfinger(*words: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*SOFTFINGER, *words], capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+class Running:
+    """A ``softfinger run`` in a process of its own, ready when constructed."""
+
+    def __init__(self, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [*SOFTFINGER, "run", *words], stderr=subprocess.PIPE, text=True
+        )
+        self.lines: list[str] = []
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if "running, disarmed" in line:
+                return
+        raise AssertionError("".join(self.lines))
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """Send a signal, read the rest of what it says, and return the exit status."""
+        self.process.send_signal(number)
+        assert self.process.stderr is not None
+        self.lines += self.process.stderr.readlines()
+        return self.process.wait(timeout=30)
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Running]]:
+    started: list[Running] = []
+
+    def run(*words: str) -> Running:
+        started.append(Running(*words))
+        return started[-1]
+
+    yield run
+    for each in started:
+        if each.process.poll() is None:
+            each.process.kill()
+        each.process.wait()
+        assert each.process.stderr is not None
+        each.process.stderr.close()
+
+
+def test_arm_grasp_and_stop_from_the_command_line(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str]
+) -> None:
+    running = start("--config", str(profile("")))
+
+    def send(*words: str) -> tuple[int, dict[str, Any]]:
+        done = softfinger("send", *words, "--address", addresses[1])
+        return done.returncode, json.loads(done.stdout)
+
+    assert send("grasp", "force=5") == (
+        1,
+        {"ok": False, "error": "grasp: not while disarmed; arm first"},
+    )
+    assert send("arm") == (0, {"ok": True, "mode": "armed"})
+    assert send("grasp", "force=5") == (0, {"ok": True, "mode": "grasping"})
+    until(lambda: send("status")[1]["mode"] == "holding")
+    assert send("rotate", "angle=5deg")[1]["mode"] == "rotating"
+    assert send("stop") == (0, {"ok": True, "mode": "disarmed"})
+    status, reply = send("status")
+    assert (status, reply["torque"], reply["fault"]) == (0, False, "")
+    assert running.end() == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_the_daemon_with_torque_off(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str], number: int
+) -> None:
+    running = start("--config", str(profile("")))
+    assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
+    assert running.end(number) == 0
+    assert "ended, torque off" in running.lines[-1]
+
+
+def test_sigusr1_stops(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str]
+) -> None:
+    running = start("--config", str(profile("")))
+    assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
+    running.process.send_signal(signal.SIGUSR1)
+    status = softfinger("send", "status", "--address", addresses[1])
+    assert json.loads(status.stdout)["mode"] == "disarmed"
+    assert running.end() == 0
+
+
+def test_duration_ends_by_itself(profile: Profile) -> None:
+    done = softfinger("run", "--config", str(profile("")), "--duration", "0.3")
+    assert done.returncode == 0, done.stderr
+    assert "ended, torque off" in done.stderr
+
+
+def test_a_second_daemon_says_so_and_ends(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str]
+) -> None:
+    path = str(profile(""))
+    running = start("--config", path)
+    second = softfinger("run", "--config", path)
+    assert second.returncode == 1
+    assert f"stream.address: {addresses[0]} is in use; is another softfinger" in second.stderr
+    assert running.end() == 0
+
+
+def test_bad_settings_end_it_with_the_whole_report(profile: Profile) -> None:
+    path = profile("[lop]\nrate = 3\n[tip]\nradius = 'big'\n")
+    done = softfinger("run", "--config", str(path))
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        f'{path}: tip.radius: found "big", expected a number',
+        f"{path}: lop: found an unknown key, expected a known one; nearest: loop",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ('[servos]\nbackend = "dynamixel"\nport = "/dev/absent"\n', "/dev/absent"),
+        (
+            '[servos]\nbackend = "none"\n[tactile]\nbackend = "flexitac"\nport = ["/dev/no", "x"]',
+            "/dev/no",
+        ),
+    ],
+)
+def test_a_missing_port_is_named(profile: Profile, text: str, error: str) -> None:
+    done = softfinger("run", "--config", str(profile(text)))
+    assert done.returncode == 1
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("softfinger: ")][-1:]
+    assert error in line
+    assert "Traceback" not in done.stderr
+
+
+def test_send_without_a_daemon_or_with_nonsense(addresses: tuple[str, str]) -> None:
+    done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "0.1")
+    assert done.returncode == 2
+    assert "is softfinger running?" in done.stderr
+    done = softfinger("send", "grasp", "force:5", "--address", addresses[1])
+    assert done.returncode == 2
+    assert "found 'force:5', expected key=number" in done.stderr
+
+
+def test_garbage_on_the_command_socket_changes_nothing(
+    start: Callable[..., Running],
+    profile: Profile,
+    addresses: tuple[str, str],
+    context: zmq.Context[Any],
+) -> None:
+    running = start("--config", str(profile("")))
+    socket = context.socket(zmq.DEALER)
+    socket.connect(addresses[1])
+    for payload in (b"\xc1" * 10, b"x" * 100_000, b"", msgpack.packb({"command": 3})):
+        socket.send_multipart([b"", payload])
+        assert socket.poll(5000)
+        assert msgpack.unpackb(socket.recv_multipart()[-1])["ok"] is False
+    assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
+    assert running.end() == 0
+
+
+def test_the_readme_subscriber_prints_what_the_daemon_publishes(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str]
+) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (subscriber,) = [block for block in blocks if "zmq.SUB" in block]
+    assert len(subscriber.strip().splitlines()) == 6
+    running = start("--config", str(profile("")))
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", subscriber.replace("tcp://127.0.0.1:9872", addresses[0])],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    with process:
+        lines = [process.stdout.readline() for _ in range(3)]
+        process.kill()
+    assert all(re.fullmatch(r"disarmed: 0\.00 N at 0\.00 mm\n", line) for line in lines)
+    assert running.end() == 0
+
+
+def test_the_readme_mathematics_runs() -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (mathematics,) = [block for block in blocks if "ContactTable" in block]
+    names: dict[str, Any] = {}
+    exec(mathematics, names)
+    assert names["estimate"].d == pytest.approx(0.004, rel=1e-3)
+    assert names["contact"].force > 0.0

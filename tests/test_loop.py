@@ -1,0 +1,329 @@
+"""The whole pipeline on the virtual clock: what the hand does when it is commanded."""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from daemon.assembly import Daemon
+from daemon.commands import Refused
+from daemon.messages import pack, state_message
+from daemon.settings import Settings
+
+Make = Callable[..., Daemon]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Daemons on virtual time without sockets; sections are given as keyword arguments."""
+    daemons = []
+
+    def build(**sections: Any) -> Daemon:
+        loop = {"clock": "virtual"} | sections.pop("loop", {})
+        settings = Settings.model_validate({"loop": loop, **sections})
+        daemon = Daemon(settings, wire=False)
+        daemons.append(daemon)
+        daemon.loop.advance(0.3)
+        return daemon
+
+    yield build
+    for daemon in daemons:
+        daemon.close()
+
+
+def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
+    return daemon.loop.command({"command": name, **numbers})
+
+
+def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
+    """Advance until the hand is in ``mode``; fail when it is not within ``seconds``."""
+    finish = daemon.clock.now() + seconds
+    while daemon.loop.state.mode != mode:
+        assert daemon.clock.now() < finish, f"{daemon.loop.state.mode}, not {mode}"
+        daemon.loop.advance(0.01)
+
+
+def grasped(daemon: Daemon, force: float) -> Daemon:
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    command(daemon, "grasp", force=force)
+    advance_to(daemon, "holding", 3.0)
+    return daemon
+
+
+def test_starts_disarmed_with_torque_off_and_does_not_move(make: Make) -> None:
+    daemon = make()
+    state = daemon.loop.state
+    before = state.reading.q.copy()
+    daemon.loop.advance(1.0)
+    assert (state.mode, state.torque, state.fault) == ("disarmed", False, "")
+    assert abs(state.reading.q - before).max() < 1e-3
+
+
+def test_arming_does_not_move_the_hand(make: Make) -> None:
+    daemon = make()
+    before = daemon.loop.state.reading.q.copy()
+    command(daemon, "arm")
+    daemon.loop.advance(1.0)
+    assert daemon.loop.state.torque
+    assert abs(daemon.loop.state.reading.q - before).max() < 0.005
+
+
+@pytest.mark.parametrize("profile", [{}, {"material": {"law": "constant"}}])
+def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(
+    make: Make, profile: dict[str, Any]
+) -> None:
+    daemon = grasped(make(**profile), 10.0)
+    state = daemon.loop.state
+    assert daemon.hand is not None
+    for _ in range(100):
+        daemon.loop.advance(0.1)
+        assert (state.mode, state.fault) == ("holding", "")
+        for finger, contact in enumerate(state.contacts):
+            assert contact.force == pytest.approx(10.0, rel=0.05)
+            assert contact.force == pytest.approx(daemon.hand.force[finger], rel=0.05)
+
+
+def test_rotate_turns_the_object_to_the_angle_and_keeps_the_grip(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    assert daemon.hand is not None
+    for angle in (0.14, -0.14, 0.0):
+        command(daemon, "rotate", angle=angle)
+        advance_to(daemon, "holding", 5.0)
+        daemon.loop.advance(1.0)
+        assert daemon.loop.state.object.angle == pytest.approx(angle, abs=math.radians(1.0))
+        assert daemon.hand.object_pose[2] == pytest.approx(angle, abs=math.radians(1.0))
+        assert all(c.force == pytest.approx(8.0, rel=0.15) for c in daemon.loop.state.contacts)
+    assert daemon.loop.state.object.width == pytest.approx(0.040, abs=5e-4)
+
+
+def test_release_opens_the_hand_and_lets_go(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    command(daemon, "release")
+    advance_to(daemon, "armed", 3.0)
+    state = daemon.loop.state
+    assert not any(contact.contact for contact in state.contacts)
+    assert state.reading.q == pytest.approx([0.0, 0.0], abs=0.04)
+    assert all(contact.force == 0.0 for contact in state.contacts)
+
+
+def test_move_goes_where_it_is_told_within_the_limits(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.2, right=-0.3)
+    advance_to(daemon, "armed", 3.0)
+    assert daemon.loop.state.reading.q == pytest.approx([-0.2, -0.3], abs=0.04)
+    with pytest.raises(Refused, match=r"move: left: found 5 rad, expected -0\.5 to 1"):
+        command(daemon, "move", left=5.0)
+
+
+def test_stop_turns_torque_off_at_the_same_tick(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    command(daemon, "stop")
+    daemon.loop.advance(daemon.loop.period)
+    assert (daemon.loop.state.mode, daemon.loop.state.torque) == ("disarmed", False)
+
+
+def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:
+    daemon = make(simulation={"object_position": (0.0, 0.5)})
+    events: list[tuple[str, str, str]] = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    command(daemon, "arm")
+    command(daemon, "grasp", force=5.0)
+    advance_to(daemon, "armed", 10.0)
+    assert any(kind == "grasp" for _, kind, _ in events)
+
+
+def test_too_much_force_latches_a_fault_that_waits_for_clear(make: Make) -> None:
+    daemon = make(safety={"force_max": 6.0}, control={"contact_force": 0.2})
+    command(daemon, "arm")
+    command(daemon, "grasp", force=5.0)
+    advance_to(daemon, "holding", 3.0)
+    assert daemon.hand is not None
+    # Something squeezes the fingers together, harder than the limit allows.
+    daemon.loop._control._grip.force_target = 9.0
+    daemon.loop._control._grip._force = 9.0
+    advance_to(daemon, "fault", 3.0)
+    state = daemon.loop.state
+    assert "above 6 N" in state.fault
+    assert not state.torque
+    with pytest.raises(Refused, match="clear the fault first"):
+        command(daemon, "arm")
+    daemon.loop.advance(1.0)
+    command(daemon, "clear")
+    daemon.loop.advance(0.1)
+    assert (state.mode, state.fault) == ("disarmed", "")
+    command(daemon, "arm")
+
+
+def test_frames_that_stop_coming_latch_a_fault(make: Make) -> None:
+    daemon = grasped(make(), 5.0)
+    perception = daemon.loop.perceptions[1]
+    frozen = perception.frame
+
+    class Silent:
+        def latest(self) -> Any:
+            return frozen
+
+        def close(self) -> None: ...
+
+    perception.sensor = Silent()  # type: ignore[assignment]
+    goal = None
+    finish = daemon.clock.now() + 0.5
+    while daemon.loop.state.mode != "fault":
+        assert daemon.clock.now() < finish
+        daemon.loop.advance(daemon.loop.period)
+        if daemon.clock.now() - perception.frame.t_arrival > 4.5 * 0.01:  # type: ignore[union-attr]
+            held = daemon.loop.state.goal.current.copy()
+            assert goal is None or (held == goal).all(), "goals moved on without frames"
+            goal = held
+    assert goal is not None
+    assert daemon.loop.state.fault.startswith("tactile: no frame for 0.1")
+    assert not daemon.loop.state.torque
+
+
+def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert daemon.loop.servos is not None
+
+    def failing(reading: Any) -> None:
+        reading.valid = False
+
+    daemon.loop.servos.read = failing  # type: ignore[method-assign]
+    advance_to(daemon, "fault", 0.2)
+    assert "no good reading" in daemon.loop.state.fault
+    with pytest.raises(Refused, match="clear: servos: no good reading"):
+        command(daemon, "clear")
+
+
+def run_recorded(make: Make, seed: int) -> list[bytes]:
+    daemon = make(simulation={"seed": seed})
+    recorded = []
+    script = {
+        10: ("arm", {}),
+        30: ("grasp", {"force": 7.0}),
+        900: ("rotate", {"angle": 0.1}),
+        1500: ("release", {}),
+    }
+    for tick in range(2000):
+        if tick in script:
+            name, numbers = script[tick]
+            command(daemon, name, **numbers)
+        daemon.loop.advance(daemon.loop.period)
+        recorded.append(pack(state_message(daemon.loop.state, (True, True))))
+    return recorded
+
+
+def test_two_runs_with_one_seed_are_the_same_to_the_bit(make: Make) -> None:
+    assert run_recorded(make, 3) == run_recorded(make, 3)
+    assert run_recorded(make, 3)[1500:] != run_recorded(make, 4)[1500:]
+
+
+def compiled() -> int:
+    return sum(len(each.signatures) for each in gc.get_objects() if isinstance(each, Dispatcher))
+
+
+def test_no_kernel_compiles_in_a_running_loop(make: Make) -> None:
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
+    with Daemon(settings, wire=False) as daemon:
+        before = compiled()
+        daemon.loop.advance(0.3)
+        grasped(daemon, 8.0)
+        command(daemon, "rotate", angle=0.1)
+        daemon.loop.advance(2.0)
+        command(daemon, "release")
+        daemon.loop.advance(1.0)
+        assert compiled() == before
+
+
+def test_tare_removes_a_standing_offset(make: Make) -> None:
+    daemon = make()
+    command(daemon, "tare")
+    daemon.loop.advance(0.5)
+    grasped(daemon, 6.0)
+    daemon.loop.advance(1.0)
+    assert daemon.hand is not None
+    assert daemon.loop.state.contacts[0].force == pytest.approx(daemon.hand.force[0], rel=0.05)
+
+
+SCENES: dict[str, dict[str, Any]] = {
+    "two fingers": {},
+    "one finger": {"scene": {"fingers": ("left",)}},
+    "the other finger": {"scene": {"fingers": ("right",)}},
+    "sensor without servos": {"servos": {"backend": "none"}},
+    "servos without sensors": {"tactile": {"backend": "none"}},
+    "no object model": {"scene": {"object_model": False}},
+}
+
+
+@pytest.mark.parametrize("sections", SCENES.values(), ids=SCENES.keys())
+def test_every_scene_runs_and_its_messages_have_one_shape(
+    make: Make, sections: dict[str, Any]
+) -> None:
+    daemon = make(**sections)
+    daemon.loop.advance(2.0)
+    message = state_message(daemon.loop.state, daemon.loop._fingers)
+    reference = state_message(make().loop.state, (True, True))
+    assert message.keys() == reference.keys()
+    for part in ("left", "right", "object"):
+        assert message[part].keys() == reference[part].keys()
+        for key, value in reference[part].items():
+            assert type(message[part][key]) is type(value), (part, key)
+    fingers = daemon.settings.scene.fingers
+    assert message["left"]["valid"] is ("left" in fingers)
+    assert message["right"]["valid"] is ("right" in fingers)
+
+
+def test_one_finger_presses_on_a_fixed_object(make: Make) -> None:
+    daemon = grasped(make(scene={"fingers": ("left",)}), 6.0)
+    daemon.loop.advance(2.0)
+    assert daemon.loop.state.contacts[0].force == pytest.approx(6.0, rel=0.05)
+    assert daemon.loop.state.contacts[1].force == 0.0
+    assert not daemon.loop.state.object.valid
+    with pytest.raises(Refused, match="needs both fingers"):
+        command(daemon, "rotate", angle=0.1)
+
+
+def test_watching_a_compression_needs_no_servos(make: Make) -> None:
+    daemon = make(servos={"backend": "none"})
+    deepest = 0.0
+    for _ in range(80):
+        daemon.loop.advance(0.1)
+        deepest = max(deepest, daemon.loop.state.contacts[0].d)
+    assert deepest > 0.002
+    with pytest.raises(Refused, match="arm: this scene has no servos"):
+        command(daemon, "arm")
+
+
+def test_servos_without_sensors_move_but_do_not_grasp(make: Make) -> None:
+    daemon = make(tactile={"backend": "none"})
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.1)
+    advance_to(daemon, "armed", 3.0)
+    with pytest.raises(Refused, match="needs a tactile sensor"):
+        command(daemon, "grasp")
+
+
+def test_the_demo_task_grasps_turns_and_releases_by_itself(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    seen: list[str] = []
+    turned: list[float] = []
+    for _ in range(2000):
+        daemon.loop.advance(0.01)
+        state = daemon.loop.state
+        if not seen or seen[-1] != state.mode:
+            seen.append(state.mode)
+        if state.object.valid:
+            turned.append(state.object.angle)
+    assert daemon.loop.state.fault == ""
+    once = ["grasping", "holding", *(["rotating", "holding"] * 3), "releasing", "armed"]
+    assert seen[: len(once) + 2] == ["disarmed", "armed", *once]
+    assert max(turned) > 0.12
+    assert min(turned) < -0.12
