@@ -11,9 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.model import make_material, make_table
 from daemon.settings import Settings
 from daemon.simulation import layout, plant, tip
-from daemon.simulation.parameters import parameters_of, stiff_step, table_of
+from daemon.simulation.parameters import parameters_of, stiff_step
 from kinematics.table import ContactTable
 
 FloatArray = NDArray[np.float64]
@@ -40,14 +41,22 @@ class SimulatedHand:
     """
 
     def __init__(
-        self, settings: Settings, start: float = 0.0, table: ContactTable | None = None
+        self,
+        settings: Settings,
+        start: float = 0.0,
+        table: ContactTable | None = None,
+        step: float | None = None,
     ) -> None:
         """Build the plant at rest, torque off, at time ``start`` [s].
 
-        ``table`` is the contact table of the settings' tip and material, built when not given.
+        ``table`` is the contact table of the settings' tip and material, built when not given;
+        ``step`` [s] the sub-step, chosen from the stiffness when not given. Raises SettingsError
+        for settings that no plant can be built from.
         """
-        self.table = table_of(settings) if table is None else table
-        self.step = stiff_step(settings, self.table)
+        if table is None:
+            table = make_table(settings, make_material(settings.material), None)
+        self.table = table
+        self.step = stiff_step(settings, table) if step is None else step
         self.start = start
         self.params = parameters_of(settings, self.table, self.step)
         self.state = np.zeros(layout.STATE)

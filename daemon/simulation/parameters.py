@@ -14,9 +14,7 @@ from daemon.records import FINGERS
 from daemon.servos.models import by_name
 from daemon.settings import Settings, SettingsError
 from daemon.simulation import layout, tip
-from kinematics.contact import Fingertip
 from kinematics.fingers import HandGeometry
-from kinematics.material import Material
 from kinematics.table import ContactTable
 
 FloatArray = NDArray[np.float64]
@@ -40,26 +38,6 @@ def geometry_of(settings: Settings) -> HandGeometry:
     hand = settings.hand
     return HandGeometry(
         hand.pivot_separation, hand.finger_length, hand.finger_offset, settings.tip.radius
-    )
-
-
-def table_of(settings: Settings) -> ContactTable:
-    """The contact table of the settings' tip and material.
-
-    Raises SettingsError when the material's points are no usable law.
-    """
-    law = settings.material
-    if law.law == "constant":
-        material = Material.constant(law.modulus)
-    elif law.law == "table_i":
-        material = Material.table_i()
-    else:
-        try:
-            material = Material.from_points(np.array(law.strain), np.array(law.stress))
-        except ValueError as error:
-            raise SettingsError(f"material.strain, material.stress: {error}") from None
-    return ContactTable.build(
-        Fingertip(radius=settings.tip.radius), material, tolerance=settings.table.tolerance
     )
 
 
