@@ -26,7 +26,10 @@ class Servos(Protocol):
         """Open and check everything. Raises ServoError with the whole list of what is wrong."""
 
     def read(self, reading: Reading) -> None:
-        """Fill ``reading`` in place; ``valid`` is False and the numbers keep when it failed."""
+        """Fill ``reading`` in place; when it failed, ``valid`` is False and all else but ``seq`` keeps.
+
+        So ``reading.t`` is the time of the last good one.
+        """
 
     def set_torque(self, on: bool) -> None:
         """Torque on (goal first set to the present angle) or off. Raises ServoError on failure."""

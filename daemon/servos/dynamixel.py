@@ -167,10 +167,10 @@ class DynamixelServos:
                 self._retries += 1
                 result = present.exchange(self._fast)
             port.not_after = math.inf
-        reading.t = self._clock.now()
         reading.valid = result == COMM_SUCCESS
         if not reading.valid:
             return
+        reading.t = self._clock.now()
         self._last_sent = begin
         alert = 0
         for finger, servo_id in self._ids.items():
