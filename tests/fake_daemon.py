@@ -97,6 +97,7 @@ class FakeDaemon:
         self.replies: dict[str, Any] = {}
         self.requests: list[dict[str, Any]] = []
         self.silent = threading.Event()
+        self.published = 0  # states so far
         self._extra: list[list[bytes]] = []
         self._context: zmq.Context[Any] = zmq.Context()
         self._publisher = self._context.socket(zmq.PUB)
@@ -140,6 +141,7 @@ class FakeDaemon:
                     payload = msgpack.packb(frame(t, side))
                     self._publisher.send_multipart([b"hand/tactile", payload])
             seq += 1
+            self.published = seq
 
     def close(self) -> None:
         self._over.set()

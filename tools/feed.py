@@ -331,7 +331,8 @@ class Commander:
         if field(record, "ok") is True:
             return Reply(now, True, f"{label}: ok")
         why = text(record, "error") or "an answer that can't be read"
-        return Reply(now, False, f"{label}: {why}")
+        said = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
+        return Reply(now, False, why if said else f"{label}: {why}")
 
     def close(self) -> None:
         """Close what is open; commands that were not taken yet are dropped."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,13 @@ _ANCHORS = (
 )
 
 
+# The same course through the 256 fixed colours: the nearest ones would jump in lightness.
+_FIXED = (17, 18, 24, 30, 36, 72, 77, 113, 149, 185, 227)
+
+# What a terminal can show: any colour, 256 fixed ones, or too few for a map.
+Depth = Literal["any", "fixed", "none"]
+
+
 def colour_map(levels: int = LEVELS) -> list[tuple[int, int, int]]:
     """The scale's colours from zero to full, as (red, green, blue) of 0…255."""
     at = np.linspace(0.0, len(_ANCHORS) - 1.0, levels)
@@ -44,12 +52,17 @@ def colour_map(levels: int = LEVELS) -> list[tuple[int, int, int]]:
     ]
 
 
-_COLOURS = [Color.from_rgb(*rgb) for rgb in colour_map()]
+_COLOURS = {
+    "any": [Color.from_rgb(*rgb) for rgb in colour_map()],
+    "fixed": [
+        Color.from_ansi(_FIXED[round(k * (len(_FIXED) - 1) / (LEVELS - 1))]) for k in range(LEVELS)
+    ],
+}
 
 
 @lru_cache(maxsize=LEVELS * LEVELS)
-def _pair_style(top: int, bottom: int) -> Style:
-    return Style(color=_COLOURS[top], bgcolor=_COLOURS[bottom])
+def _pair_style(top: int, bottom: int, depth: Depth) -> Style:
+    return Style(color=_COLOURS[depth][top], bgcolor=_COLOURS[depth][bottom])
 
 
 @lru_cache(maxsize=16)
@@ -83,44 +96,39 @@ def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
     return np.rint(scaled * (LEVELS - 1)).astype(np.int64)
 
 
-def half_blocks(grid: FloatArray, full: float, lines: int, columns: int) -> list[list[Segment]]:
+def picture(
+    grid: FloatArray, full: float, lines: int, columns: int, depth: Depth
+) -> list[list[Segment]]:
     """``grid`` as ``lines`` of ``columns`` characters, row 0 lowest as y points up.
 
-    ``full`` is the value that gets the brightest colour.
+    ``full`` is the value that gets the brightest colour, or the densest shade.
     """
+    if depth == "none":
+        levels = levels_of(resample(grid, lines, columns), full)[::-1]
+        return [_shades(row) for row in levels]
     levels = levels_of(resample(grid, 2 * lines, columns), full)[::-1]
-    picture = []
-    for line in range(lines):
-        pairs = levels[2 * line] * LEVELS + levels[2 * line + 1]
-        picture.append(_runs(pairs))
-    return picture
+    return [_runs(levels[2 * k] * LEVELS + levels[2 * k + 1], depth) for k in range(lines)]
 
 
-def _runs(pairs: NDArray[np.int64]) -> list[Segment]:
+def _runs(pairs: NDArray[np.int64], depth: Depth) -> list[Segment]:
     """One line, neighbours of the same two colours in one segment."""
     starts = [0, *(np.flatnonzero(np.diff(pairs)) + 1).tolist(), len(pairs)]
     segments = []
     for start, end in pairwise(starts):
         top, bottom = divmod(int(pairs[start]), LEVELS)
-        segments.append(Segment("▀" * (end - start), _pair_style(top, bottom)))
+        segments.append(Segment("▀" * (end - start), _pair_style(top, bottom, depth)))
     return segments
 
 
-def shades(grid: FloatArray, full: float, lines: int, columns: int) -> list[list[Segment]]:
-    """The same picture for a terminal without colours, one shaded character a pixel."""
-    levels = levels_of(resample(grid, lines, columns), full)[::-1]
+def _shades(levels: NDArray[np.int64]) -> list[Segment]:
     index = np.ceil(levels * ((len(SHADES) - 1) / (LEVELS - 1))).astype(int)
-    return [[Segment("".join(SHADES[i] for i in row))] for row in index]
+    return [Segment("".join(SHADES[i] for i in index))]
 
 
-def colour_bar(columns: int, colours: bool) -> list[Segment]:
+def colour_bar(columns: int, depth: Depth) -> list[Segment]:
     """The scale from nothing to full, in one line."""
-    at = np.linspace(0.0, 1.0, columns)
-    if not colours:
-        index = np.rint(at * (len(SHADES) - 1)).astype(int)
-        return [Segment("".join(SHADES[i] for i in index))]
-    levels = np.rint(at * (LEVELS - 1)).astype(np.int64)
-    return _runs(levels * LEVELS + levels)
+    levels = levels_of(np.linspace(0.0, 1.0, columns), 1.0)
+    return _shades(levels) if depth == "none" else _runs(levels * LEVELS + levels, depth)
 
 
 def round_up(value: float) -> float:

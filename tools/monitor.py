@@ -126,9 +126,8 @@ class _Ending:
         os.close(self._wake_write)
 
     def _end(self, number_: int, frame: FrameType | None) -> None:
-        first = not self.over
         self.over = True
-        if first and self.terminal is not None and self.terminal.writing:
+        if self.terminal is not None and self.terminal.writing:
             raise TerminalGone("a signal came while the terminal took no output")
 
     def _pause(self, number_: int, frame: FrameType | None) -> None:
@@ -168,7 +167,7 @@ def _run_page(page: Page, subscriber: Subscriber, commander: Commander, ending: 
     keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
     page.keys = keyboard is not None
     terminal = Terminal(sys.stdout.fileno(), keyboard, suspendable=not ending.beside)
-    page.colours = terminal.rich_colours
+    page.depth = terminal.depth
     ending.terminal = terminal
     try:
         while not ending.over:
@@ -278,9 +277,8 @@ def _run_plain(address: str, subscriber: Subscriber, ending: _Ending) -> None:
             if status != said_status:
                 said_status = status
                 _say(f"{_clock()} stream {status}: {address}")
-            for event in (
-                list(feed.events)[shown - feed.event_count :] if shown < (feed.event_count) else ()
-            ):
+            fresh = feed.event_count - shown
+            for event in list(feed.events)[-fresh:] if fresh else ():
                 _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
             shown = feed.event_count
             if status in ("live", "stale") and now >= due:

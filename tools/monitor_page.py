@@ -31,7 +31,8 @@ Line = list[Segment]
 
 PLAIN = Style()
 BOLD = Style(bold=True)
-DIM = Style(dim=True)
+DIM = Style(color="#8b929c")
+FADED = Style(color="#8b929c", bold=False)
 GOOD = Style(color="#1fa883")
 WARN = Style(color="#e69f00")
 BAD = Style(color="#ff6a3d", bold=True)
@@ -55,7 +56,7 @@ _ROWS = (
     ("θ", "theta", math.degrees(1.0), 2, "°", "theta_std"),
     ("force", "force", 1.0, 2, "N", "force_std"),
     ("energy", "energy", 1e3, 2, "mJ", "energy_std"),
-    ("age", "frame_age_s", 1e3, 1, "ms", ""),
+    ("map age", "frame_age_s", 1e3, 1, "ms", ""),
     ("", "", 0.0, 0, "", ""),
     ("joint", "q", math.degrees(1.0), 2, "°", ""),
     ("goal", "goal_q", math.degrees(1.0), 2, "°", ""),
@@ -71,7 +72,7 @@ class Page:
 
     feed: Feed
     address: str
-    colours: bool = True  # at least 256 of them
+    depth: heatmap.Depth = "any"
     keys: bool = True  # a keyboard is there
     _pressure: heatmap.FullScale = field(
         default_factory=lambda: heatmap.FullScale(least=5e3, patience=3.0)
@@ -91,25 +92,30 @@ class Page:
             self._statistics_at = now
         status = self.feed.status(now)
         maps, trend, events = _shares(width, height)
-        page = [
-            self._header(width, now, status),
-            self._notice(width, now, status),
+        numbers = [
             *self._body(width, maps, now),
             _rule(width),
             *self._trends(width, trend),
-            self._ticks(width),
+            self._ticks(),
+        ]
+        if status in ("stale", "lost"):
+            numbers = [_faded(line) for line in numbers]
+        page = [
+            self._header(width, now, status),
+            self._notice(width, status),
+            *numbers,
             _rule(width, "events", _reply(reply, now)),
             *self._events(width, events),
             self._footer(width),
         ]
-        if status in ("stale", "lost"):
-            page[2:-1] = [_faded(line) for line in page[2:-1]]
         return [_exactly(line, width) for line in page]
 
     def _header(self, width: int, now: float, status: str) -> Line:
         mode = text(self.feed.state, "mode")
         fault = text(self.feed.state, "fault")
-        badge = ALARM if fault else _BADGES.get(mode, _BUSY if mode else _BADGES["disarmed"])
+        badge = ALARM if fault else _BADGES.get(mode, _BUSY)
+        if not mode or status == "lost":
+            badge = _BADGES["disarmed"]
         left = [
             Segment(" softfinger ", BOLD),
             Segment(f" {mode.upper() or '—'} ", badge),
@@ -124,11 +130,15 @@ class Page:
             age = _short(self.feed.age(now), 1)
             right = [Segment(f"{sign} {age} s ", WARN if status == "stale" else BAD)]
         room = width - _length(left) - _length(right) - 2
-        if len(self.address) <= room:
+        unreadable = f"{self.feed.skipped} unreadable  " if self.feed.skipped else ""
+        if len(self.address) + len(unreadable) <= room:
             right = [Segment(f"{self.address}  ", DIM), *right]
+        right = [Segment(unreadable, WARN), *right]
         return _apart(left, right, width)
 
-    def _notice(self, width: int, now: float, status: str) -> Line:
+    def _notice(self, width: int, status: str) -> Line:
+        if status == "lost":
+            return [Segment(" nothing comes any more; what stands below is old", BAD)]
         fault = text(self.feed.state, "fault")
         if fault:
             way = "c clears it " if self.keys else "softfinger send clear "
@@ -138,9 +148,6 @@ class Page:
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
             return [Segment(_cut(what, width), WARN)]
-        if status == "lost":
-            what = " nothing comes any more; what stands below is old"
-            return [Segment(what, BAD)]
         schema = value_at(self.feed.state, "schema")
         if self.feed.state is not None and schema != SCHEMA:
             what = f" the stream has schema {schema!r:.12}, this page knows {SCHEMA}"
@@ -155,15 +162,7 @@ class Page:
         full = self._pressure.follow(peak, now)
         counts = any(math.isnan(frame.scale) for frame in self.feed.frames.values())
         left, right = (self._map(name, lines, box, full, now, counts) for name in FINGERS)
-        top = max(0, (lines - len(_ROWS)) // 2)
-        numbers: list[Line] = [[] for _ in range(top)]
-        numbers += [self._row(*row) for row in _ROWS]
-        numbers += [[] for _ in range(lines - len(numbers))]
-        rows = [
-            self._heads(),
-            *numbers,
-            self._object(),
-        ]
+        rows = self._numbers(lines + 2)
         gap = max(1, (width - 2 * box - CENTRE) // 2)
         gap = min(gap, 6)
         margin = Segment(" " * max(0, (width - 2 * box - 2 * gap - CENTRE) // 2))
@@ -200,19 +199,27 @@ class Page:
             [Segment(name.upper(), SIDE[name]), Segment(f" {said}", style)], [Segment(peak)], box
         )
         height, columns = heatmap.fit(frame.rows, frame.cols, lines, box)
-        draw = heatmap.half_blocks if self.colours else heatmap.shades
         above = (lines - height) // 2
         picture: list[Line] = [[] for _ in range(lines)]
-        for i, line in enumerate(draw(grid, full, height, columns)):
+        for i, line in enumerate(heatmap.picture(grid, full, height, columns, self.depth)):
             picture[above + i] = _centred([*line], box)
         end = f" {full * factor:g} {unit}"
-        bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.colours)
+        bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.depth)
         return [title, *picture, [Segment("0 ", DIM), *bar, Segment(end, DIM)]]
+
+    def _numbers(self, lines: int) -> list[Line]:
+        """Heads, one row a quantity, and the object, in the middle of ``lines``."""
+        rows = [self._row(*row) for row in _ROWS]
+        between: list[Line] = [[]] if lines > len(rows) + 3 else []
+        block = [self._heads(), *between, *rows, *between, self._object()]
+        above = (lines - len(block)) // 2
+        return [[]] * above + block + [[]] * (lines - above - len(block))
 
     def _heads(self) -> Line:
         present = {name: value_at(self.feed.state, name, "valid") is not False for name in FINGERS}
         heads = [
-            Segment(f"{name if present[name] else name + ' –':^11}", SIDE[name]) for name in FINGERS
+            Segment(f"{name if present[name] else name + ' —':^10} ", SIDE[name])
+            for name in FINGERS
         ]
         return [Segment(" " * 8), *heads]
 
@@ -247,28 +254,25 @@ class Page:
 
     def _trends(self, width: int, lines: int) -> list[Line]:
         """Both forces over the last while, ``lines`` of bars each."""
-        columns = width - 24
+        columns = width - 30
         recent = list(self.feed.history)[-columns:]
         peak = max((v for pair in recent for v in pair if math.isfinite(v)), default=0.0)
         full = self._force.follow(peak, 0.0)
-        result = []
+        result: list[Line] = []
         for i, name in enumerate(FINGERS):
             bars = _bars([pair[i] for pair in recent], full, lines)
-            for k, bar in enumerate(bars):
-                last = k == lines - 1
-                value = _aligned(number(self.feed.state, name, "force"), 2)
-                label = f" force {name:<6}" if last else ""
+            value = _aligned(number(self.feed.state, name, "force"), 2)
+            for bar in bars:
                 result.append(
-                    [
-                        Segment(f"{label:<13}", DIM),
-                        Segment(f"{value if last else '':<8}"),
-                        Segment(f"{bar:>{columns}}", SIDE[name]),
-                        Segment(f"{f'{full:g} N':>{_TAIL}}" if k == 0 and i == 0 else "", DIM),
-                    ]
+                    [Segment(" " * 23), Segment(f"{bar:>{columns}}", SIDE[name]), Segment(" ")]
                 )
+            result[-1][0] = Segment(f" force {name:<6}", DIM)
+            result[-1].insert(1, Segment(f"{value:<8}"))
+            result[-1].insert(2, Segment("N ", DIM))
+            result[-lines].append(Segment(f"{full:g} N", DIM))
         return result
 
-    def _ticks(self, width: int) -> Line:
+    def _ticks(self) -> Line:
         now = self._statistics
         overruns = number(self.feed.state, "overruns")
         line = [Segment(" tick ", DIM), Segment(f"{_short(now.rate, 0)} Hz")]
@@ -285,8 +289,6 @@ class Page:
             Segment("   overruns ", DIM),
             Segment(_short(overruns, 0), WARN if overruns > 0 else PLAIN),
         ]
-        if self.feed.skipped:
-            line += [Segment("   unreadable ", DIM), Segment(str(self.feed.skipped), WARN)]
         return line
 
     def _events(self, width: int, count: int) -> list[Line]:
@@ -317,9 +319,6 @@ class Page:
         ):
             line += [Segment(key, KEY), Segment(f" {what}  ", DIM)]
         return line
-
-
-_TAIL = 3
 
 
 def _shares(width: int, height: int) -> tuple[int, int, int]:
@@ -423,5 +422,5 @@ def _rule(width: int, title: str = "", note: Line | None = None) -> Line:
 
 
 def _faded(line: Line) -> Line:
-    """``line`` as something that is no longer true."""
-    return [Segment(s.text, (s.style or PLAIN) + DIM) for s in line]
+    """``line`` as something that is no longer true: colourless, but for the maps."""
+    return [s if "▀" in s.text else Segment(s.text, FADED) for s in line]

@@ -19,6 +19,8 @@ from rich.color import ColorSystem
 from rich.console import Console
 from rich.segment import Segment
 
+from tools.heatmap import Depth
+
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, pastes marked
 _LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # CAN ends a sequence that was cut off
 _HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # terminals that know it show a redraw as one
@@ -111,11 +113,14 @@ class Terminal:
         self._shown: list[str] = []
         self._size = (0, 0)
         self.writing = False
+        self._stuck = False
         console = Console()
         name = None if console.no_color else console.color_system
         self._colours = _COLOUR_SYSTEMS.get(name) if name else None
         # Sixteen colours are too few for a map; shades of one character read better there.
-        self.rich_colours = self._colours in (ColorSystem.TRUECOLOR, ColorSystem.EIGHT_BIT)
+        self.depth: Depth = "none"
+        if self._colours in (ColorSystem.TRUECOLOR, ColorSystem.EIGHT_BIT):
+            self.depth = "any" if self._colours is ColorSystem.TRUECOLOR else "fixed"
 
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
@@ -126,6 +131,7 @@ class Terminal:
                 ours[6][termios.VSUSP] = b"\0"
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, ours)
         self._shown = []
+        self._size = (0, 0)
         try:
             self._write(_ENTER)
         except BaseException:
@@ -143,7 +149,10 @@ class Terminal:
             if self._attributes is not None and self._keyboard is not None:
                 # At once and not after the output has drained: a stuck line would hold us here.
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
-        with contextlib.suppress(OSError, TerminalGone):
+        with contextlib.suppress(OSError, termios.error, TerminalGone):
+            if self._stuck:  # what it did not take shall not stand before what follows
+                termios.tcflush(self._output, termios.TCOFLUSH)
+            termios.tcflow(self._output, termios.TCOON)  # as Ctrl-Q, or the next write hangs
             self._write(_LEAVE)
 
     def size(self) -> tuple[int, int]:
@@ -181,6 +190,9 @@ class Terminal:
         try:
             while data:
                 data = data[os.write(self._output, data) :]
+        except TerminalGone:
+            self._stuck = True
+            raise
         except OSError as error:
             raise TerminalGone(str(error)) from error
         finally:

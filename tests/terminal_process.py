@@ -1,0 +1,101 @@
+"""A process on a pseudo-terminal of its own, and what a person would see there."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import select
+import signal
+import struct
+import subprocess
+import termios
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pyte
+
+ENVIRONMENT = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8"}
+
+
+class TerminalProcess:
+    """``command`` with a pty as controlling terminal; ``screen`` follows what it writes."""
+
+    def __init__(self, command: list[str], columns: int = 80, lines: int = 24) -> None:
+        self.master, self.slave = pty.openpty()
+        self.screen = pyte.Screen(columns, lines)
+        self._stream = pyte.ByteStream(self.screen)
+        self.written = b""
+        self.resize(columns, lines, tell=False)
+        self.attributes = termios.tcgetattr(self.slave)
+        environment = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "FORCE_COLOR")}
+        self.process: subprocess.Popen[bytes] = subprocess.Popen(
+            command,
+            stdin=self.slave,
+            stdout=self.slave,
+            stderr=self.slave,
+            env=environment | ENVIRONMENT,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+
+    def resize(self, columns: int, lines: int, tell: bool = True) -> None:
+        fcntl.ioctl(self.slave, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+        if tell:
+            self.screen.resize(lines, columns)
+            self.screen.reset()
+
+    def pump(self, seconds: float = 0.02) -> None:
+        """Take what it writes within ``seconds``; returns at the first quiet moment."""
+        while select.select([self.master], [], [], seconds)[0]:
+            data = os.read(self.master, 65536)
+            self.written += data
+            self._stream.feed(data)
+            seconds = 0.0
+
+    def text(self) -> str:
+        return "\n".join(self.screen.display)
+
+    def wait(self, condition: Callable[[], Any], seconds: float = 15.0) -> None:
+        """Follow the page until ``condition`` holds; fail with the page when it doesn't."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            self.pump()
+            if time.monotonic() > deadline:
+                raise AssertionError(f"not within {seconds:g} s; the page:\n{self.text()}")
+
+    def shows(self, *texts: str, seconds: float = 15.0) -> None:
+        self.wait(lambda: all(text in self.text() for text in texts), seconds)
+
+    def type(self, keys: bytes) -> None:
+        os.write(self.master, keys)
+
+    def ended(self) -> int:
+        """Wait for its end; the exit code."""
+        self.wait(lambda: self.process.poll() is not None)
+        self.pump()
+        return self.process.returncode
+
+    def is_restored(self) -> bool:
+        """The terminal is as it was: modes, main screen, cursor, colours, pastes."""
+        self.pump()
+        pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
+        pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
+        # The one that gives back is the last of each pair, and the page had taken the terminal.
+        given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
+        return given and termios.tcgetattr(self.slave) == self.attributes
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.kill()
+            self.process.wait()
+        os.close(self.master)
+        os.close(self.slave)
+
+    def __enter__(self) -> TerminalProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
