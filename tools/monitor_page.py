@@ -10,16 +10,30 @@ right, the numbers of both between them, then the object they hold.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from rich.cells import cell_len, set_cell_size
 from rich.segment import Segment
 from rich.style import Style
 
 from tools import heatmap
 from tools.feed import FINGERS, SCHEMA, Feed, Reply, TickStatistics, number, text
 from tools.feed import field as value_at
+from tools.typeset import (
+    DIM,
+    PLAIN,
+    Line,
+    aligned,
+    apart,
+    bars,
+    centred,
+    cut,
+    exactly,
+    faded,
+    length,
+    narrow,
+    rule,
+    short,
+)
 
 WIDTH, HEIGHT = 80, 24  # the least that everything fits into
 CENTRE = 34  # columns of the numbers
@@ -27,12 +41,7 @@ MAP_LINES = 11  # of each map at the least size
 OLD = 1.0  # s after which a frame on the page is called old
 REPLY_TIME = 12.0  # s a reply stays
 
-Line = list[Segment]
-
-PLAIN = Style()
 BOLD = Style(bold=True)
-DIM = Style(color="#8b929c")
-FADED = Style(color="#8b929c", bold=False)
 GOOD = Style(color="#1fa883")
 WARN = Style(color="#e69f00")
 BAD = Style(color="#ff6a3d", bold=True)
@@ -48,7 +57,6 @@ _BADGES = {
 }
 _BUSY = Style(color="#201800", bgcolor="#e6a817", bold=True)
 _LEVELS = {"info": DIM, "warning": WARN, "error": BAD}
-_BARS = " ▁▂▃▄▅▆▇█"
 
 # (label, field, factor, decimals, unit, field of the standard deviation); "" leaves a line
 _ROWS = (
@@ -94,21 +102,21 @@ class Page:
         maps, trend, events = _shares(width, height)
         numbers = [
             *self._body(width, maps, now),
-            _rule(width),
+            rule(width),
             *self._trends(width, trend),
             self._ticks(),
         ]
         if status in ("stale", "lost"):
-            numbers = [_faded(line) for line in numbers]
+            numbers = [faded(line) for line in numbers]
         page = [
             self._header(width, now, status),
             self._notice(width, status),
             *numbers,
-            _rule(width, "events", _reply(reply, now)),
+            rule(width, "events", _reply(reply, now)),
             *self._events(width, events),
             self._footer(width),
         ]
-        return [_exactly(line, width) for line in page]
+        return [exactly(line, width) for line in page]
 
     def _header(self, width: int, now: float, status: str) -> Line:
         mode = text(self.feed.state, "mode")
@@ -123,18 +131,18 @@ class Page:
         if status == "waiting":
             right = [Segment("○ no stream yet ", WARN)]
         elif status == "live":
-            rate = _short(self._statistics.messages, 0)
+            rate = short(self._statistics.messages, 0)
             right = [Segment("● live ", GOOD), Segment(f"{rate} Hz ", DIM)]
         else:
             sign = "◐ stale" if status == "stale" else "○ lost"
-            age = _short(self.feed.age(now), 1)
+            age = short(self.feed.age(now), 1)
             right = [Segment(f"{sign} {age} s ", WARN if status == "stale" else BAD)]
-        room = width - _length(left) - _length(right) - 2
+        room = width - length(left) - length(right) - 2
         unreadable = f"{self.feed.skipped} unreadable  " if self.feed.skipped else ""
         if len(self.address) + len(unreadable) <= room:
             right = [Segment(f"{self.address}  ", DIM), *right]
         right = [Segment(unreadable, WARN), *right]
-        return _apart(left, right, width)
+        return apart(left, right, width)
 
     def _notice(self, width: int, status: str) -> Line:
         if status == "lost":
@@ -143,11 +151,11 @@ class Page:
         if fault:
             way = "c clears it " if self.keys else "softfinger send clear "
             room = width - len(way) - 8
-            line = [Segment(f" FAULT {_cut(fault, room)}", ALARM)]
-            return _apart(line, [Segment(way, ALARM)], width, ALARM)
+            line = [Segment(f" FAULT {cut(fault, room)}", ALARM)]
+            return apart(line, [Segment(way, ALARM)], width, ALARM)
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
-            return [Segment(_cut(what, width), WARN)]
+            return [Segment(cut(what, width), WARN)]
         schema = value_at(self.feed.state, "schema")
         if self.feed.state is not None and schema != SCHEMA:
             what = f" the stream has schema {schema!r:.12}, this page knows {SCHEMA}"
@@ -170,11 +178,11 @@ class Page:
         return [
             [
                 margin,
-                *_exactly(a, box),
+                *exactly(a, box),
                 space,
-                *_exactly(b, CENTRE),
+                *exactly(b, CENTRE),
                 space,
-                *_exactly(c, box),
+                *exactly(c, box),
             ]
             for a, b, c in zip(left, rows, right, strict=True)
         ]
@@ -186,7 +194,7 @@ class Page:
         frame = self.feed.frames.get(name)
         unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
         if frame is None:
-            empty = [_centred([Segment("no frames", DIM)], box) if i == lines // 2 else []
+            empty = [centred([Segment("no frames", DIM)], box) if i == lines // 2 else []
                      for i in range(lines)]  # fmt: skip
             return [[Segment(name.upper(), SIDE[name])], *empty, []]
         grid = frame.grid()
@@ -195,14 +203,14 @@ class Page:
         said = "old" if old else "contact" if touch is True else "free" if touch is False else ""
         style = WARN if old else GOOD if touch is True else DIM
         peak = f"{grid.max() * factor:.{decimals}f} {unit}"
-        title = _apart(
+        title = apart(
             [Segment(name.upper(), SIDE[name]), Segment(f" {said}", style)], [Segment(peak)], box
         )
         height, columns = heatmap.fit(frame.rows, frame.cols, lines, box)
         above = (lines - height) // 2
         picture: list[Line] = [[] for _ in range(lines)]
         for i, line in enumerate(heatmap.picture(grid, full, height, columns, self.depth)):
-            picture[above + i] = _centred([*line], box)
+            picture[above + i] = centred([*line], box)
         end = f" {full * factor:g} {unit}"
         bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.depth)
         return [title, *picture, [Segment("0 ", DIM), *bar, Segment(end, DIM)]]
@@ -230,9 +238,9 @@ class Page:
         for name in FINGERS:
             finger = value_at(self.feed.state, name)
             here = value_at(finger, "valid") is not False
-            shown = _aligned(factor * number(finger, key), decimals)
+            shown = aligned(factor * number(finger, key), decimals)
             spread = number(finger, std) if std else math.nan
-            beside = "" if math.isnan(spread) else "±" + _narrow(factor * spread)
+            beside = "" if math.isnan(spread) else "±" + narrow(factor * spread)
             line.append(Segment(f"{shown:<6}", PLAIN if here else DIM))
             line.append(Segment(f"{beside:<{11 - max(6, len(shown))}}", DIM))
         line.append(Segment(f" {unit}", DIM))
@@ -246,9 +254,9 @@ class Page:
         width = 1e3 * number(pose, "width")
         return [
             Segment(f"{'object':<8}", DIM),
-            Segment(f"{_aligned(angle, 2):<6}", BOLD),
+            Segment(f"{aligned(angle, 2):<6}", BOLD),
             Segment(f"{' °':<5}", DIM),
-            Segment(f"{_aligned(width, 2):<6}", BOLD),
+            Segment(f"{aligned(width, 2):<6}", BOLD),
             Segment(" mm wide", DIM),
         ]
 
@@ -260,9 +268,8 @@ class Page:
         full = self._force.follow(peak, 0.0)
         result: list[Line] = []
         for i, name in enumerate(FINGERS):
-            bars = _bars([pair[i] for pair in recent], full, lines)
-            value = _aligned(number(self.feed.state, name, "force"), 2)
-            for bar in bars:
+            value = aligned(number(self.feed.state, name, "force"), 2)
+            for bar in bars([pair[i] for pair in recent], full, lines):
                 result.append(
                     [Segment(" " * 23), Segment(f"{bar:>{columns}}", SIDE[name]), Segment(" ")]
                 )
@@ -275,19 +282,19 @@ class Page:
     def _ticks(self) -> Line:
         now = self._statistics
         overruns = number(self.feed.state, "overruns")
-        line = [Segment(" tick ", DIM), Segment(f"{_short(now.rate, 0)} Hz")]
+        line = [Segment(" tick ", DIM), Segment(f"{short(now.rate, 0)} Hz")]
         for label, median, worst in (
             ("compute", now.compute, now.compute_max),
             ("late", now.late, now.late_max),
         ):
             line += [
                 Segment(f"   {label} ", DIM),
-                Segment(f"{_short(1e6 * median, 0)} µs"),
-                Segment(f" max {_short(1e6 * worst, 0)}", DIM),
+                Segment(f"{short(1e6 * median, 0)} µs"),
+                Segment(f" max {short(1e6 * worst, 0)}", DIM),
             ]
         line += [
             Segment("   overruns ", DIM),
-            Segment(_short(overruns, 0), WARN if overruns > 0 else PLAIN),
+            Segment(short(overruns, 0), WARN if overruns > 0 else PLAIN),
         ]
         return line
 
@@ -299,7 +306,7 @@ class Page:
             kind = f" {event.kind:<9}"
             line = [Segment(f" {event.clock()}", DIM), Segment(kind, style)]
             said = PLAIN if event.level == "info" else style
-            line.append(Segment(" " + _cut(event.text, width - _length(line) - 1), said))
+            line.append(Segment(" " + cut(event.text, width - length(line) - 1), said))
             result.append(line)
         return result + [[] for _ in range(count - len(result))]
 
@@ -342,85 +349,12 @@ def _too_small(width: int, height: int) -> list[Line]:
     ]
     above = max(0, (height - len(said)) // 2)
     lines: list[Line] = [[] for _ in range(above)]
-    lines += [_centred([Segment(_cut(line, width), WARN)], width) for line in said]
+    lines += [centred([Segment(cut(line, width), WARN)], width) for line in said]
     lines += [[] for _ in range(height)]
-    return [_exactly(line, width) for line in lines[:height]]
+    return [exactly(line, width) for line in lines[:height]]
 
 
 def _reply(reply: Reply | None, now: float) -> Line:
     if reply is None or now - reply.at > REPLY_TIME:
         return []
     return [Segment(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)]
-
-
-def _bars(values: list[float], full: float, lines: int) -> list[str]:
-    """Values as bars of eighths of a line, highest line first; nothing where there is no value."""
-    steps = [
-        -1 if math.isnan(v) else round(min(max(v / full, 0.0), 1.0) * 8 * lines) for v in values
-    ]
-    rows = []
-    for row in reversed(range(lines)):
-        floor = 1 if row == 0 else 0  # a zero still shows as a thin line
-        cells = (max(floor, min(8, s - 8 * row)) if s >= 0 else 0 for s in steps)
-        rows.append("".join(_BARS[max(0, c)] for c in cells))
-    return rows
-
-
-def _aligned(value: float, decimals: int) -> str:
-    """The number with its decimal point in the fourth column, at most 7 wide."""
-    if not math.isfinite(value):
-        return "  —"
-    shown = f"{value:{4 + decimals}.{decimals}f}"
-    if len(shown) > 7:
-        shown = f"{value:.1e}"
-    return shown
-
-
-def _narrow(value: float) -> str:
-    """A standard deviation in 4 columns."""
-    return f"{value:.2f}" if value < 9.995 else f"{value:.0f}" if value < 9999.5 else "many"
-
-
-def _short(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
-
-
-def _cut(said: str, room: int) -> str:
-    """``said`` in at most ``room`` columns, with an ellipsis where it was cut."""
-    if cell_len(said) <= room:
-        return said
-    return set_cell_size(said, max(0, room - 1)) + ("…" if room > 0 else "")
-
-
-def _length(line: Iterable[Segment]) -> int:
-    return sum(segment.cell_length for segment in line)
-
-
-def _exactly(line: Line, width: int) -> Line:
-    """``line`` cropped or padded to ``width`` columns."""
-    return Segment.adjust_line_length(line, width, pad=True)
-
-
-def _apart(left: Line, right: Line, width: int, between: Style = PLAIN) -> Line:
-    """``left`` and ``right`` at the two ends of ``width`` columns."""
-    space = max(1, width - _length(left) - _length(right))
-    return [*left, Segment(" " * space, between), *right]
-
-
-def _centred(line: Line, width: int) -> Line:
-    return [Segment(" " * ((width - _length(line)) // 2)), *line]
-
-
-def _rule(width: int, title: str = "", note: Line | None = None) -> Line:
-    """A line across the page with a title at its left end and a note at its right end."""
-    head = f"─ {title} " if title else ""
-    if not note:
-        return [Segment(head + "─" * (width - len(head)), DIM)]
-    note = [Segment(_cut(s.text, width - len(head) - 6), s.style) for s in note]
-    fill = "─" * (width - len(head) - _length(note) - 3)
-    return [Segment(f"{head}{fill} ", DIM), *note, Segment(" ─", DIM)]
-
-
-def _faded(line: Line) -> Line:
-    """``line`` as something that is no longer true: colourless, but for the maps."""
-    return [s if "▀" in s.text else Segment(s.text, FADED) for s in line]
