@@ -18,6 +18,7 @@ _PROFILE_MAX = 32_767
 _OFFSET_MAX = 1_044_479
 _MULTI_TURN = 1_048_575
 _STARTUP_FIRMWARE = 45
+_LAYOUTS = 64  # spans whose layout is remembered
 _FORMATS = {
     (1, False): "<B",
     (2, False): "<H",
@@ -45,10 +46,6 @@ class Item:
     def saved(self) -> bool:
         """Whether the register is EEPROM."""
         return self.address < reg.RAM
-
-    def decode(self, data: bytes) -> int:
-        """The value that ``data`` (of this item's size) stands for."""
-        return int.from_bytes(data, "little", signed=self.signed)
 
 
 def _read_only(address: int, size: int, default: int = 0, signed: bool = False) -> Item:
@@ -155,6 +152,11 @@ class ControlTable:
             for i in range(entries)
         }
         self._first_indirect = min(self._indirect)
+        self._unpack = {
+            item.address: struct.Struct(_FORMATS[item.size, item.signed]).unpack_from
+            for item in self.items
+        }
+        self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int, int]]]] = {}
         self.reset()
 
     def reset(self, keep: tuple[int, ...] = ()) -> None:
@@ -171,8 +173,7 @@ class ControlTable:
 
     def get(self, address: int) -> int:
         """Value of the item at that address."""
-        item = self.at[address]
-        value: int = struct.unpack_from(_FORMATS[item.size, item.signed], self.memory, address)[0]
+        value: int = self._unpack[address](self.memory, address)[0]
         return value
 
     def set(self, address: int, value: int) -> None:
@@ -180,6 +181,8 @@ class ControlTable:
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
+        if item.backed_up:  # indirect addresses are among these
+            self._layouts.clear()
 
     def holds(self, address: int, length: int) -> bool:
         """Whether the span lies inside the table."""
@@ -216,16 +219,35 @@ class ControlTable:
         undefined byte ACCESS, a value out of the item's own range DATA_RANGE. With an error
         nothing is to be written, the items before the bad one neither.
         """
-        if not data or address + len(data) > self.size:
-            return (protocol.ACCESS, []) if data else (protocol.DATA_LENGTH, [])
-        targets = range(address, address + len(data))
-        if targets[-1] >= self._first_indirect:
-            places = [self.resolve(i) for i in targets]
-        else:
-            places = list(targets)
+        error, layout = self._layout(address, len(data))
+        if error:
+            return error, []
         plan: list[tuple[Item, int]] = []
+        for item, begin, end in layout:
+            value = int.from_bytes(data[begin:end], "little", signed=item.signed)
+            if not item.low <= value <= item.high:
+                return protocol.DATA_RANGE, []
+            plan.append((item, value))
+        return protocol.OK, plan
+
+    def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
+        """Which items a span writes, with their places in its data, or the error it makes."""
+        known = self._layouts.get((address, length))
+        if known is None:
+            known = self._lay_out(address, length)
+            if len(self._layouts) < _LAYOUTS:
+                self._layouts[address, length] = known
+        return known
+
+    def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
+        if length == 0:
+            return protocol.DATA_LENGTH, []
+        if address + length > self.size:
+            return protocol.ACCESS, []
+        places = [self.resolve(i) for i in range(address, address + length)]
+        layout: list[tuple[Item, int, int]] = []
         i = 0
-        while i < len(places):
+        while i < length:
             start = self._start[places[i]]
             if start is None:
                 return protocol.ACCESS, []
@@ -234,9 +256,6 @@ class ControlTable:
                 return protocol.ACCESS, []
             if places[i : i + item.size] != list(range(start, start + item.size)):
                 return protocol.DATA_LENGTH, []
-            value = item.decode(data[i : i + item.size])
-            if not item.low <= value <= item.high:
-                return protocol.DATA_RANGE, []
-            plan.append((item, value))
+            layout.append((item, i, i + item.size))
             i += item.size
-        return protocol.OK, plan
+        return protocol.OK, layout

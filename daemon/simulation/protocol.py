@@ -138,7 +138,7 @@ class Parser:
 
     def _next(self) -> Packet | None:
         buffer = self._buffer
-        while True:
+        while buffer:
             start = buffer.find(_PREFIX)
             if start < 0:
                 # Keep what may be the beginning of a header.
@@ -169,6 +169,7 @@ class Parser:
             if _STUFFED in body:
                 body = unstuff(body)
             return Packet(packet_id, body[0], body[1:], valid, end)
+        return None
 
     def _header_within(self, end: int) -> int:
         """Where an unstuffed FF FF FD stands in the body so far received, or -1."""

@@ -10,7 +10,6 @@ overload is OVERLOAD_TIME of current at the configured limit.
 from __future__ import annotations
 
 import math
-import struct
 
 from daemon.servos import registers as reg
 from daemon.servos.models import ServoModel
@@ -18,11 +17,10 @@ from daemon.servos.units import JointScale
 from daemon.simulation import protocol
 from daemon.simulation.control_table import ControlTable, Item
 from daemon.simulation.joint_plant import JointPlant
-from daemon.simulation.profile import Profile
+from daemon.simulation.servo_joint import STEP, ServoJoint
 
 REBOOT_TIME = 0.34  # s without an answer
 OVERLOAD_TIME = 2.0  # s at the current limit
-STEP = 0.001  # s: trajectories, velocity and PWM modes
 SENSE = 0.010  # s: temperature, voltage and overload
 AMBIENT = 25.0  # °C
 THERMAL_TIME = 120.0  # s
@@ -31,13 +29,7 @@ _CLEAR_FIRMWARE = 42
 _BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
 _CLEAR_KEY = b"\x01DXL\x22"
 _BACKUP_KEY = b"CTRL"
-_PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 _GOALS = (reg.GOAL_PWM, reg.GOAL_CURRENT, reg.GOAL_VELOCITY, reg.GOAL_POSITION)
-_POSITION_MODES = (
-    reg.POSITION_MODE,
-    reg.EXTENDED_POSITION_MODE,
-    reg.CURRENT_BASED_POSITION_MODE,
-)
 
 
 class EmulatedServo:
@@ -67,11 +59,7 @@ class EmulatedServo:
         self.silent = False
         self.voltage = (model.voltage_min + model.voltage_max) / 2 * reg.VOLTAGE_UNIT
         self.temperature = AMBIENT
-        self._plant = plant
-        self._joint = joint
-        self._scale = scale
-        self._profile = Profile()
-        self._turns = 0  # whole turns that the position has forgotten
+        self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self._registered: tuple[int, bytes] | None = None
         self._backup: dict[int, int] | None = None
         self._watched = 0.0  # time of the last packet the watchdog knows of
@@ -169,8 +157,11 @@ class EmulatedServo:
             self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
             self._stop()
         if t >= self._next_step:
-            self._next_step = t + STEP
-            self._follow()
+            if self.torque_on and self._joint.moves_by_itself():
+                self._next_step = t + STEP
+                self._joint.follow()
+            else:
+                self._next_step = math.inf
         if t >= self._next_sense:
             self._next_sense = t + SENSE
             self._sense()
@@ -183,7 +174,7 @@ class EmulatedServo:
         if not table.holds(address, length):
             return None
         if table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
-            self._refresh(t)
+            self._joint.refresh(t - self._booted, self.voltage, self.temperature)
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
@@ -195,7 +186,7 @@ class EmulatedServo:
             self.table.set(item.address, value)
         for item, value in plan:
             self._effect(item.address, value, t)
-        self._drive()
+        self._joint.drive()
         return protocol.OK
 
     def register(self, address: int, data: bytes) -> int:
@@ -218,7 +209,7 @@ class EmulatedServo:
     def reboot(self, t: float) -> None:
         """Torque off, silence for REBOOT_TIME, then RAM as after power-up."""
         self.table.set(reg.TORQUE_ENABLE, 0)
-        self._drive()
+        self._joint.drive()
         self._next_step = math.inf
         self._boot_at = t + REBOOT_TIME
         self._next_sense = self._boot_at
@@ -239,15 +230,13 @@ class EmulatedServo:
             return protocol.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
             return protocol.DATA_RANGE
-        self._refresh(t)
+        self._joint.refresh(t - self._booted, self.voltage, self.temperature)
         if self.table.memory[reg.MOVING]:
             return protocol.RESULT_FAIL
-        before = self._turns
-        self._forget_turns()
-        shift = self._sign() * (self._turns - before) * reg.COUNTS_PER_TURN
+        shift = self._joint.forget_turns()
         self.table.set(reg.GOAL_POSITION, self.table.get(reg.GOAL_POSITION) - shift)
-        self._profile.hold(self._profile.position - shift)
-        self._drive()
+        self._joint.profile.hold(self._joint.profile.position - shift)
+        self._joint.drive()
         return protocol.OK
 
     def backup(self, parameters: bytes, t: float) -> int:
@@ -278,7 +267,7 @@ class EmulatedServo:
         self.table.set(reg.HARDWARE_ERROR_STATUS, status)
         if self._shut_down() and self.torque_on:
             self.table.set(reg.TORQUE_ENABLE, 0)
-            self._drive()
+            self._joint.drive()
 
     def recover(self) -> None:
         """Cool down and bring the supply back; a latched hardware error stays until a reboot."""
@@ -341,18 +330,18 @@ class EmulatedServo:
     def _effect(self, address: int, value: int, t: float) -> None:
         if address == reg.TORQUE_ENABLE:
             if self.mode == reg.POSITION_MODE and value:
-                self._forget_turns()
-            self._profile.hold(self._position())
+                self._joint.forget_turns()
+            self._joint.hold()
             self._watched = t
             if value:
-                self._aim()
+                self._joint.aim()
         elif address == reg.OPERATING_MODE:
             self._reset_mode()
         elif address in (reg.GOAL_POSITION, reg.GOAL_VELOCITY) and self.torque_on:
-            self._aim()
+            self._joint.aim()
         elif address == reg.BUS_WATCHDOG:
             self._watched = t
-        if self._stepping():
+        if self.torque_on and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)
 
     def _reset_mode(self) -> None:
@@ -363,7 +352,7 @@ class EmulatedServo:
         table.set(reg.PROFILE_ACCELERATION, 0)
         table.set(reg.PROFILE_VELOCITY, 0)
         if self.mode == reg.POSITION_MODE:
-            self._forget_turns()
+            self._joint.forget_turns()
         self._reset_goals()
 
     def _reset_goals(self) -> None:
@@ -372,7 +361,7 @@ class EmulatedServo:
         table.set(reg.GOAL_VELOCITY, 0)
         if self.model.senses_current:
             table.set(reg.GOAL_CURRENT, table.get(reg.CURRENT_LIMIT))
-        table.set(reg.GOAL_POSITION, self._position())
+        table.set(reg.GOAL_POSITION, self._joint.position())
 
     def _start(self, t: float) -> None:
         """Power-up, or the end of a reboot."""
@@ -386,14 +375,14 @@ class EmulatedServo:
         self._registered = None
         self._overload = 0.0
         self._booted = self._watched = t
-        self._forget_turns()
+        self._joint.forget_turns()
         self._reset_goals()
-        self._profile.hold(self._position())
+        self._joint.hold()
         self._next_step = math.inf
         self._next_sense = t + SENSE
         if startup & 1:
             table.set(reg.TORQUE_ENABLE, 1)
-        self._drive()
+        self._joint.drive()
 
     def _has_startup(self) -> bool:
         return reg.STARTUP_CONFIGURATION in self.table.at
@@ -404,106 +393,25 @@ class EmulatedServo:
             if self.table.at[address].saved == saved:
                 self.table.set(address, value)
 
-    # --- the joint -------------------------------------------------------------------------
-
-    def _sign(self) -> int:
-        return -1 if self.table.memory[reg.DRIVE_MODE] & 1 else 1
-
-    def _encoder(self) -> int:
-        return self._scale.position_counts(float(self._plant.q[self._joint]))
-
-    def _forget_turns(self) -> None:
-        self._turns = self._encoder() // reg.COUNTS_PER_TURN
-
-    def _position(self) -> int:
-        within = self._encoder() - self._turns * reg.COUNTS_PER_TURN
-        return self._sign() * within + self.table.get(reg.HOMING_OFFSET)
-
-    def _joint_angle(self, position: float) -> float:
-        within = self._sign() * (position - self.table.get(reg.HOMING_OFFSET))
-        return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
-
-    def _aim(self) -> None:
-        """Start the trajectory to the goals as the profile registers ask."""
-        table, profile = self.table, self._profile
-        speed, acceleration = table.get(reg.PROFILE_VELOCITY), table.get(reg.PROFILE_ACCELERATION)
-        per_velocity = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-        per_acceleration = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-        if self.mode in _POSITION_MODES:
-            target = float(table.get(reg.GOAL_POSITION))
-            if table.memory[reg.DRIVE_MODE] & 4:
-                profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
-            else:
-                profile.aim(target, speed * per_velocity, acceleration * per_acceleration)
-
-    def _stepping(self) -> bool:
-        if not self.torque_on:
-            return False
-        if self.mode in _POSITION_MODES:
-            return self._profile.busy
-        return self.mode in (reg.VELOCITY_MODE, reg.PWM_MODE)
-
-    def _follow(self) -> None:
-        """One STEP of whatever moves by itself."""
-        if not self._stepping():
-            self._next_step = math.inf
-            return
-        if self.mode in _POSITION_MODES:
-            self._profile.step(STEP)
-        elif self.mode == reg.VELOCITY_MODE:
-            turn = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-            self._profile.velocity = self.table.get(reg.GOAL_VELOCITY) * turn
-            self._profile.position += self._profile.velocity * STEP
-        self._drive()
+    # --- what happens by itself ------------------------------------------------------------
 
     def _stop(self) -> None:
         """The bus watchdog's stop: stand where the shaft is, with torque still on."""
         table = self.table
-        if reg.GOAL_CURRENT in table.at and self.mode == reg.CURRENT_MODE:
+        if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
-        if self.mode == reg.PWM_MODE:
+        elif self.mode == reg.PWM_MODE:
             table.set(reg.GOAL_PWM, 0)
         table.set(reg.GOAL_VELOCITY, 0)
         table.set(reg.PROFILE_ACCELERATION, 0)
         table.set(reg.PROFILE_VELOCITY, 0)
-        table.set(reg.GOAL_POSITION, self._position())
-        self._profile.hold(self._position())
-        self._drive()
-
-    def _drive(self) -> None:
-        """Tell the plant what the registers say."""
-        mode, joint, table = self.mode, self._joint, self.table
-        if not self.torque_on:
-            self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
-            return
-        if mode in (reg.CURRENT_MODE, reg.PWM_MODE):
-            if mode == reg.CURRENT_MODE:
-                current = self._scale.amperes(self._sign() * table.get(reg.GOAL_CURRENT))
-            else:
-                current = self._pwm_current()
-            self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
-            return
-        goal = self._joint_angle(self._profile.position)
-        if mode == reg.CURRENT_BASED_POSITION_MODE:
-            bound = abs(table.get(reg.GOAL_CURRENT)) * self.model.current_unit
-            self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
-            return
-        bound = self.model.stall_current
-        if self.model.senses_current:
-            bound = table.get(reg.CURRENT_LIMIT) * self.model.current_unit
-        self._plant.drive(joint, reg.POSITION_MODE, True, goal, bound)
-
-    def _pwm_current(self) -> float:
-        """Current [A] of the joint's motor under goal PWM: supply less back-EMF over resistance."""
-        duty = self._sign() * self._scale.direction * self.table.get(reg.GOAL_PWM) / 885.0
-        speed = float(self._plant.dq[self._joint]) * reg.VELOCITY_UNIT / self._scale.velocity
-        return self.model.stall_current * (duty - speed / self.model.no_load_speed)
-
-    # --- what it measures ------------------------------------------------------------------
+        table.set(reg.GOAL_POSITION, self._joint.position())
+        self._joint.hold()
+        self._joint.drive()
 
     def _sense(self) -> None:
         table = self.table
-        current = abs(float(self._plant.current[self._joint]))
+        current = self._joint.current
         share = current / self.model.stall_current
         warm = AMBIENT + THERMAL_RISE * share * share
         self.temperature += (warm - self.temperature) * SENSE / THERMAL_TIME
@@ -512,42 +420,10 @@ class EmulatedServo:
         low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
         if not low <= round(self.voltage / reg.VOLTAGE_UNIT) <= high:
             self.fail(0)
-        limit = self.model.stall_current
-        if self.model.senses_current:
-            limit = table.get(reg.CURRENT_LIMIT) * self.model.current_unit
-        self._overload = self._overload + SENSE if self.torque_on and current >= limit else 0.0
+        self._overload = (
+            self._overload + SENSE
+            if self.torque_on and current >= self._joint.current_limit
+            else 0.0
+        )
         if self._overload >= OVERLOAD_TIME:
             self.fail(5)
-
-    def _refresh(self, t: float) -> None:
-        """Bring registers 120 … 146 up to date."""
-        table, scale, joint, profile = self.table, self._scale, self._joint, self._profile
-        sign = self._sign()
-        speed = float(self._plant.dq[joint])
-        ampere = float(self._plant.current[joint])
-        velocity = sign * scale.velocity_counts(speed)
-        position = self._position()
-        share = ampere / self.model.stall_current
-        turned = speed * reg.VELOCITY_UNIT / scale.velocity / self.model.no_load_speed
-        pwm = 885.0 * sign * scale.direction * (share + turned) if self.torque_on else 0.0
-        if self.model.senses_current:
-            current = sign * scale.current_counts(ampere)
-        else:  # the register is present load, 0.1 %
-            current = round(sign * scale.direction * 1000.0 * ampere / self.model.stall_current)
-        arrived = abs(profile.target - position) <= 20 and not profile.busy
-        per_velocity = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-        _PRESENT.pack_into(
-            table.memory,
-            reg.REALTIME_TICK,
-            int((t - self._booted) * 1000.0 + 1e-6) & 0x7FFF,
-            abs(velocity) > table.get(reg.MOVING_THRESHOLD),
-            int(arrived) | (2 if profile.busy else 0),
-            max(-885, min(885, round(pwm))),
-            max(-32768, min(32767, current)),
-            velocity,
-            position,
-            round(profile.velocity / per_velocity),
-            round(profile.position),
-            max(0, round(self.voltage / reg.VOLTAGE_UNIT)),
-            max(0, min(255, round(self.temperature))),
-        )

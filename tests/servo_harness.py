@@ -1,0 +1,127 @@
+"""Emulated servo buses for the tests: one to feed by hand, and one on a pty in a thread.
+
+The thread serves tests of behaviour; what is timed runs the bus in a process of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import select
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from daemon.servos.models import by_name
+from daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
+from daemon.servos.units import JointScale
+from daemon.settings import Settings
+from daemon.simulation.free_joints import FreeJoints
+from daemon.simulation.pty_bus import PtyServoBus
+from daemon.simulation.servo import EmulatedServo
+from daemon.simulation.servo_bus import ServoBus
+
+RADIAN = 2.0 * 3.141592653589793 / COUNTS_PER_TURN
+
+
+def plain_scale(model: str, zero: int = 0) -> JointScale:
+    """Joint angle and servo counts with one sign and the given zero."""
+    return JointScale(1, zero, RADIAN, VELOCITY_UNIT, by_name(model).current_unit)
+
+
+def make_bus(
+    model: str = "XM430-W210",
+    ids: Sequence[int] = (1, 2),
+    *,
+    firmware: int | None = None,
+    counts: Sequence[int] = (),
+    prepared: bool = False,
+    **options: Any,
+) -> ServoBus:
+    """Factory-new servos on free joints that stand at ``counts``, with the time at 0."""
+    plant = FreeJoints(len(ids))
+    for joint, count in enumerate(counts):
+        plant.q[joint] = count * RADIAN
+    servos = [
+        EmulatedServo(
+            by_name(model),
+            servo_id,
+            plant,
+            joint,
+            plain_scale(model),
+            firmware=firmware,
+            prepared=prepared,
+        )
+        for joint, servo_id in enumerate(ids)
+    ]
+    return ServoBus(servos, plant, **options)
+
+
+class RunningBus:
+    """A bus on a pty, served by a thread until :meth:`close`."""
+
+    def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
+        if bus is None:
+            now = time.monotonic()
+            bus = ServoBus.from_settings(
+                Settings(), FreeJoints(2, now), baud=baud, t=now, **options
+            )
+        self.bus = bus
+        self.port = PtyServoBus(bus, baud=baud)
+        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._wake_read, self._wake_write = os.pipe()
+        self._running = True
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    @property
+    def path(self) -> str:
+        return self.port.path
+
+    def servo(self, index: int) -> EmulatedServo:
+        return self.bus.servos[index]
+
+    def memory(self, index: int) -> bytes:
+        """A copy of a servo's control table."""
+        return self.call(lambda: bytes(self.servo(index).table.memory))
+
+    def call(self, job: Callable[[], Any]) -> Any:
+        """Run ``job`` in the serving thread, between two packets, and return what it gave."""
+        done: queue.SimpleQueue[tuple[bool, Any]] = queue.SimpleQueue()
+
+        def run() -> None:
+            try:
+                done.put((True, job()))
+            except BaseException as error:
+                done.put((False, error))
+
+        self._jobs.put(run)
+        os.write(self._wake_write, b"!")
+        fine, value = done.get(timeout=10)
+        if not fine:
+            raise value
+        return value
+
+    def fault(self, text: str) -> None:
+        self.call(lambda: self.bus.fault(text, time.monotonic()))
+
+    def close(self) -> None:
+        self._running = False
+        os.write(self._wake_write, b"!")
+        self._thread.join(timeout=10)
+        self.port.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _serve(self) -> None:
+        while self._running:
+            now = time.monotonic()
+            wait = max(0.0, self.port.next_event(now) - now)
+            ports = [self.port] if self.port.fileno() >= 0 else []
+            ready, _, _ = select.select([*ports, self._wake_read], [], [], wait)
+            if self._wake_read in ready:
+                os.read(self._wake_read, 1)
+                while not self._jobs.empty():
+                    self._jobs.get()()
+            self.port.service(time.monotonic())

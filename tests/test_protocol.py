@@ -1,0 +1,190 @@
+"""Protocol 2.0 framing: the maker's published packets byte for byte, and the parser's promises."""
+
+from __future__ import annotations
+
+import pytest
+from dynamixel_sdk import PacketHandler as sdk_handler
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.servos.packets import crc16 as handler_crc16
+from daemon.simulation import protocol
+from daemon.simulation.protocol import BROADCAST, Parser, crc16, frame, status, stuff, unstuff
+
+# From the maker's Protocol 2.0 manual: (id, instruction, parameters, packet).
+INSTRUCTIONS = [
+    (1, protocol.PING, "", "FFFFFD00010300 01 194E"),
+    (BROADCAST, protocol.PING, "", "FFFFFD00FE0300 01 3142"),
+    (1, protocol.READ, "84000400", "FFFFFD00010700 02 84000400 1D15"),
+    (1, protocol.WRITE, "740000020000", "FFFFFD00010900 03 740000020000 CA89"),
+    (1, protocol.REG_WRITE, "6800C8000000", "FFFFFD00010900 04 6800C8000000 AE8E"),
+    (1, protocol.ACTION, "", "FFFFFD00010300 05 02CE"),
+    (1, protocol.FACTORY_RESET, "01", "FFFFFD00010400 06 01 A1E6"),
+    (1, protocol.REBOOT, "", "FFFFFD00010300 08 2F4E"),
+    (1, protocol.CLEAR, "0144584C22", "FFFFFD00010800 10 0144584C22 B1DC"),
+    (1, protocol.BACKUP, "014354524C", "FFFFFD00010800 20 014354524C 16F5"),
+    (BROADCAST, protocol.SYNC_READ, "840004000102", "FFFFFD00FE0900 82 840004000102 CEFA"),
+    (
+        BROADCAST,
+        protocol.SYNC_WRITE,
+        "74000400 0196000000 02AA000000",
+        "FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287",
+    ),
+    (
+        BROADCAST,
+        protocol.BULK_READ,
+        "0190000200 0292000100",
+        "FFFFFD00FE0D00 92 0190000200 0292000100 1A05",
+    ),
+    (
+        BROADCAST,
+        protocol.BULK_WRITE,
+        "0120000200A000 021F00010050",
+        "FFFFFD00FE1000 93 0120000200A000 021F00010050 B768",
+    ),
+    (
+        BROADCAST,
+        protocol.FAST_SYNC_READ,
+        "84000400 030704",
+        "FFFFFD00FE0A00 8A 84000400 030704 20F2",
+    ),
+    (
+        BROADCAST,
+        protocol.FAST_SYNC_READ,
+        "44020400 0102",
+        "FFFFFD00FE0900 8A 44020400 0102 72F2",
+    ),
+]
+STATUSES = [
+    (1, 0, "060426", "FFFFFD00010700 55 00 060426 655D"),
+    (2, 0, "060426", "FFFFFD00020700 55 00 060426 6F6D"),
+    (1, 0, "A6000000", "FFFFFD00010800 55 00 A6000000 8CC0"),
+    (2, 0, "1F080000", "FFFFFD00020800 55 00 1F080000 BABE"),
+    (1, 0, "", "FFFFFD00010400 55 00 A10C"),
+    (1, 0, "7700", "FFFFFD00010600 55 00 7700 C369"),
+    (2, 0, "24", "FFFFFD00020500 55 00 24 8BA9"),
+]
+
+payloads = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55, 0x12]), max_size=40).map(bytes)
+
+
+def test_published_instruction_packets() -> None:
+    for packet_id, instruction, parameters, expected in INSTRUCTIONS:
+        assert frame(packet_id, instruction, bytes.fromhex(parameters)) == bytes.fromhex(expected)
+
+
+def test_published_status_packets() -> None:
+    for packet_id, error, data, expected in STATUSES:
+        assert status(packet_id, error, bytes.fromhex(data)) == bytes.fromhex(expected)
+
+
+@pytest.mark.parametrize(
+    ("packet_id", "instruction", "parameters", "misprint"),
+    [
+        # Printed with the CRC of the fast sync read example.
+        (BROADCAST, protocol.FAST_BULK_READ, "0384000400 077C000200 0492000100", "20F2"),
+        (1, protocol.BACKUP, "024354524C", "92F5"),
+    ],
+)
+def test_published_packets_whose_printed_crc_is_wrong(
+    packet_id: int, instruction: int, parameters: str, misprint: str
+) -> None:
+    packet = frame(packet_id, instruction, bytes.fromhex(parameters))
+    head = bytes((packet_id, len(packet) - 7, 0, instruction))
+    assert packet[4:-2] == head + bytes.fromhex(parameters)
+    sdk = sdk_handler(2.0).updateCRC(0, packet, len(packet) - 2)
+    assert packet[-2:] == sdk.to_bytes(2, "little") != bytes.fromhex(misprint)
+
+
+@given(st.binary(max_size=300))
+def test_crc_equals_long_division_and_the_sdk(data: bytes) -> None:
+    value = 0
+    for byte in data:
+        value ^= byte << 8
+        for _ in range(8):
+            value = (value << 1 ^ 0x8005) & 0xFFFF if value & 0x8000 else value << 1
+    assert crc16(data) == value
+    assert handler_crc16(data) == value
+    assert sdk_handler(2.0).updateCRC(0, data, len(data)) == value
+
+
+@given(payloads)
+def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
+    stuffed = stuff(body)
+    assert unstuff(stuffed) == body
+    at = stuffed.find(b"\xff\xff\xfd")
+    while at >= 0:
+        assert stuffed[at + 3] == 0xFD
+        at = stuffed.find(b"\xff\xff\xfd", at + 1)
+
+
+def test_stuffing_of_goal_current_minus_one_and_goal_velocity_minus_three() -> None:
+    goals = (-1).to_bytes(2, "little", signed=True) + (-3).to_bytes(4, "little", signed=True)
+    packet = frame(1, protocol.WRITE, b"\x66\x00" + goals)
+    assert packet[8:-2] == bytes.fromhex("6600 FFFF FDFD FFFFFF")
+    assert packet[5] == len(packet) - 7
+    (parsed,) = Parser().feed(packet, 0.0)
+    assert parsed.parameters[2:] == goals
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 252), st.integers(1, 255), payloads), min_size=1, max_size=5),
+    st.data(),
+)
+def test_parser_finds_every_packet_however_the_bytes_come(
+    contents: list[tuple[int, int, bytes]], data: st.DataObject
+) -> None:
+    stream = b"".join(frame(*content) for content in contents)
+    parser = Parser()
+    found = []
+    at = 0
+    while at < len(stream):
+        size = data.draw(st.integers(1, len(stream) - at))
+        found += parser.feed(stream[at : at + size], 0.0)
+        at += size
+    assert [(p.id, p.instruction, p.parameters) for p in found] == contents
+    assert all(packet.valid for packet in found)
+    assert parser.dropped == 0
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=60), payloads)
+def test_parser_recovers_after_any_noise(noise: bytes, body: bytes) -> None:
+    parser = Parser(gap=0.0015)
+    parser.feed(noise, 0.0)
+    found = parser.feed(frame(7, protocol.WRITE, body), 1.0)
+    assert [(p.id, p.parameters, p.valid) for p in found] == [(7, body, True)]
+
+
+def test_a_cut_packet_does_not_swallow_the_next() -> None:
+    whole = frame(1, protocol.WRITE, bytes(20))
+    found = Parser().feed(whole[:15] + frame(2, protocol.PING), 0.0)
+    assert [(p.id, p.instruction) for p in found] == [(2, protocol.PING)]
+
+
+def test_an_unstuffed_packet_is_not_obeyed() -> None:
+    goals = bytes.fromhex("6600 FFFF FDFFFFFF")
+    raw = b"\xff\xff\xfd\x00\x01" + (len(goals) + 3).to_bytes(2, "little") + b"\x03" + goals
+    raw += crc16(raw).to_bytes(2, "little")
+    assert Parser().feed(raw, 0.0) == []
+
+
+def test_a_damaged_packet_is_told_apart() -> None:
+    damaged = bytearray(frame(1, protocol.READ, bytes(4)))
+    damaged[9] ^= 4
+    (packet,) = Parser().feed(bytes(damaged), 0.0)
+    assert not packet.valid
+
+
+def test_silence_within_a_packet_ends_it() -> None:
+    packet = frame(1, protocol.PING)
+    parser = Parser(gap=0.0015)
+    assert parser.feed(packet[:6], 0.0) == []
+    assert parser.feed(packet[6:], 0.002) == []
+    assert parser.dropped == len(packet)
+    assert len(parser.feed(packet, 0.0021)) == 1
+
+
+@pytest.mark.parametrize("bad_id", [0xFD, 0xFF])
+def test_ids_that_no_servo_may_have(bad_id: int) -> None:
+    assert Parser().feed(frame(bad_id, protocol.PING), 0.0) == []
