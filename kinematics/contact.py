@@ -231,6 +231,12 @@ def _tangential(
         out[1, i] = tangential_force(modulus, d[i], theta[i], d_t[i])
 
 
+@kernel
+def _limits(radius: float, d: FloatArray, out: FloatArray) -> None:
+    for i in range(d.shape[0]):
+        out[i] = theta_limit(radius, d[i])
+
+
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
     """Broadcast to one shape; returns it and each argument flat, contiguous and in float64."""
     arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values))
@@ -280,7 +286,7 @@ def tangential(
 
 def theta_limits(radius: float, d: ArrayLike) -> FloatArray:
     """Largest |θ| [rad] at displacement d [m], shape of d; π/2 for d ≤ 0, 0 for d ≥ a."""
-    depth = np.asarray(d, dtype=np.float64)
-    inside = np.clip(depth, 0.0, radius)
-    height = radius - inside
-    return np.asarray(np.arctan2(height, np.sqrt(inside * (radius + height))))
+    shape, (depth,) = flatten(d)
+    out = np.empty_like(depth)
+    _limits(radius, depth, out)
+    return out.reshape(shape)
