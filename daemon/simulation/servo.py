@@ -420,10 +420,7 @@ class EmulatedServo:
         low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
         if not low <= round(self.voltage / reg.VOLTAGE_UNIT) <= high:
             self.fail(0)
-        self._overload = (
-            self._overload + SENSE
-            if self.torque_on and current >= self._joint.current_limit
-            else 0.0
-        )
+        pressed = self.torque_on and current >= 0.99 * self._joint.current_limit
+        self._overload = self._overload + SENSE if pressed else 0.0
         if self._overload >= OVERLOAD_TIME:
             self.fail(5)
