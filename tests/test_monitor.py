@@ -288,6 +288,13 @@ class Beside(TerminalProcess):
             return True
 
 
+def test_page_yields_to_the_daemon(fake: FakeDaemon, tmp_path: Path) -> None:
+    with Beside(fake, tmp_path) as page:
+        assert os.getpriority(os.PRIO_PROCESS, page.child) == min(
+            os.getpriority(os.PRIO_PROCESS, page.process.pid) + 5, 19
+        )
+
+
 def test_quitting_the_page_ends_the_daemon(fake: FakeDaemon, tmp_path: Path) -> None:
     with Beside(fake, tmp_path) as page:
         page.type(b"\x1a")  # would stop the daemon with the hand stiff: it does nothing here

@@ -84,7 +84,8 @@ def start_beside(
     with contextlib.suppress(termios.error):
         attributes = termios.tcgetattr(terminal)
     reads, writes = os.pipe()
-    command = [sys.executable, "-m", "tools.monitor", "--state", state_address]
+    # -P: a folder named tools where the daemon was started is not ours.
+    command = [sys.executable, "-P", "-m", "tools.monitor", "--state", state_address]
     command += ["--commands", command_address, "--lifeline", str(reads)]
     if duration is not None:
         command += ["--duration", str(duration)]

@@ -57,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
 
         state = Stream().address if state is None else state
         commands = CommandSettings().address if commands is None else commands
+    if args.lifeline is not None:
+        _stand_back()
     context: zmq.Context[Any] = zmq.Context(io_threads=1)
     feed = Feed()
     try:
@@ -79,6 +81,14 @@ def run(args: argparse.Namespace) -> int:
     if ending.why:
         print(f"softfinger monitor: {ending.why}", file=sys.stderr)
     return 1 if args.no_wait and feed.state is None and ending.why else 0
+
+
+def _stand_back() -> None:
+    """Drop the daemon's priority, which a child inherits: a page is in no hurry."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError):
+        os.nice(5)
 
 
 def _is_page(args: argparse.Namespace) -> bool:
