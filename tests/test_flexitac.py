@@ -83,6 +83,36 @@ def test_a_clean_stream_gives_every_frame_as_soon_as_the_next_marker_confirms_it
     }
 
 
+def test_on_a_line_with_gaps_a_frame_comes_at_once_unless_it_may_be_spliced():
+    decoder = FlexiTacDecoder(ROWS, COLS, byte_time=1e-4)
+    images = numbered(9)
+    spare = bytearray(numbered(1)[0])
+    spare[3:5] = MARKER
+    decoder.feed(frame(images[0]) + frame(images[1]), 0.0)
+    assert decoder.settle() is not None
+    for k in range(2, 5):
+        decoded = decoder.feed(frame(images[k]), 0.01 * k)
+        assert decoded is not None
+        assert decoded.data[0, 0] == k
+        assert decoded.t == 0.01 * k
+    # In two pieces within its time; then in two pieces with a gap between them.
+    assert decoder.feed(frame(images[5])[:7], 0.05) is None
+    assert decoder.feed(frame(images[5])[7:], 0.052) is not None
+    assert decoder.feed(frame(images[6])[:7], 0.06) is None
+    assert decoder.feed(frame(images[6])[7:], 0.07) is None
+    assert decoder.settle() is not None
+    # An image with the marker in it waits for the next frame.
+    assert decoder.feed(frame(bytes(spare)), 0.08) is None
+    assert decoder.settle() is None
+    decoded = decoder.feed(frame(images[7]), 0.09)
+    assert decoded is not None
+    assert decoded.data[0, 0] == 7
+    assert decoder.counters()["frames"] == 9
+    # A line without gaps: bytes follow at once, and tell.
+    assert decoder.feed(frame(images[8]), 0.0903) is None
+    assert decoder.feed(MARKER, 0.0904) is not None
+
+
 def test_one_marker_alone_is_never_locked_on():
     decoder = FlexiTacDecoder(ROWS, COLS)
     assert decode(decoder, [frame(bytes(CELLS))]) == []

@@ -6,6 +6,7 @@ after frame. There is no length, number or checksum, and ``AA 55`` may occur amo
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Literal
 
@@ -13,12 +14,13 @@ import numpy as np
 
 from daemon.clock import Clock
 from daemon.settings import TactileSettings
-from daemon.tactile.serial_reader import Decoded, SerialReader
+from daemon.tactile.serial_reader import BITS_PER_BYTE, Decoded, SerialReader
 
 MARKER = b"\xaa\x55"
 _LEVELS = 12  # frames that a search may look back on before it drops the oldest
 _LOST_AFTER = 10  # frames' worth of bytes without a frame
 _MARKERS_KEPT = 96  # for recognising a grid of another size
+_GAP = 1e-3  # s; a line quiet for longer has gaps between frames
 _SMALLEST_GRID = 16  # cells; closer markers are an image's own pattern
 
 
@@ -33,17 +35,21 @@ class FlexiTacDecoder:
 
     *Hold.* Once locked, a frame is handed over when the next marker stands where it must, which
     tells that no byte of the frame was lost. On a line with gaps between frames that would cost a
-    frame's period; ``settle`` says that the line is quiet, and then a whole frame whose counts
-    contain no ``AA 55`` (the trace of the next frame in a torn one) is handed over as well.
+    frame's period. There a whole frame is handed over at once if it is no splice of a torn frame
+    and the next one: its counts contain no ``AA 55``, and it came in the time its bytes take. Else
+    it waits for the next marker, or for ``settle``, which says that the line is quiet.
 
     *Loss.* A marker that isn't where it must be drops the frame before it and starts the search
     anew. Every byte fed is part of a frame, counted as skipped, or still held.
     """
 
-    def __init__(self, rows: int, cols: int) -> None:
+    def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
+        """``byte_time`` [s]: what a byte takes on the wire."""
         self.rows = rows
         self.cols = cols
         self.frame_bytes = len(MARKER) + rows * cols
+        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP  # s for one frame's bytes
+        self._t_whole = -math.inf  # when the last frame handed over was whole
         self._buffer = bytearray()
         self._start = 0  # place of the buffer's first byte in the stream
         self._locked = False
@@ -68,17 +74,13 @@ class FlexiTacDecoder:
                 newest = self._take()
             else:
                 break
+        if self.pending and self._in_one_go() and not self._may_be_spliced():
+            newest = self._take()
         return newest
 
     def settle(self) -> Decoded | None:
         """The line is quiet: hand over a held frame, unless its counts could hide a marker."""
-        if not self.pending:
-            return None
-        first, end = len(MARKER), self.frame_bytes
-        # The last count and the byte after it may be the two halves of a marker as well.
-        if self._buffer.find(MARKER, first) >= 0 or self._buffer.endswith(MARKER[:1], first, end):
-            return None
-        return self._take()
+        return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
     def pending(self) -> bool:
@@ -203,18 +205,28 @@ class FlexiTacDecoder:
         """The buffer's bytes at ``place``, as far as they came, are not a marker's."""
         return not MARKER.startswith(self._buffer[place : place + len(MARKER)])
 
+    def _may_be_spliced(self) -> bool:
+        """The whole frame at the buffer's start shows the marker of another one inside."""
+        first, end = len(MARKER), self.frame_bytes
+        # The last count and the byte after it may be the two halves of a marker as well.
+        return self._buffer.find(MARKER, first) >= 0 or self._buffer.endswith(
+            MARKER[:1], first, end
+        )
+
+    def _in_one_go(self) -> bool:
+        """The whole frame at the buffer's start came after a gap and without one."""
+        first, whole = self._pieces[0][1], self._pieces[-1][1]
+        return first - self._t_whole > _GAP and whole - first < self._longest
+
     def _take(self) -> Decoded:
         count = self.rows * self.cols
         data = np.frombuffer(self._buffer, np.uint8, count, len(MARKER)).astype(np.uint16)
         end = self._start + self.frame_bytes
-        while self._pieces[0][0] < end:
-            self._pieces.popleft()
-        t = self._pieces[0][1]
-        del self._buffer[: self.frame_bytes]
-        self._start = end
+        self._t_whole = next(t for piece_end, t in self._pieces if piece_end >= end)
+        self._drop(self.frame_bytes)
         self._frames += 1
         self._skipped_at_frame = self._skipped
-        return Decoded(data.reshape(self.rows, self.cols), t)
+        return Decoded(data.reshape(self.rows, self.cols), self._t_whole)
 
     def _lose(self) -> None:
         self._locked = False
@@ -225,11 +237,14 @@ class FlexiTacDecoder:
 
     def _skip(self, count: int) -> None:
         if count:
-            del self._buffer[:count]
-            self._start += count
+            self._drop(count)
             self._skipped += count
-            while self._pieces and self._pieces[0][0] <= self._start:
-                self._pieces.popleft()
+
+    def _drop(self, count: int) -> None:
+        del self._buffer[:count]
+        self._start += count
+        while self._pieces and self._pieces[0][0] <= self._start:
+            self._pieces.popleft()
 
     def _note(self, place: int) -> None:
         place += self._start
@@ -244,7 +259,7 @@ class FlexiTac(SerialReader):
         """``finger`` 0 is the left one; it chooses the port."""
 
         def make_decoder() -> FlexiTacDecoder:
-            return FlexiTacDecoder(settings.rows, settings.cols)
+            return FlexiTacDecoder(settings.rows, settings.cols, BITS_PER_BYTE / settings.baud)
 
         super().__init__(
             settings.port[finger],

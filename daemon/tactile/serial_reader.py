@@ -24,7 +24,7 @@ from daemon.records import Frame
 from daemon.tactile.base import TactileError
 
 _CHUNK = 65536  # bytes taken at once: all that a Linux tty can hold
-_BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _SHORTEST_WAIT = 3e-4  # s; below this a timed wait costs more than the wake-ups it saves
 _LONGEST_WAIT = 2e-3  # s; bounds what a wrong guess of the missing bytes can delay
 
@@ -99,7 +99,7 @@ class SerialReader:
         self._decoder = make_decoder()
         self._clock = clock
         self._settle = settle
-        self._byte_time = _BITS_PER_BYTE / baud
+        self._byte_time = BITS_PER_BYTE / baud
         self._age = self._decoder.frame_bytes * self._byte_time + latency
         self._open_timeout = open_timeout
         self._latest: Frame | None = None
@@ -179,7 +179,7 @@ class SerialReader:
         return f"{self._bytes} bytes within {self._open_timeout:g} s, {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
-        """The thread: waits in the kernel, wakes about twice a frame."""
+        """The thread: waits in the kernel, wakes once or twice a frame."""
         decoder = self._decoder
         while True:
             timeout = self._settle if decoder.pending else None
