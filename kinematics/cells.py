@@ -3,16 +3,22 @@
 The outline makes the integrand's second derivative jump, so each cell is cut into strips in y where
 no strip has the outline entering or leaving through a side; in x each line ends on the outline.
 Gauss-Legendre in both directions then converges exponentially. Towards the rim the springs' length
-√(a² − x² − y²) goes to zero like a square root, so there the nodes are more and spaced in the angle.
+√(a² − x² − y²) goes to zero like a square root, so there the nodes are more, spaced in the angle.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from kinematics.footprint import GAUSS_NODES, GAUSS_WEIGHTS, beyond_limit, extremes, line_span
+from kinematics.footprint import (
+    GAUSS_NODES,
+    GAUSS_WEIGHTS,
+    FloatArray,
+    Geometry,
+    beyond_limit,
+    extremes,
+    line_span,
+)
 from kinematics.kernels import kernel
 from kinematics.material import stress_at
 
@@ -22,7 +28,7 @@ MAX_BREAKS = 12
 
 
 @kernel
-def nodes_needed(a, half, far):
+def nodes_needed(a: float, half: float, far: float) -> int:
     """Gauss points in one direction for a relative 1e-7 in a cell, 0 where the angle must be used.
 
     ``far`` is the distance of the farthest point from the axis, ``half`` half the cell's longer
@@ -43,7 +49,17 @@ def nodes_needed(a, half, far):
 
 
 @kernel
-def line_stress(law, u, v, w, a, y, left, right, n):
+def line_stress(
+    law: FloatArray,
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    y: float,
+    left: float,
+    right: float,
+    n: int,
+) -> float:
     """∫ σ(ε) dx [Pa m] on the line ``y`` from ``left`` to ``right``, which lie in the footprint.
 
     With n = 0 the variable is the angle t of x = R sin t: σ(ε)√(a² − x² − y²) dt stays smooth at
@@ -74,7 +90,17 @@ def line_stress(law, u, v, w, a, y, left, right, n):
 
 
 @kernel
-def whole_cell_stress(law, u, v, w, a, x0, x1, y0, y1):
+def whole_cell_stress(
+    law: FloatArray,
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    x0: float,
+    x1: float,
+    y0: float,
+    y1: float,
+) -> float:
     """Mean σ(ε) [Pa] of a cell that lies in the footprint."""
     far = math.hypot(max(abs(x0), abs(x1)), max(abs(y0), abs(y1)))
     n = nodes_needed(a, 0.5 * max(x1 - x0, y1 - y0), far)
@@ -87,7 +113,7 @@ def whole_cell_stress(law, u, v, w, a, x0, x1, y0, y1):
 
 
 @kernel
-def _insert(breaks, count, value, low, high):
+def _insert(breaks: FloatArray, count: int, value: float, low: float, high: float) -> int:
     """Put ``value`` into the sorted ``breaks`` if it lies between ``low`` and ``high``."""
     if not (low < value < high):
         return count
@@ -100,8 +126,19 @@ def _insert(breaks, count, value, low, high):
 
 
 @kernel
-def cut_cell_stress(law, u, v, w, a, x0, x1, y0, y1, breaks):
-    """Mean σ(ε) [Pa] of a cell that the outline may cut; ``breaks`` is scratch, length MAX_BREAKS."""
+def cut_cell_stress(
+    law: FloatArray,
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    x0: float,
+    x1: float,
+    y0: float,
+    y1: float,
+    breaks: FloatArray,
+) -> float:
+    """Mean σ(ε) [Pa] of a cell that the outline may cut; ``breaks`` [MAX_BREAKS] is scratch."""
     ends = extremes(u, v, w, a)
     low = max(y0, ends[0])
     high = min(y1, ends[1])
@@ -163,44 +200,53 @@ def cut_cell_stress(law, u, v, w, a, x0, x1, y0, y1, breaks):
     return total / ((x1 - x0) * (y1 - y0))
 
 
-@kernel
-def face_integrals(a, x_first, y_first, pitch_x, pitch_y, out):
-    """Means over whole cells of g, x g, y g with g = 1/√(a² − x² − y²), into out[:, 0..2, :].
+# Planes of a grid's cells, float64 [rows, CELL_PLANES, cols]: means over the whole cell of g, x g
+# and y g with g = 1/√(a² − x² − y²), their covariances, and 1 for a live cell, 0 for a dead one.
+PLAIN_MEAN, X_MEAN, Y_MEAN, LIVE, PLAIN_VAR, PLAIN_X, PLAIN_Y, X_VAR, X_Y, Y_VAR = range(10)
+CELL_PLANES = 10
+_MEAN_NODES = 8
 
-    ``out`` has shape [rows, ≥3, cols]. The strain's mean over a cell in the footprint is exactly
-    ``1 − u ḡ + v (xg) + w (yg)``. A cell that the rim cuts never lies in the footprint: left at 0.
+
+@kernel
+def face_integrals(geometry: Geometry, out: FloatArray) -> None:
+    """Fill the planes of ``out`` [rows, CELL_PLANES, cols] but LIVE.
+
+    The strain's mean over a whole cell in the footprint is exactly 1 − u ḡ + v (xg) + w (yg), and
+    its variance the same form's in the covariances. A cell that the rim cuts never lies in the
+    footprint and stays 0.
     """
-    rows = out.shape[0]
-    cols = out.shape[2]
-    n = MAX_NODES_ANGLE
+    a, x_first, y_first, pitch_x, pitch_y = geometry
+    rows, _, cols = out.shape
+    n = _MEAN_NODES
     for i in range(rows):
         y0 = y_first + i * pitch_y
         for j in range(cols):
             x0 = x_first + j * pitch_x
-            x1 = x0 + pitch_x
-            far = math.hypot(max(abs(x0), abs(x1)), max(abs(y0), abs(y0 + pitch_y)))
-            plain = 0.0
-            along_x = 0.0
-            along_y = 0.0
-            if far < a:
-                for k in range(n):
-                    y = y0 + pitch_y * GAUSS_NODES[n, k]
-                    radius = math.sqrt(a * a - y * y)
-                    # ∫ g dx = asin(x/R) and ∫ x g dx = −√(R² − x²) on each line.
-                    line = GAUSS_WEIGHTS[n, k] * (math.asin(x1 / radius) - math.asin(x0 / radius))
-                    plain += line
-                    along_y += y * line
-                    along_x += GAUSS_WEIGHTS[n, k] * (
-                        math.sqrt(radius * radius - x0 * x0) - math.sqrt(radius * radius - x1 * x1)
-                    )
-            out[i, 0, j] = plain / pitch_x
-            out[i, 1, j] = along_x / pitch_x
-            out[i, 2, j] = along_y / pitch_x
-
-
-MAX_NODES_ANGLE = 12
-
-
-def scratch() -> np.ndarray:
-    """Scratch for :func:`cut_cell_stress`."""
-    return np.empty(MAX_BREAKS)
+            x_far = max(abs(x0), abs(x0 + pitch_x))
+            if x_far * x_far + max(abs(y0), abs(y0 + pitch_y)) ** 2 >= a * a:
+                continue
+            for k in range(n):
+                y = y0 + pitch_y * GAUSS_NODES[n, k]
+                for m in range(n):
+                    x = x0 + pitch_x * GAUSS_NODES[n, m]
+                    weight = GAUSS_WEIGHTS[n, k] * GAUSS_WEIGHTS[n, m]
+                    g = 1.0 / math.sqrt(a * a - x * x - y * y)
+                    out[i, PLAIN_MEAN, j] += weight * g
+                    out[i, X_MEAN, j] += weight * g * x
+                    out[i, Y_MEAN, j] += weight * g * y
+                    weight *= g * g
+                    out[i, PLAIN_VAR, j] += weight
+                    out[i, PLAIN_X, j] += weight * x
+                    out[i, PLAIN_Y, j] += weight * y
+                    out[i, X_VAR, j] += weight * x * x
+                    out[i, X_Y, j] += weight * x * y
+                    out[i, Y_VAR, j] += weight * y * y
+            g = out[i, PLAIN_MEAN, j]
+            g_x = out[i, X_MEAN, j]
+            g_y = out[i, Y_MEAN, j]
+            out[i, PLAIN_VAR, j] -= g * g
+            out[i, PLAIN_X, j] -= g * g_x
+            out[i, PLAIN_Y, j] -= g * g_y
+            out[i, X_VAR, j] -= g_x * g_x
+            out[i, X_Y, j] -= g_x * g_y
+            out[i, Y_VAR, j] -= g_y * g_y

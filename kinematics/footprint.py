@@ -16,13 +16,23 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinematics.kernels import kernel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# (a, x and y of the first cell's corner from the tip's centre, pitch x, pitch y) [m].
+Geometry = tuple[float, float, float, float, float]
+Span = tuple[float, float]
+Ends = tuple[float, float, float, float, float, float]
+Crossings = tuple[float, float, float, float]
 
 MAX_NODES = 12
 
 
-def _gauss_table() -> tuple[np.ndarray, np.ndarray]:
+def _gauss_table() -> tuple[FloatArray, FloatArray]:
     nodes = np.zeros((MAX_NODES + 1, MAX_NODES))
     weights = np.zeros((MAX_NODES + 1, MAX_NODES))
     for n in range(1, MAX_NODES + 1):
@@ -37,14 +47,14 @@ GAUSS_NODES, GAUSS_WEIGHTS = _gauss_table()
 
 
 @kernel
-def plane(a, d, n_x, n_y):
+def plane(a: float, d: float, n_x: float, n_y: float) -> tuple[float, float, float]:
     """(u, v, w) of the object's face; the normal's z component must be positive."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     return (a - d) / n_z, n_x / n_z, n_y / n_z
 
 
 @kernel
-def line_span(u, v, w, a, y):
+def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
     """Ends (left, right) in x of the footprint on the line ``y``; (inf, −inf) if it has none.
 
     To cut along a line of constant x instead, exchange v and w.
@@ -72,14 +82,14 @@ def line_span(u, v, w, a, y):
 
 
 @kernel
-def beyond_limit(u, v, w, a):
+def beyond_limit(u: float, v: float, w: float, a: float) -> bool:
     """Whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
     return u <= 0.0 or u * u < (v * v + w * w) * a * a
 
 
 @kernel
-def extremes(u, v, w, a):
-    """(y of the lowest, y of the highest point, y of the leftmost, its x, y of the rightmost, its x).
+def extremes(u: float, v: float, w: float, a: float) -> Ends:
+    """(y of the lowest, of the highest point, y and x of the leftmost, y and x of the rightmost).
 
     Empty (inf, −inf, …) when the face is off the tip. Beyond the limit the two y are the rim's.
     """
@@ -101,11 +111,24 @@ def extremes(u, v, w, a):
 
 
 @kernel
-def band_columns(u, v, w, a, ends, below, above, y0, y1, x_first, pitch_x, cols):
-    """Columns (a, b, c, d) of the cells in the band y0..y1: a..d touch the footprint, b..c lie in it.
+def band_columns(
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    ends: Ends,
+    below: Span,
+    above: Span,
+    y0: float,
+    y1: float,
+    x_first: float,
+    pitch_x: float,
+    cols: int,
+) -> tuple[int, int, int, int]:
+    """Columns (a, b, c, d) of the cells in the band y0..y1: a..d touch the footprint, b..c lie in.
 
-    ``ends`` is what :func:`extremes` gave, ``below`` and ``above`` the spans at y0 and y1. Cells a..b
-    and c..d may be cut by the outline, and beyond the limit some of them lie outside.
+    ``ends`` is what :func:`extremes` gave, ``below`` and ``above`` the spans at y0 and y1. Cells
+    a..b and c..d may be cut by the outline, and beyond the limit some of them lie outside.
     """
     if beyond_limit(u, v, w, a):
         nearest = 0.0 if y0 * y1 <= 0.0 else min(abs(y0), abs(y1))

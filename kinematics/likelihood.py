@@ -1,10 +1,10 @@
 """Normal equations of the pressure grid's likelihood, as kernels.
 
-The model of a cell is ``γ · mean(σ(ε)) = γ A (σ(ε̄) + ½ σ''(ε̄) V)``, with A the cell's share inside the
+The model of a cell is ``γ · mean(σ(ε)) = γ A (σ(ε̄) + ½ σ''(ε̄) V)``, with A the cell's share in the
 footprint, ε̄ and V the strain's mean and variance over that share; it is exact for a constant
 modulus, and to the strain's third moment for any other law. The strain is linear in (u, v, w) (see
 footprint.py), so its means are sums of fixed means of g, x g, y g for whole cells; cut cells are
-integrated. The outline adds no derivative of its own, as σ is 0 there.
+integrated (cut_cells.py). The outline adds no derivative of its own, as σ is 0 there.
 """
 
 from __future__ import annotations
@@ -12,26 +12,46 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kinematics.cells import (
+    LIVE,
+    PLAIN_MEAN,
+    PLAIN_VAR,
+    PLAIN_X,
+    PLAIN_Y,
+    X_MEAN,
+    X_VAR,
+    X_Y,
+    Y_MEAN,
+    Y_VAR,
+)
+from kinematics.cut_cells import (
+    ALONG_X,
+    ALONG_Y,
+    LINES_A_CELL,
+    PLAIN,
+    READING,
+    SHARE,
+    VARIANCE,
+    WEIGHT,
+    flush,
+    push_lines,
+)
 from kinematics.footprint import (
-    GAUSS_NODES,
-    GAUSS_WEIGHTS,
+    FloatArray,
+    Geometry,
+    IntArray,
     band_columns,
     extremes,
     line_span,
 )
 from kinematics.kernels import fast_kernel, kernel
 
-# Planes of the packed footprint cells: share, means of g, x g, y g, variance of strain, reading,
-# weight.
-SHARE, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
-PLANES = 7
-
+SUMS = 17
 LAW_PIECES = 128
 
 
-def cubic_law(law: NDArray[np.float64]) -> NDArray[np.float64]:
+def cubic_law(law: FloatArray) -> FloatArray:
     """Any material's law as LAW_PIECES cubics [pieces + 1, 4] of value, slope at the pieces' ends.
 
     Piece k holds the coefficients of t = ε·pieces − k. Within 1e-9 of a smooth law; the last row
@@ -57,72 +77,23 @@ def cubic_law(law: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @kernel
-def cut_cell(u, v, w, a, x0, x1, y0, y1, low, high, crossings, n):
-    """Integrals over the share of a cell in the footprint: (area, g, x g, y g, ε²).
-
-    ``low``, ``high`` bound the footprint in y; ``crossings`` are the four y where the outline crosses
-    the cell's sides; ``n`` Gauss points in each direction.
-    """
-    start = max(y0, low)
-    stop = min(y1, high)
-    area = plain = along_x = along_y = square = 0.0
-    if not start < stop:
-        return area, plain, along_x, along_y, square
-    b0 = min(max(crossings[0], start), stop)
-    b1 = min(max(crossings[1], start), stop)
-    b2 = min(max(crossings[2], start), stop)
-    b3 = min(max(crossings[3], start), stop)
-    if b0 > b1:
-        b0, b1 = b1, b0
-    if b2 > b3:
-        b2, b3 = b3, b2
-    b0, b2 = min(b0, b2), max(b0, b2)
-    b1, b3 = min(b1, b3), max(b1, b3)
-    if b1 > b2:
-        b1, b2 = b2, b1
-    ends = (b0, b1, b2, b3, stop)
-    e = 1.0 + v * v
-    for piece in range(5):
-        end = ends[piece]
-        length = end - start
-        if length > 1e-7 * (y1 - y0):
-            for k in range(n):
-                y = start + length * GAUSS_NODES[n, k]
-                rim = a * a - y * y
-                q = u - w * y
-                root = e * rim - q * q
-                if root <= 0.0:
-                    continue
-                root = math.sqrt(root)
-                left = max((v * q - root) / e, x0)
-                width = min((v * q + root) / e, x1) - left
-                if width <= 0.0:
-                    continue
-                weight = GAUSS_WEIGHTS[n, k] * length * width
-                line = line_x = line_square = 0.0
-                for m in range(n):
-                    x = left + width * GAUSS_NODES[n, m]
-                    g = GAUSS_WEIGHTS[n, m] / math.sqrt(rim - x * x)
-                    line += g
-                    line_x += g * x
-                    face = (q - v * x) * g
-                    line_square += face * face / GAUSS_WEIGHTS[n, m]
-                area += weight
-                plain += weight * line
-                along_x += weight * line_x
-                along_y += weight * line * y
-                # ∫ε² = ∫1 − 2 face g + (face g)²
-                square += weight * (1.0 - 2.0 * (q * line - v * line_x) + line_square)
-        start = end
-    return area, plain, along_x, along_y, square
-
-
-@kernel
-def pack(u, v, w, geometry, cells, frame, scale, columns, packed):
+def pack(
+    u: float,
+    v: float,
+    w: float,
+    geometry: Geometry,
+    cells: FloatArray,
+    frame: FloatArray,
+    scale: float,
+    columns: FloatArray,
+    lines: FloatArray,
+    owners: IntArray,
+    packed: FloatArray,
+) -> int:
     """Gather the footprint's cells into ``packed`` [PLANES, n]; returns n.
 
-    ``cells`` [rows, 4, cols] holds the means of g, x g, y g over whole cells and 1 for a live cell;
-    ``columns`` [cols + 1, 2] is scratch for the outline's crossings of the grid's lines of constant x.
+    ``cells`` [rows, CELL_PLANES, cols] is what :func:`kinematics.cells.face_integrals` gives;
+    ``columns`` [cols + 1, 2], ``lines`` and ``owners`` are scratch, see :class:`Scratch`.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape
@@ -135,10 +106,10 @@ def pack(u, v, w, geometry, cells, frame, scale, columns, packed):
     j1 = min(max(math.ceil((ends[5] - x_first) / pitch_x), j0), cols)
     for j in range(j0, j1 + 1):
         columns[j, 0], columns[j, 1] = line_span(u, w, v, a, x_first + j * pitch_x)
-    whole = pitch_x * pitch_y
-    across_x = pitch_x * pitch_x / 12.0
-    across_y = pitch_y * pitch_y / 12.0
+    capacity = lines.shape[1] - LINES_A_CELL
     count = 0
+    line = 0
+    waiting = 0
     above = line_span(u, v, w, a, y_first + first_row * pitch_y)
     for i in range(first_row, last_row):
         y0 = y_first + i * pitch_y
@@ -150,57 +121,79 @@ def pack(u, v, w, geometry, cells, frame, scale, columns, packed):
         )
         first = max(first, j0)
         last = min(last, j1)
+        y_far = max(-y0, y1)
         for side in range(2):
             begin = first if side == 0 else max(inner_last, first)
             stop = min(inner_first, last) if side == 0 else last
             for j in range(begin, stop):
                 x0 = x_first + j * pitch_x
-                x1 = x0 + pitch_x
-                far = max(abs(x0), abs(x1)) ** 2 + max(abs(y0), abs(y1)) ** 2
-                n = 3 if far < 0.81 * a * a else 5
+                x_far = max(-x0, x0 + pitch_x)
+                fine = x_far * x_far + y_far * y_far > 0.81 * a * a
                 crossings = (columns[j, 0], columns[j, 1], columns[j + 1, 0], columns[j + 1, 1])
-                area, plain, along_x, along_y, square = cut_cell(
-                    u, v, w, a, x0, x1, y0, y1, ends[0], ends[1], crossings, n
-                )
-                if area <= 1e-9 * whole:
-                    continue
-                mean = (area - u * plain + v * along_x + w * along_y) / area
-                packed[0, count] = area / whole
-                packed[1, count] = plain / whole
-                packed[2, count] = along_x / whole
-                packed[3, count] = along_y / whole
-                packed[4, count] = square / area - mean * mean
-                packed[5, count] = frame[i, j] * scale
-                packed[6, count] = cells[i, 3, j]
+                line = push_lines(lines, line, x0, y0, y1, ends[0], ends[1], crossings, fine)
+                packed[READING, count] = frame[i, j] * scale
+                packed[WEIGHT, count] = cells[i, LIVE, j]
+                owners[0, waiting] = count
+                owners[1, waiting] = line
+                waiting += 1
                 count += 1
+                if line > capacity or waiting == owners.shape[1]:
+                    flush(lines, owners, line, waiting, u, v, w, a, pitch_x, pitch_y, packed)
+                    line = 0
+                    waiting = 0
         n = inner_last - inner_first
         if n > 0:
-            for k in range(n):
-                j = inner_first + k
-                g = cells[i, 0, j]
-                g_x = cells[i, 1, j]
-                g_y = cells[i, 2, j]
-                face = u * g - v * g_x - w * g_y
-                slope_x = v * g - face * g_x * g
-                slope_y = w * g - face * g_y * g
-                packed[0, count + k] = 1.0
-                packed[1, count + k] = g
-                packed[2, count + k] = g_x
-                packed[3, count + k] = g_y
-                packed[4, count + k] = slope_x * slope_x * across_x + slope_y * slope_y * across_y
-                packed[5, count + k] = frame[i, j] * scale
-                packed[6, count + k] = cells[i, 3, j]
+            copy_whole(
+                cells[i, :, inner_first:inner_last],
+                frame[i, inner_first:inner_last],
+                scale,
+                u,
+                v,
+                w,
+                packed[:, count : count + n],
+            )
             count += n
+    flush(lines, owners, line, waiting, u, v, w, a, pitch_x, pitch_y, packed)
     return count
 
 
 @fast_kernel
-def accumulate(packed, count, u, v, w, gain, saturation, law, sums):
+def copy_whole(
+    cells: FloatArray, row: FloatArray, scale: float, u: float, v: float, w: float, out: FloatArray
+) -> None:
+    """Whole cells of one row, planes ``cells`` and readings ``row``, into ``out`` [PLANES, n]."""
+    for k in range(row.shape[0]):
+        out[SHARE, k] = 1.0
+        out[PLAIN, k] = cells[PLAIN_MEAN, k]
+        out[ALONG_X, k] = cells[X_MEAN, k]
+        out[ALONG_Y, k] = cells[Y_MEAN, k]
+        out[VARIANCE, k] = (
+            u * (u * cells[PLAIN_VAR, k] - 2.0 * (v * cells[PLAIN_X, k] + w * cells[PLAIN_Y, k]))
+            + v * (v * cells[X_VAR, k] + 2.0 * w * cells[X_Y, k])
+            + w * w * cells[Y_VAR, k]
+        )
+        out[READING, k] = row[k] * scale
+        out[WEIGHT, k] = cells[LIVE, k]
+
+
+@fast_kernel
+def accumulate(
+    packed: FloatArray,
+    count: int,
+    u: float,
+    v: float,
+    w: float,
+    gain: float,
+    saturation: float,
+    law: FloatArray,
+    sums: FloatArray,
+) -> None:
     """Sums for one Gauss-Newton step over the packed cells, into ``sums`` [17].
 
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
     factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
-    sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A saturated cell counts only while the model stays below.
+    sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
+    below its end.
     """
     pieces = law.shape[0] - 1
     s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0

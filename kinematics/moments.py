@@ -1,110 +1,231 @@
 """From a pressure grid to a first estimate: is there a contact, its centroid and its extent.
 
-Kernels for the activity test and for the moments of the pressure over the footprint, with the closed
-relations between them and (d, n) for a constant modulus.
+Kernels for the activity test and for the moments of the pressure over the footprint, and the
+relations between those and (d, n). For a constant modulus they are closed:
+
+    F = πE d²/cos θ,   centroid = (a − d/3)(n_x, n_y),
+    trace of the covariance = d(4a − d)/6 − sin²θ d(12a − 5d)/36;
+
+any other material enters by the ratios to them, tabled over d (`moment_ratios`).
 """
 
 from __future__ import annotations
 
 import math
 
-from kinematics.footprint import band_columns, extremes, line_span, plane
+import numpy as np
+
+from kinematics.cells import LIVE
+from kinematics.contact import Fingertip
+from kinematics.footprint import (
+    FloatArray,
+    Geometry,
+    IntArray,
+    band_columns,
+    extremes,
+    line_span,
+    plane,
+)
 from kinematics.kernels import fast_kernel, kernel
+from kinematics.material import Material
 
-LIVE = 3  # plane of ``cells`` that is 1 for a live cell and 0 for a dead one or one outside the tip
+RATIO_POINTS = 33
+RATIO_END = 0.8  # of the radius
+_RATIO_TILT = 0.2  # rad at which the ratios are taken; they hardly depend on it
+
+
+def moment_ratios(tip: Fingertip, material: Material) -> FloatArray:
+    """Force, centroid and trace over the closed forms of E₀, float64 [RATIO_POINTS, 3], over d.
+
+    Rows are evenly spaced from 0 to RATIO_END·a. Integrated over the flattened disc in polar
+    coordinates at a tilt of 0.2 rad.
+    """
+    a = tip.radius
+    table = np.ones((RATIO_POINTS, 3))
+    if material.is_linear:
+        return table
+    radial, radial_weight = np.polynomial.legendre.leggauss(24)
+    angle = 2.0 * math.pi * (np.arange(32) + 0.5) / 32
+    s, c = math.sin(_RATIO_TILT), math.cos(_RATIO_TILT)
+    for k, d in enumerate(np.linspace(0.0, RATIO_END, RATIO_POINTS) * a):
+        depth = max(d, 1e-4 * a)
+        h = a - depth
+        rho = math.sqrt(depth * (2.0 * a - depth))
+        r = rho * 0.5 * (radial + 1.0)[:, None]
+        x = h * s + r * np.cos(angle) * c
+        y = r * np.sin(angle)
+        z = h * c - r * np.cos(angle) * s
+        length2 = a * a - x * x - y * y
+        strain = np.clip(1.0 - z / np.sqrt(np.maximum(length2, 1e-12)), 0.0, 1.0)
+        pressure = material.stress(strain) * radial_weight[:, None] * r
+        total = pressure.sum()
+        mean = (pressure * x).sum() / total
+        trace = (pressure * ((x - mean) ** 2 + y**2)).sum() / total
+        force = total * c * (0.5 * rho) * (2.0 * math.pi / 32)
+        table[k, 0] = force / (math.pi * material.reference_modulus * depth**2 / c)
+        table[k, 1] = mean / (s * (a - depth / 3.0))
+        table[k, 2] = trace / closed_trace(a, depth, s)
+    return table
 
 
 @kernel
-def row_peak(frame, cells, i, first, last):
-    """(largest, smallest, sum) of the live cells first..last of row i; the sum tells NaN and inf."""
-    high = 0.0
-    low = 0.0
+def closed_trace(a: float, d: float, s: float) -> float:
+    """Trace of the pressure's covariance [m²] for a constant modulus, s = sin θ."""
+    return d * (4.0 * a - d) / 6.0 - s * s * d * (12.0 * a - 5.0 * d) / 36.0
+
+
+@kernel
+def _ratio(ratios: FloatArray, a: float, d: float, column: int) -> float:
+    t = min(max(d / (RATIO_END * a), 0.0), 0.999999) * (RATIO_POINTS - 1)
+    k = int(t)
+    t -= k
+    return float(ratios[k, column] * (1.0 - t) + ratios[k + 1, column] * t)
+
+
+@fast_kernel
+def _row_scan(row: FloatArray, live: FloatArray, level: float) -> tuple[float, float, float]:
+    """Live cells of a row above ``level`` and below −4 · level, and the sum, which tells NaN."""
+    over = 0.0
+    under = 0.0
     total = 0.0
-    for j in range(first, last):
-        value = frame[i, j] if cells[i, LIVE, j] > 0.0 else 0.0
-        high = max(high, value)
-        low = min(low, value)
+    bottom = -4.0 * level
+    for j in range(row.shape[0]):
+        value = row[j]
+        mask = live[j]
+        value = value if mask > 0.0 else 0.0
+        over += 1.0 if value > level else 0.0
+        under += 1.0 if value < bottom else 0.0
         total += value
-    return high, low, total
+    return over, under, total
 
 
 @kernel
-def patch_sum(frame, cells, i, j):
-    """Weighted sum over the 5 × 5 cells round (i, j), weights (1, 2, 2, 2, 1) ⊗ itself, and Σ w²."""
+def _neighbourhood(frame: FloatArray, cells: FloatArray, i: int, j: int) -> float:
+    """How far the 5 × 5 cells round (i, j), without the middle one, stand above noise 1.
+
+    Weights (1, 2, 2, 2, 1) both ways; the sum over its standard deviation.
+    """
     rows, cols = frame.shape
     total = 0.0
-    squares = 0.0
+    squares = 1e-30
     for k in range(max(i - 2, 0), min(i + 3, rows)):
         row_weight = 1.0 if abs(k - i) == 2 else 2.0
         for m in range(max(j - 2, 0), min(j + 3, cols)):
-            if cells[k, LIVE, m] > 0.0:
+            if cells[k, LIVE, m] > 0.0 and not (k == i and m == j):
                 weight = row_weight if abs(m - j) == 2 else 2.0 * row_weight
                 total += weight * frame[k, m]
                 squares += weight * weight
-    return total, squares
+    return total / math.sqrt(squares)
 
 
 @kernel
-def activity(frame, cells, runs, noise, peak_level, patch_level):
-    """Cheap test for a contact: (row, col, peak, lowest, finite); row is −1 without one.
+def activity(
+    frame: FloatArray,
+    cells: FloatArray,
+    runs: IntArray,
+    noise: float,
+    peak_level: float,
+    patch_level: float,
+) -> tuple[bool, int, int, float, float, bool]:
+    """Cheap test: (contact, row and column of the largest cell, that cell, low cells, finite).
 
     ``noise`` is a cell's standard deviation in the frame's unit. A contact is a cell above
-    ``peak_level`` · noise whose neighbourhood's weighted sum passes ``patch_level`` standard
-    deviations. ``runs`` [rows, 2] are the columns inside the tip's disc.
+    ``peak_level`` · noise whose neighbours' weighted sum, itself left out, passes ``patch_level``
+    standard deviations: one hot cell alone is none. ``runs`` [rows, 2] are the columns inside the
+    tip's disc.
     """
-    best = patch_level
-    found_i = -1
-    found_j = -1
+    level = peak_level * noise
+    contact = False
+    row = -1
+    col = -1
     peak = 0.0
-    lowest = 0.0
+    low = 0.0
     total = 0.0
     for i in range(frame.shape[0]):
         first = runs[i, 0]
         last = runs[i, 1]
-        high, low, row = row_peak(frame, cells, i, first, last)
-        total += row
-        lowest = min(lowest, low)
-        peak = max(peak, high)
-        if high > peak_level * noise:
+        over, under, row_sum = _row_scan(frame[i, first:last], cells[i, LIVE, first:last], level)
+        total += row_sum
+        low += under
+        if over > 0.0:
             for j in range(first, last):
-                if frame[i, j] > peak_level * noise and cells[i, LIVE, j] > 0.0:
-                    patch, squares = patch_sum(frame, cells, i, j)
-                    score = patch / (noise * math.sqrt(squares))
-                    if score > best:
-                        best = score
-                        found_i = i
-                        found_j = j
-    return found_i, found_j, peak, lowest, math.isfinite(total) and math.isfinite(peak)
+                value = frame[i, j]
+                if value > level and cells[i, LIVE, j] > 0.0:
+                    if value > peak:
+                        peak = value
+                        row = i
+                        col = j
+                    if not contact:
+                        contact = _neighbourhood(frame, cells, i, j) > patch_level * noise
+    return contact, row, col, peak, low, math.isfinite(total) and math.isfinite(peak)
+
+
+@kernel
+def is_spike(
+    frame: FloatArray, cells: FloatArray, i: int, j: int, noise: float, confined: float
+) -> bool:
+    """Whether the cell stands alone as no contact can: a hot cell.
+
+    ``confined`` is what a contact no wider than a cell could press at most.
+    """
+    rows, cols = frame.shape
+    total = 0.0
+    number = 0
+    for k, m in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+        if 0 <= k < rows and 0 <= m < cols and cells[k, LIVE, m] > 0.0:
+            total += frame[k, m]
+            number += 1
+    if number == 0:
+        return False
+    return bool(
+        frame[i, j] > 10.0 * noise + confined
+        and frame[i, j] > 4.0 * (max(total, 0.0) / number + 3.0 * noise)
+    )
 
 
 @fast_kernel
-def row_moments(frame, cells, i, first, last, level):
-    """Σp, Σp j, Σp j² and the number of live cells of row i with p > level."""
+def _row_moments(
+    row: FloatArray, live: FloatArray, level: float
+) -> tuple[float, float, float, float]:
+    """Σp, Σp k, Σp k² and the number of live cells of a row's part with p > level."""
     s0 = 0.0
     s1 = 0.0
     s2 = 0.0
     n = 0.0
-    for j in range(first, last):
-        value = frame[i, j]
-        weight = cells[i, LIVE, j] if value > level else 0.0
+    for k in range(row.shape[0]):
+        value = row[k]
+        weight = live[k]
+        weight = weight if value > level else 0.0
         value = value if weight > 0.0 else 0.0
+        x = float(k)
         s0 += value
-        s1 += value * j
-        s2 += value * (j * j)
+        s1 += value * x
+        s2 += value * x * x
         n += weight
     return s0, s1, s2, n
 
 
 @kernel
-def footprint_moments(frame, cells, geometry, u, v, w):
-    """(Σp, centroid x, y, variance x, y, covariance) over the cells that touch the footprint.
+def row_moments(
+    frame: FloatArray, cells: FloatArray, i: int, first: int, last: int, level: float
+) -> tuple[float, float, float, float]:
+    """Σp, Σp j, Σp j² and the number of live cells first..last of row i with p > level."""
+    s0, s1, s2, n = _row_moments(frame[i, first:last], cells[i, LIVE, first:last], level)
+    return s0, s1 + first * s0, s2 + first * (2.0 * s1 + first * s0), n
+
+
+@kernel
+def footprint_moments(
+    frame: FloatArray, cells: FloatArray, geometry: Geometry, u: float, v: float, w: float
+) -> tuple[float, float, float, float, float]:
+    """(Σp, centroid x, y, trace of the covariance, cells) over the cells that touch the footprint.
 
     Lengths in m from the tip's centre, the cells' own variance pitch²/12 already taken off.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape
     ends = extremes(u, v, w, a)
-    total = sum_x = sum_y = sum_xx = sum_xy = sum_yy = 0.0
+    total = sum_x = sum_y = sum_xx = sum_yy = number = 0.0
     if ends[0] < ends[1]:
         first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
         last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), first_row), rows)
@@ -116,44 +237,49 @@ def footprint_moments(frame, cells, geometry, u, v, w):
             first, _, _, last = band_columns(
                 u, v, w, a, ends, below, above, y0, y0 + pitch_y, x_first, pitch_x, cols
             )
-            s0, s1, s2, _ = row_moments(frame, cells, i, first, last, -math.inf)
+            s0, s1, s2, n = row_moments(frame, cells, i, first, last, -math.inf)
             total += s0
             sum_x += s1
             sum_xx += s2
             sum_y += s0 * i
             sum_yy += s0 * (i * i)
-            sum_xy += s1 * i
+            number += n
     if not total > 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, number
     mean_x = sum_x / total
     mean_y = sum_y / total
     return (
         total,
         x_first + pitch_x * (mean_x + 0.5),
         y_first + pitch_y * (mean_y + 0.5),
-        pitch_x * pitch_x * (sum_xx / total - mean_x * mean_x - 1.0 / 12.0),
-        pitch_y * pitch_y * (sum_yy / total - mean_y * mean_y - 1.0 / 12.0),
-        pitch_x * pitch_y * (sum_xy / total - mean_x * mean_y),
+        pitch_x * pitch_x * (sum_xx / total - mean_x * mean_x - 1.0 / 12.0)
+        + pitch_y * pitch_y * (sum_yy / total - mean_y * mean_y - 1.0 / 12.0),
+        number,
     )
 
 
 @kernel
-def from_extent(a, trace, reach):
-    """d from the trace of the pressure's covariance and the centroid's distance ``reach``.
-
-    Solves d(4a − d)/6 − s² d(12a − 5d)/36 = trace with s = reach/(a − d/3).
-    """
+def from_extent(a: float, trace: float, reach: float, ratios: FloatArray) -> float:
+    """d from the trace of the pressure's covariance and the centroid's distance ``reach``."""
     d = 2.0 * a - math.sqrt(max(4.0 * a * a - 6.0 * max(trace, 0.0), a * a))
-    for _ in range(8):
-        s = min(reach / (a - d / 3.0), 0.95)
+    for _ in range(6):
+        s = min(reach / (_ratio(ratios, a, d, 1) * (a - d / 3.0)), 0.95)
         slope = (4.0 * a - 2.0 * d) / 6.0 - s * s * (12.0 * a - 10.0 * d) / 36.0
-        miss = d * (4.0 * a - d) / 6.0 - s * s * d * (12.0 * a - 5.0 * d) / 36.0 - trace
+        miss = closed_trace(a, d, s) - trace / _ratio(ratios, a, d, 2)
         d = min(max(d - miss / slope, 0.0), 0.95 * a)
     return d
 
 
 @kernel
-def coarse(frame, cells, geometry, runs, level, row, col):
+def coarse(
+    frame: FloatArray,
+    cells: FloatArray,
+    geometry: Geometry,
+    runs: IntArray,
+    level: float,
+    row: int,
+    col: int,
+) -> tuple[float, float, float]:
     """(d, n_x, n_y) from the cells above ``level`` in the tip's disc: their centroid and number."""
     a, x_first, y_first, pitch_x, pitch_y = geometry
     total = sum_x = sum_y = number = 0.0
@@ -170,13 +296,12 @@ def coarse(frame, cells, geometry, runs, level, row, col):
     # The footprint's area is π ρ² cos θ with ρ² = 2 a d − d².
     rho2 = min(number * pitch_x * pitch_y / math.pi, 0.75 * a * a)
     d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
-    reach = a - d / 3.0
-    n_x, n_y = bounded(x / reach, y / reach)
+    n_x, n_y = bounded(x / (a - d / 3.0), y / (a - d / 3.0))
     return d, n_x, n_y
 
 
 @kernel
-def bounded(n_x, n_y):
+def bounded(n_x: float, n_y: float) -> tuple[float, float]:
     """(n_x, n_y) shortened to at most 0.95."""
     length = math.hypot(n_x, n_y)
     if length > 0.95:
@@ -185,23 +310,58 @@ def bounded(n_x, n_y):
 
 
 @kernel
-def refine(frame, cells, geometry, modulus, d, n_x, n_y):
-    """(d, n_x, n_y, gain) from the moments over the footprint of the contact given, one cell wider.
+def refine(
+    frame: FloatArray,
+    cells: FloatArray,
+    geometry: Geometry,
+    ratios: FloatArray,
+    modulus: float,
+    fixed_gain: float,
+    noise: float,
+    d: float,
+    n_x: float,
+    n_y: float,
+    covariance: FloatArray,
+) -> tuple[float, float, float, float]:
+    """(d, n_x, n_y, gain) from the moments over the footprint of the contact given, a cell wider.
 
-    ``modulus`` is in the frame's unit and turns the gain into measured over modelled force.
+    ``modulus`` E₀ and ``noise`` are in the frame's unit. With ``fixed_gain`` > 0 the displacement
+    comes from the force, otherwise from the extent and the gain from the force. ``covariance``
+    float64 [16] takes that of (d, n_x, n_y, gain) from white noise over those cells; the gain is 0
+    where nothing presses.
     """
     a = geometry[0]
     margin = math.hypot(geometry[3], geometry[4]) * 0.5
     rho = min(math.sqrt(max(d * (2.0 * a - d), 0.0)) + margin, 0.99 * a)
-    wide = a - math.sqrt(a * a - rho * rho)
-    u, v, w = plane(a, wide, n_x, n_y)
-    total, x, y, xx, yy, _ = footprint_moments(frame, cells, geometry, u, v, w)
+    u, v, w = plane(a, a - math.sqrt(a * a - rho * rho), n_x, n_y)
+    total, x, y, trace, number = footprint_moments(frame, cells, geometry, u, v, w)
+    covariance[:] = 0.0
     if not total > 0.0:
         return d, n_x, n_y, 0.0
-    d = from_extent(a, xx + yy, math.hypot(x, y))
-    d = max(d, 1e-4 * a)
-    reach = a - d / 3.0
-    n_x, n_y = bounded(x / reach, y / reach)
+    force = total * geometry[3] * geometry[4]
     cosine = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
-    gain = total * geometry[3] * geometry[4] * cosine / (math.pi * modulus * d * d)
+    relative = noise * noise * number / (total * total)  # variance of the force over its square
+    if fixed_gain > 0.0:
+        plain = force * cosine / (math.pi * modulus * fixed_gain)
+        for _ in range(4):
+            d = math.sqrt(plain / _ratio(ratios, a, d, 0))
+            d = min(max(d, 1e-4 * a), 0.95 * a)
+        covariance[0] = 0.25 * relative * d * d
+        gain = fixed_gain
+    else:
+        d = max(from_extent(a, trace, math.hypot(x, y), ratios), 1e-4 * a)
+    reach = _ratio(ratios, a, d, 1) * (a - d / 3.0)
+    n_x, n_y = bounded(x / reach, y / reach)
+    if fixed_gain <= 0.0:
+        cosine = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
+        gain = force * cosine / (math.pi * modulus * d * d * _ratio(ratios, a, d, 0))
+        # Over a disc of radius ρ: mean of (r² − trace)².
+        spread = rho**4 / 3.0 - trace * rho * rho + trace * trace
+        slope = (4.0 * a - 2.0 * d) / 6.0
+        covariance[0] = relative * spread / (slope * slope)
+        covariance[15] = gain * gain * (relative + 4.0 * covariance[0] / (d * d))
+        covariance[3] = -2.0 * gain * covariance[0] / d
+        covariance[12] = covariance[3]
+    covariance[5] = relative * 0.25 * rho * rho / (reach * reach)
+    covariance[10] = covariance[5]
     return d, n_x, n_y, gain

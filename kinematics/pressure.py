@@ -1,7 +1,7 @@
 """The forward model: what a pressure grid of given cells under a soft tip would read.
 
-Holds the sensor's geometry (`SensorGrid`) and the rendering of a contact on it. Every cell reads the
-pressure averaged over its area; sensor imperfections (noise, counts, dead cells) are not here.
+Holds the sensor's geometry (`SensorGrid`) and the rendering of a contact on it. Every cell reads
+the pressure averaged over its area; sensor imperfections (noise, counts, dead cells) are not here.
 """
 
 from __future__ import annotations
@@ -10,19 +10,24 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinematics.cells import MAX_BREAKS, cut_cell_stress, whole_cell_stress
 from kinematics.contact import Fingertip
-from kinematics.footprint import band_columns, extremes, line_span, plane
+from kinematics.footprint import FloatArray, Geometry, band_columns, extremes, line_span, plane
 from kinematics.kernels import kernel
 from kinematics.material import Material
 
-FloatArray = NDArray[np.float64]
-
 
 @kernel
-def render(geometry, law, gain, d, n_x, n_y, out):
+def render(
+    geometry: Geometry,
+    law: FloatArray,
+    gain: float,
+    d: float,
+    n_x: float,
+    n_y: float,
+    out: FloatArray,
+) -> None:
     """Write the pressure [Pa] of a contact, averaged over each cell, into ``out`` [rows, cols].
 
     ``geometry`` is :meth:`SensorGrid.geometry`, ``law`` the material's, (n_x, n_y) the first two
@@ -32,12 +37,12 @@ def render(geometry, law, gain, d, n_x, n_y, out):
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = out.shape
     out[:] = 0.0
-    if not (0.0 < d and n_x * n_x + n_y * n_y < 1.0):
+    if not (d > 0.0 and n_x * n_x + n_y * n_y < 1.0):
         return
     u, v, w = plane(a, min(d, a), n_x, n_y)
     ends = extremes(u, v, w, a)
     breaks = np.empty(MAX_BREAKS)
-    first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows) if d > 0.0 else 0
+    first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
     last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), 0), rows)
     above = line_span(u, v, w, a, y_first + first_row * pitch_y)
     for i in range(first_row, last_row):
@@ -93,7 +98,7 @@ class SensorGrid:
         """(rows, cols)."""
         return self.rows, self.cols
 
-    def geometry(self, tip: Fingertip) -> tuple[float, float, float, float, float]:
+    def geometry(self, tip: Fingertip) -> Geometry:
         """(a, x and y of the first cell's corner from the tip's centre, pitch x, pitch y) [m]."""
         pitch_x, pitch_y = self.pitches
         return (

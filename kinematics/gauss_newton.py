@@ -1,0 +1,206 @@
+"""Gauss-Newton on the likelihood of one pressure frame, as kernels.
+
+Holds the solution of the normal equations, the iteration with its stopping rule, and the covariance
+of what comes out. Parameters are (gain, u, v, w) inside and (d, n_x, n_y, gain) outside; see
+footprint.py for (u, v, w).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinematics.footprint import FloatArray, Geometry, IntArray, plane
+from kinematics.kernels import kernel
+from kinematics.likelihood import SUMS, accumulate, pack
+
+# Places in what a fit leaves in ``result``.
+D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)
+RESULT = 8
+
+
+@kernel
+def solve(
+    sums: FloatArray, gain: float, free: bool, step: FloatArray, inverse: FloatArray
+) -> tuple[bool, float]:
+    """Gauss-Newton step in (gain, u, v, w), the inverse normal matrix, (solvable, decrement).
+
+    ``sums`` are :func:`kinematics.likelihood.accumulate`'s. Without a ``free`` gain its row is left
+    out. The decrement is the fall of the sum of squares that the step promises. Not solvable where
+    a pivot of the scaled matrix is below 1e-11: the frame doesn't determine every parameter.
+    """
+    first = 0 if free else 1
+    matrix = np.empty((4, 4))
+    right = np.empty(4)
+    scale = np.empty(4)
+    factor = (1.0, -gain, gain, gain)
+    k = 0
+    for i in range(4):
+        for j in range(i, 4):
+            matrix[j, i] = sums[k] * factor[i] * factor[j]
+            k += 1
+        right[i] = sums[10 + i] * factor[i]
+    for i in range(first, 4):
+        if not matrix[i, i] > 0.0:
+            return False, 0.0
+        scale[i] = 1.0 / math.sqrt(matrix[i, i])
+    for i in range(first, 4):
+        for j in range(first, i + 1):
+            matrix[i, j] *= scale[i] * scale[j]
+    # Cholesky in the lower triangle, its inverse in ``lower``.
+    lower = np.zeros((4, 4))
+    for j in range(first, 4):
+        pivot = matrix[j, j]
+        for k in range(first, j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not pivot > 1e-11:
+            return False, 0.0
+        pivot = math.sqrt(pivot)
+        matrix[j, j] = pivot
+        lower[j, j] = 1.0 / pivot
+        for i in range(j + 1, 4):
+            value = matrix[i, j]
+            for k in range(first, j):
+                value -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = value / pivot
+    for j in range(first, 4):
+        for i in range(j + 1, 4):
+            value = 0.0
+            for k in range(j, i):
+                value -= matrix[i, k] * lower[k, j]
+            lower[i, j] = value * lower[i, i]
+    inverse[:] = 0.0
+    step[:] = 0.0
+    decrement = 0.0
+    for i in range(first, 4):
+        for j in range(first, 4):
+            value = 0.0
+            for k in range(max(i, j), 4):
+                value += lower[k, i] * lower[k, j]
+            inverse[i, j] = value * scale[i] * scale[j]
+            step[i] += inverse[i, j] * right[j]
+        decrement += step[i] * right[i]
+    return math.isfinite(decrement), decrement
+
+
+@kernel
+def covariance_of(
+    inverse: FloatArray, a: float, u: float, v: float, w: float, variance: float, out: FloatArray
+) -> None:
+    """Covariance of (d, n_x, n_y, gain), rows after another in ``out`` [16].
+
+    ``inverse`` is that of the normal matrix in (gain, u, v, w), ``variance`` a cell's.
+    """
+    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
+    cube = n_z * n_z * n_z
+    jacobian = np.zeros((4, 4))
+    half = np.zeros((4, 4))
+    # d = a − u n_z, n_x = v n_z, n_y = w n_z, ∂n_z/∂v = −v n_z³.
+    jacobian[0, 1] = -n_z
+    jacobian[0, 2] = u * v * cube
+    jacobian[0, 3] = u * w * cube
+    jacobian[1, 2] = n_z - v * v * cube
+    jacobian[1, 3] = -v * w * cube
+    jacobian[2, 2] = -v * w * cube
+    jacobian[2, 3] = n_z - w * w * cube
+    jacobian[3, 0] = 1.0
+    for i in range(4):
+        for j in range(4):
+            for k in range(4):
+                half[i, j] += jacobian[i, k] * inverse[k, j]
+    for i in range(4):
+        for j in range(4):
+            value = 0.0
+            for k in range(4):
+                value += half[i, k] * jacobian[j, k]
+            out[4 * i + j] = value * variance
+
+
+@kernel
+def fit(
+    frame: FloatArray,
+    scale: float,
+    geometry: Geometry,
+    cells: FloatArray,
+    law: FloatArray,
+    free: bool,
+    saturation: float,
+    variance: float,
+    tolerance: float,
+    iterations: int,
+    floats: FloatArray,
+    owners: IntArray,
+    packed: FloatArray,
+    lines: FloatArray,
+    result: FloatArray,
+    covariance: FloatArray,
+) -> bool:
+    """Gauss-Newton from the contact in ``result`` (D, N_X, N_Y, GAIN), the estimate left there.
+
+    ``variance`` [Pa²] is a cell's, ``saturation`` [Pa] its end. Stops when the promised decrement
+    is below ``tolerance`` · variance, that is the step is that part of the noise floor, squared.
+    RESIDUAL takes Σ over the footprint of (reading − model)² − reading² [Pa²]. False when the
+    frame doesn't determine the contact or the iteration doesn't settle.
+    """
+    a = geometry[0]
+    cols = frame.shape[1]
+    sums = floats[:SUMS]
+    step = floats[SUMS : SUMS + 4]
+    inverse = floats[SUMS + 4 : SUMS + 20].reshape(4, 4)
+    columns = floats[SUMS + 20 : SUMS + 22 + 2 * cols].reshape(cols + 1, 2)
+    u, v, w = plane(a, result[D], result[N_X], result[N_Y])
+    gain = result[GAIN]
+    cost = math.inf
+    before = (u, v, w, gain)
+    halvings = 0
+    solved = False
+    for iteration in range(iterations):
+        count = pack(u, v, w, geometry, cells, frame, scale, columns, lines, owners, packed)
+        accumulate(packed, count, u, v, w, gain, saturation, law, sums)
+        now = sums[14] - sums[15]
+        if solved and not now <= cost + variance and halvings < 5:
+            # Too far: half way back.
+            u = 0.5 * (u + before[0])
+            v = 0.5 * (v + before[1])
+            w = 0.5 * (w + before[2])
+            gain = 0.5 * (gain + before[3])
+            halvings += 1
+            continue
+        cost = now
+        solved, decrement = solve(sums, gain, free, step, inverse)
+        if not solved:
+            return False
+        before = (u, v, w, gain)
+        halvings = 0
+        gain = max(gain + step[0], 0.2 * gain)
+        u += step[1]
+        v += step[2]
+        w += step[3]
+        # Keep the face between the tip's top and its base plate.
+        tilt = math.hypot(v, w)
+        if tilt > 3.0:
+            v *= 3.0 / tilt
+            w *= 3.0 / tilt
+        n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
+        d = a - u * n_z
+        shallow = a - before[0] / math.sqrt(1.0 + before[1] ** 2 + before[2] ** 2)
+        limited = min(max(d, 0.3 * shallow, 1e-4 * a), 0.95 * a)
+        if limited != d:
+            u = (a - limited) / n_z
+        elif decrement <= tolerance * variance:
+            freedom = sums[16] - (4.0 if free else 3.0)
+            misfit = max(sums[14] - decrement, 0.0)
+            result[D] = d
+            result[N_X] = v * n_z
+            result[N_Y] = w * n_z
+            result[GAIN] = gain
+            result[CHI2] = misfit / (variance * max(freedom, 1.0))
+            result[CELLS] = sums[16]
+            result[ITERATIONS] = iteration + 1
+            result[RESIDUAL] = misfit - sums[15]
+            # A misfit beyond its own scatter widens the covariance.
+            excess = max(result[CHI2] - 3.0 * math.sqrt(2.0 / max(freedom, 1.0)), 1.0)
+            covariance_of(inverse, a, u, v, w, variance * excess, covariance)
+            return bool(freedom > 0.0)
+    return False
