@@ -176,7 +176,9 @@ class Control:
         if self._gripping:
             self._hold(dt, goal)
         else:
-            bound = self._settings.safety.current_move
+            closing = mode is Mode.GRASPING
+            control, safety = self._settings.control, self._settings.safety
+            bound = control.approach_current if closing else safety.current_move
             for index in self._fingers:
                 goal.q[index] = self._goal_q[index]
                 goal.current[index] = bound

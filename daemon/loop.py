@@ -122,14 +122,14 @@ class Loop:
         state.seq += 1
         state.t = now
         state.wall = self._clock.wall()
-        self._read(now)
+        self._read()
         self._feel()
         self._decide()
         self._write(now)
         if self._publisher is not None:
             self._publish(self._publisher)
 
-    def _read(self, now: float) -> None:
+    def _read(self) -> None:
         reading = self.state.reading
         if self.servos is None:
             return
@@ -139,8 +139,7 @@ class Loop:
             reading.valid = False
             self._fail(str(error))
         if reading.valid:
-            reading.t = now
-            self._history.append(now, reading.q.tolist())
+            self._history.append(reading.t, reading.q.tolist())
 
     def _feel(self) -> None:
         new = False

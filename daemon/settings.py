@@ -143,6 +143,7 @@ class Control(Section):
 
     torque_constant: Positive = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
     approach_speed: Positive = 0.3  # rad/s
+    approach_current: Positive = 0.15  # A, while closing: a tip that feels nothing presses no more
     move_speed: Positive = 1.0  # rad/s
     contact_force: Positive = 0.5  # N at which a finger counts as touching
     force_default: Positive = 5.0  # N, grasp without force=
