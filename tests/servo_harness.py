@@ -37,10 +37,11 @@ def make_bus(
     firmware: int | None = None,
     counts: Sequence[int] = (),
     prepared: bool = False,
+    t: float = 0.0,
     **options: Any,
 ) -> ServoBus:
-    """Factory-new servos on free joints that stand at ``counts``, with the time at 0."""
-    plant = FreeJoints(len(ids))
+    """Factory-new servos on free joints that stand at ``counts``, with the time at ``t``."""
+    plant = FreeJoints(len(ids), t)
     for joint, count in enumerate(counts):
         plant.q[joint] = count * RADIAN
     servos = [
@@ -52,6 +53,7 @@ def make_bus(
             plain_scale(model),
             firmware=firmware,
             prepared=prepared,
+            t=t,
         )
         for joint, servo_id in enumerate(ids)
     ]

@@ -313,9 +313,9 @@ class DynamixelServos:
         self, port: SerialPort, servo_id: int, address: int, length: int
     ) -> bytes | None:
         for _ in range(_TRIES):
-            data, result, _ = self._handler.readTxRx(port, servo_id, address, length)
-            if result == COMM_SUCCESS and len(data) == length:
-                return bytes(data)
+            data, result, error = self._handler.readTxRx(port, servo_id, address, length)
+            if result == COMM_SUCCESS:
+                return None if error & 0x7F else bytes(data)
         return None
 
     def _store(self, address: int, form: str, values: dict[int, int], what: str) -> None:

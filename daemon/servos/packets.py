@@ -14,11 +14,13 @@ from dynamixel_sdk.group_sync_read import GroupSyncRead
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from dynamixel_sdk.robotis_def import (
     BROADCAST_ID,
+    COMM_NOT_AVAILABLE,
     COMM_RX_CORRUPT,
     COMM_RX_TIMEOUT,
     COMM_SUCCESS,
     COMM_TX_ERROR,
     COMM_TX_FAIL,
+    INST_READ,
     INST_STATUS,
     MAX_ID,
 )
@@ -78,6 +80,29 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         if port.writePort(packet) != len(packet):
             return int(COMM_TX_FAIL)
         return int(COMM_SUCCESS)
+
+    def readTxRx(
+        self, port: SerialPort, dxl_id: int, address: int, length: int
+    ) -> tuple[list[int], int, int]:
+        """Read a span: (data, result code, error byte). With an error the data are zeros.
+
+        A reply of another length is an old one (the SDK does not wait for an action's) and is
+        passed over; the SDK would take its CRC for data.
+        """
+        if dxl_id >= BROADCAST_ID:
+            return [], int(COMM_NOT_AVAILABLE), 0
+        span = address.to_bytes(2, "little") + length.to_bytes(2, "little")
+        result = self._send(port, _packet(dxl_id, bytes((INST_READ,)) + span))
+        port.setPacketTimeout(_SMALLEST + length)
+        while result == COMM_SUCCESS:
+            packet, result = self.rxPacket(port, False)
+            if result != COMM_SUCCESS or packet[4] != dxl_id:
+                continue
+            if len(packet) == _SMALLEST + length:
+                return list(packet[9:-2]), result, packet[8]
+            if packet[8] & 0x7F:
+                return [0] * length, result, packet[8]
+        return [], result, 0
 
     def syncReadTx(
         self,
