@@ -107,14 +107,15 @@ def test_it_is_due_at_each_frame_delivery():
     source = Source()
     made = board(source, rate=100.0, delay=0.004)
     assert made.next_event() == -np.inf
-    made.service(0.0)
-    assert made.next_event() == pytest.approx(0.004)
-    made.service(0.004)
-    assert made.next_event() == pytest.approx(0.014)
     # A due time that rounding put just before the frame's must not come again at once.
-    made.service(np.nextafter(0.014, 0.0))
-    assert made.next_event() == pytest.approx(0.024)
-    made.service(0.0561)
+    times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
+    for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
+        source.make(seq)
+        made.service(t)
+        assert made.next_event() == pytest.approx(due)
+    made.service(0.0562)  # a frame that is late is asked for again soon
+    assert made.next_event() == pytest.approx(0.0567)
+    made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)
     made.close()
 

@@ -29,6 +29,7 @@ Encoder = Callable[[NDArray[np.uint16]], bytes]
 
 _TTY_ROOM = 2048  # bytes; a tty reports at most 4095 unread ones, so more is never asked for
 _DRAIN = 4096
+_RETRY = 5e-4  # s until a frame that is late is asked for again
 _NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
 
 
@@ -203,6 +204,7 @@ class TactileBoard:
         self._due += self._delay
         frame = self._source.latest()
         if frame is None or frame.seq == self._seq:
+            self._due = min(self._due, t + _RETRY)
             return
         self._seq = frame.seq
         if self._start is None:
