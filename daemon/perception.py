@@ -109,7 +109,7 @@ class FingerPerception:
         contact.theta = estimate.tilt_x
         contact.tilt_y = estimate.tilt_y
         contact.d_std = estimate.d_std
-        contact.theta_std = estimate.tilt_std[0]
+        contact.theta_std = estimate.tilt_x_std
         force, energy, _, _, _, _, inside = lookup(
             self._table, contact.d, _total_tilt(contact.theta, contact.tilt_y)
         )
