@@ -181,11 +181,12 @@ class SerialReader:
     def _run(self, port: int, stop: int) -> None:
         """The thread: waits in the kernel, wakes once or twice a frame."""
         decoder = self._decoder
+        timeout = None
         while True:
-            timeout = self._settle if decoder.pending else None
             ready, _, _ = select.select((port, stop), (), (), timeout)
             if stop in ready:
-                return
+                return None
+            timeout = None
             if not ready:
                 self._hand_over(decoder.settle())
                 continue
@@ -201,6 +202,8 @@ class SerialReader:
             self._hand_over(decoder.feed(data, self._clock.now()))
             if decoder.lost and not self._error:
                 self._invalidate(decoder.diagnosis())
+            if decoder.pending:
+                timeout = self._settle
             wait = decoder.missing * self._byte_time
             # The rest of this frame is on its way: wait for its end instead of for its next byte.
             if (
