@@ -11,84 +11,55 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.simulation import tip as tips
-from daemon.simulation.layout import (
-    CURRENT_BASED_POSITION_MODE,
-    CURRENT_MODE,
-    DRAG,
-    FACE,
-    FORCES,
-    GOAL_CURRENT,
-    GOAL_Q,
-    GRAVITY,
-    HALF_HEIGHT,
-    HALF_SEPARATION,
-    HALF_WIDTH,
-    JOINT_DAMPING,
-    JOINT_FRICTION,
-    JOINT_INERTIA,
-    JOINT_SPEED,
-    LENGTH,
-    MASS,
-    MODE,
-    NO_LOAD_SPEED,
-    OFFSET,
-    POSITION_GAIN,
-    PRESENT,
-    PUSH,
-    RATE_GAIN,
-    SCRIPT_LEFT,
-    SCRIPT_RIGHT,
-    SCRIPT_SPEED,
-    SCRIPT_X,
-    STALL_CURRENT,
-    STOP_HIGH,
-    STOP_LOW,
-    STOP_STIFFNESS,
-    TABLE_FORCE,
-    TABLE_SPEED,
-    TABLE_SPIN,
-    TABLE_TORQUE,
-    TORQUE_ON,
-)
+from daemon.simulation import layout
 from daemon.simulation.tip import evaluate_tip, nearest_face
-from kinematics.fingers import tip_position, tip_velocity
 from kinematics.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
 
 @kernel
-def current_reference(
-    goal: FloatArray, q: float, rate: float, limit: float, params: FloatArray
-) -> float:
+def current_reference(memory: FloatArray, joint: int, q: float, rate: float) -> float:
     """Current [A] that a servo asks of its motor: its mode's law within all that bounds it.
 
     The supply's bound falls linearly from the stall current at rest to none at no-load speed.
     """
-    if goal[TORQUE_ON] == 0.0:
+    if memory[layout.TORQUE_ON + joint] == 0.0:
         return 0.0
-    if goal[MODE] == CURRENT_MODE:
-        reference = goal[GOAL_CURRENT]
+    limit = memory[layout.CURRENT_LIMIT]
+    mode = memory[layout.MODE + joint]
+    goal_current = memory[layout.GOAL_CURRENT + joint]
+    if mode == layout.CURRENT_MODE:
+        reference = goal_current
     else:
-        reference = params[POSITION_GAIN] * (goal[GOAL_Q] - q) - params[RATE_GAIN] * rate
-        if goal[MODE] == CURRENT_BASED_POSITION_MODE:
-            limit = min(limit, abs(goal[GOAL_CURRENT]))
+        error = memory[layout.GOAL_Q + joint] - q
+        reference = memory[layout.POSITION_GAIN] * error - memory[layout.RATE_GAIN] * rate
+        if mode == layout.CURRENT_BASED_POSITION_MODE:
+            limit = min(limit, abs(goal_current))
     reference = min(max(reference, -limit), limit)
-    back = params[STALL_CURRENT] * rate / params[NO_LOAD_SPEED]
-    stall = params[STALL_CURRENT]
+    stall = memory[layout.STALL_CURRENT]
+    back = stall * rate / memory[layout.NO_LOAD_SPEED]
     current: float = min(max(reference, -stall - back), stall - back)
     return current
 
 
 @kernel
-def script_place(t: float, params: FloatArray) -> float:
+def stop_stiffness(memory: FloatArray, joint: int, q: float) -> float:
+    """Stiffness [N·m/rad] of the end stop that the joint is on, 0 between them."""
+    stiffness: float = 0.0
+    if q < memory[layout.STOP_LOW + joint] or q > memory[layout.STOP_HIGH + joint]:
+        stiffness = memory[layout.STOP_STIFFNESS]
+    return stiffness
+
+
+@kernel
+def script_place(memory: FloatArray, t: float) -> float:
     """x [m] of a held object at ``t``: from its start onto the left tip, back, the right, back."""
-    x: float = params[SCRIPT_X]
-    left = params[SCRIPT_LEFT]
-    right = params[SCRIPT_RIGHT]
-    if params[SCRIPT_SPEED] > 0.0 and left + right > 0.0:
-        way = (params[SCRIPT_SPEED] * t) % (2.0 * (left + right))
+    x: float = memory[layout.SCRIPT_X]
+    left = memory[layout.SCRIPT_LEFT]
+    right = memory[layout.SCRIPT_RIGHT]
+    if memory[layout.SCRIPT_SPEED] > 0.0 and left + right > 0.0:
+        way = (memory[layout.SCRIPT_SPEED] * t) % (2.0 * (left + right))
         if way <= 2.0 * left:
             x += abs(left - way) - left
         else:
@@ -98,84 +69,91 @@ def script_place(t: float, params: FloatArray) -> float:
 
 @kernel
 def evaluate_hand(
-    position: FloatArray,
-    velocity: FloatArray,
-    state: FloatArray,
+    memory: FloatArray,
+    data: FloatArray,
+    position: int,
+    velocity: int,
+    row: int,
     shear1: float,
     shear2: float,
-    params: FloatArray,
-    data: FloatArray,
-    work: FloatArray,
-    stage: int,
 ) -> None:
-    """Evaluate both tips into rows ``stage`` and ``stage`` + 1, then all forces but the motors'.
+    """Evaluate both tips into the rows from ``row`` on, then all forces but the motors'.
 
-    The drag row is the positive slope of friction, losses and stops against the velocities, in the
-    forces already.
+    ``position`` and ``velocity`` are where the five coordinates and their rates stand. The drag is
+    friction over velocity, in the forces already.
     """
-    forces = work[FORCES]
-    drag = work[DRAG]
-    angle = position[4]
+    angle = memory[position + 4]
     nx = math.cos(angle)
     ny = math.sin(angle)
-    forces[2] = params[MASS] * params[GRAVITY] + params[PUSH]
-    forces[3] = params[MASS] * params[GRAVITY + 1] + params[PUSH + 1]
-    forces[4] = params[PUSH + 2]
+    vx = memory[velocity + 2]
+    vy = memory[velocity + 3]
+    spin = memory[velocity + 4]
+    speed = math.sqrt(vx * vx + vy * vy + memory[layout.TABLE_SPEED] ** 2)
+    drag = memory[layout.TABLE_FORCE] / speed
+    spin_drag = memory[layout.TABLE_TORQUE] / math.sqrt(spin**2 + memory[layout.TABLE_SPIN] ** 2)
+    force_x = memory[layout.MASS] * memory[layout.GRAVITY] + memory[layout.PUSH] - drag * vx
+    force_y = memory[layout.MASS] * memory[layout.GRAVITY + 1] + memory[layout.PUSH + 1] - drag * vy
+    torque = memory[layout.PUSH + 2] - spin_drag * spin
+    memory[layout.DRAG + 2] = drag
+    memory[layout.DRAG + 3] = drag
+    memory[layout.DRAG + 4] = spin_drag
     for finger in range(2):
-        q = position[finger]
-        rate = velocity[finger]
-        friction = params[JOINT_FRICTION] / math.hypot(rate, params[JOINT_SPEED])
-        drag[finger] = params[JOINT_DAMPING] + friction
-        beyond = min(q - params[STOP_LOW + finger], 0.0) + max(q - params[STOP_HIGH + finger], 0.0)
+        q = memory[position + finger]
+        rate = memory[velocity + finger]
+        slow = memory[layout.JOINT_SPEED]
+        resisting = memory[layout.JOINT_DAMPING] + memory[layout.JOINT_FRICTION] / math.sqrt(
+            rate * rate + slow * slow
+        )
+        beyond = min(q - memory[layout.STOP_LOW + finger], 0.0) + max(
+            q - memory[layout.STOP_HIGH + finger], 0.0
+        )
         if beyond != 0.0:
-            drag[finger] += math.sqrt(params[STOP_STIFFNESS] * params[JOINT_INERTIA])
-        forces[finger] = -drag[finger] * rate - params[STOP_STIFFNESS] * beyond
-        out = work[stage + finger]
-        if params[PRESENT + finger] == 0.0:
-            out[:] = 0.0
-            continue
-        side = 1.0 - 2.0 * finger
-        ox, oy = tip_position(q, side, params[HALF_SEPARATION], params[LENGTH], params[OFFSET])
-        vx, vy = tip_velocity(q, side, params[LENGTH], params[OFFSET])
-        rx = ox - position[2]
-        ry = oy - position[3]
-        face = nearest_face(
-            rx * nx + ry * ny, ry * nx - rx * ny, params[HALF_WIDTH], params[HALF_HEIGHT]
-        )
-        shear = shear1 if finger == 0 else shear2
-        if face != state[FACE + finger]:
-            # Only past an edge, where the window has closed and no shear is stored.
-            state[FACE + finger] = face
-            shear = 0.0
-        evaluate_tip(
-            side,
-            math.cos(q),
-            math.sin(q),
-            vx,
-            vy,
-            rx,
-            ry,
-            nx,
-            ny,
-            face,
-            params[HALF_WIDTH],
-            params[HALF_HEIGHT],
-            shear,
-            rate,
-            velocity[2],
-            velocity[3],
-            velocity[4],
-            params,
-            data,
-            out,
-        )
-        forces[finger] += out[tips.Q]
-        forces[2] += out[tips.Q + 1]
-        forces[3] += out[tips.Q + 2]
-        forces[4] += out[tips.Q + 3]
-    speed = math.sqrt(velocity[2] ** 2 + velocity[3] ** 2 + params[TABLE_SPEED] ** 2)
-    drag[2] = params[TABLE_FORCE] / speed
-    drag[3] = drag[2]
-    drag[4] = params[TABLE_TORQUE] / math.hypot(velocity[4], params[TABLE_SPIN])
-    for j in range(2, 5):
-        forces[j] -= drag[j] * velocity[j]
+            resisting += math.sqrt(memory[layout.STOP_STIFFNESS] * memory[layout.JOINT_INERTIA])
+        memory[layout.DRAG + finger] = resisting
+        joint_torque = -resisting * rate - memory[layout.STOP_STIFFNESS] * beyond
+        out = row + finger * layout.TIP_ROW
+        if memory[layout.PRESENT + finger] != 0.0:
+            cq = math.cos(q)
+            sq = math.sin(q)
+            # The tip's centre from its pivot, inwards and away from the palm (kinematics.fingers).
+            inward = memory[layout.LENGTH] * sq + memory[layout.OFFSET] * cq
+            ahead = memory[layout.LENGTH] * cq - memory[layout.OFFSET] * sq
+            side = 1.0 - 2.0 * finger
+            rx = side * (inward - memory[layout.HALF_SEPARATION]) - memory[position + 2]
+            ry = ahead - memory[position + 3]
+            face = nearest_face(
+                rx * nx + ry * ny,
+                ry * nx - rx * ny,
+                memory[layout.HALF_WIDTH],
+                memory[layout.HALF_HEIGHT],
+            )
+            shear = shear1 if finger == 0 else shear2
+            if face != memory[layout.FACE + finger]:
+                # Only past an edge, where the window has closed and no shear is stored.
+                memory[layout.FACE + finger] = face
+                shear = 0.0
+            evaluate_tip(
+                memory,
+                data,
+                out,
+                finger,
+                velocity,
+                cq,
+                sq,
+                side * ahead,
+                -inward,
+                rx,
+                ry,
+                nx,
+                ny,
+                face,
+                shear,
+            )
+            joint_torque += memory[out + layout.Q]
+            force_x += memory[out + layout.Q + 1]
+            force_y += memory[out + layout.Q + 2]
+            torque += memory[out + layout.Q + 3]
+        memory[layout.FORCES + finger] = joint_torque
+    memory[layout.FORCES + 2] = force_x
+    memory[layout.FORCES + 3] = force_y
+    memory[layout.FORCES + 4] = torque

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from daemon.model import make_material, make_table
 from daemon.settings import Settings
-from daemon.simulation import layout, plant, tip
-from daemon.simulation.parameters import parameters_of, stiff_step
+from daemon.simulation import layout, plant
+from daemon.simulation.parameters import set_parameters, stiff_step
 from kinematics.table import ContactTable
 
 FloatArray = NDArray[np.float64]
@@ -58,35 +58,30 @@ class SimulatedHand:
         self.table = table
         self.step = stiff_step(settings, table) if step is None else step
         self.start = start
-        self.params = parameters_of(settings, self.table, self.step)
-        self.state = np.zeros(layout.STATE)
-        simulation = settings.simulation
-        self.state[layout.POSITION : layout.POSITION + 2] = settings.hand.open_angle
-        self.state[layout.POSITION + 2 : layout.POSITION + 4] = simulation.object_position
-        self.state[layout.POSITION + 4] = simulation.object_angle
-        self.goals = np.zeros((2, layout.GOALS))
-        self.goals[:, layout.MODE] = layout.CURRENT_BASED_POSITION_MODE
+        self.memory = np.zeros(layout.MEMORY)
+        set_parameters(self.memory, settings, table, self.step)
+        memory, simulation = self.memory, settings.simulation
+        memory[layout.POSITION : layout.POSITION + 2] = settings.hand.open_angle
+        memory[layout.POSITION + 2 : layout.POSITION + 4] = simulation.object_position
+        memory[layout.POSITION + 4] = simulation.object_angle
+        memory[layout.MODE : layout.MODE + 2] = layout.CURRENT_BASED_POSITION_MODE
         self._ring = np.full((SAMPLES_KEPT, layout.SAMPLE), -1.0)
-        self._work = np.zeros((layout.WORK_ROWS, tip.WORK))
         self._done = 0
         self._torque_until = math.inf
         self._per_step = 1.0 / self.step
-        state = self.state
-        self.q: FloatArray = state[layout.POSITION : layout.POSITION + 2]  # rad
-        self.dq: FloatArray = state[layout.VELOCITY : layout.VELOCITY + 2]  # rad/s
-        self.current: FloatArray = state[layout.CURRENT : layout.CURRENT + 2]  # A
-        self.object_pose: FloatArray = state[layout.POSITION + 2 : layout.POSITION + 5]  # x, y, φ
-        self.object_velocity: FloatArray = state[layout.VELOCITY + 2 : layout.VELOCITY + 5]
-        self.d: FloatArray = state[layout.CONTACT_D : layout.CONTACT_D + 2]  # m, negative: a gap
-        self.theta: FloatArray = state[layout.CONTACT_THETA : layout.CONTACT_THETA + 2]  # rad
-        self.force: FloatArray = state[layout.CONTACT_FORCE : layout.CONTACT_FORCE + 2]  # F [N]
-        self.normal: FloatArray = state[layout.CONTACT_NORMAL : layout.CONTACT_NORMAL + 2]  # N
-        self.tangential: FloatArray = state[
-            layout.CONTACT_TANGENTIAL : layout.CONTACT_TANGENTIAL + 2
-        ]
-        self.shear: FloatArray = state[layout.SHEAR : layout.SHEAR + 2]  # d_t [m]
+        self.q = self._pair(layout.POSITION)  # rad
+        self.dq = self._pair(layout.VELOCITY)  # rad/s
+        self.current = self._pair(layout.CURRENT)  # A
+        self.object_pose = memory[layout.POSITION + 2 : layout.POSITION + 5]  # x, y, φ
+        self.object_velocity = memory[layout.VELOCITY + 2 : layout.VELOCITY + 5]
+        self.d = self._pair(layout.CONTACT_D)  # m, negative: a gap
+        self.theta = self._pair(layout.CONTACT_THETA)  # rad
+        self.force = self._pair(layout.CONTACT_FORCE)  # F on the tip's base [N]
+        self.normal = self._pair(layout.CONTACT_NORMAL)  # N [N]
+        self.tangential = self._pair(layout.CONTACT_TANGENTIAL)  # T [N]
+        self.shear = self._pair(layout.SHEAR)  # d_t [m]
         # How far the backing plate's rim is pressed into the object: > 0 is past the tip's limit.
-        self.rim: FloatArray = state[layout.CONTACT_RIM : layout.CONTACT_RIM + 2]  # m
+        self.rim = self._pair(layout.CONTACT_RIM)  # m
         self._run(0)
 
     @property
@@ -98,7 +93,7 @@ class SimulatedHand:
         """Step to the last sub-step at or before ``t`` [s]; nothing when that has passed."""
         if t > self._torque_until:
             self._advance(self._torque_until)
-            self.goals[:, layout.TORQUE_ON] = 0.0
+            self.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2] = 0.0
             self._torque_until = math.inf
         self._advance(t)
 
@@ -123,11 +118,11 @@ class SimulatedHand:
             raise ValueError(f"operating mode {mode} is not simulated; {_MODES} are")
         if not (math.isfinite(goal_q) and math.isfinite(goal_current)):
             raise ValueError(f"goals must be finite, not {goal_q!r} rad, {goal_current!r} A")
-        goal = self.goals[joint]
-        goal[layout.MODE] = mode
-        goal[layout.TORQUE_ON] = 1.0 if torque_on else 0.0
-        goal[layout.GOAL_Q] = goal_q
-        goal[layout.GOAL_CURRENT] = goal_current
+        memory = self.memory
+        memory[layout.MODE + joint] = mode
+        memory[layout.TORQUE_ON + joint] = 1.0 if torque_on else 0.0
+        memory[layout.GOAL_Q + joint] = goal_q
+        memory[layout.GOAL_CURRENT + joint] = goal_current
 
     def hold_torque_until(self, t: float) -> None:
         """Let both servos drop their torque by themselves at ``t`` [s]; infinity ends it."""
@@ -135,12 +130,12 @@ class SimulatedHand:
 
     def push(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
         """Push the object with this force [N] and torque [N·m] from now on; zeros end it."""
-        self.params[layout.PUSH : layout.PUSH + 3] = force_x, force_y, torque
+        self.memory[layout.PUSH : layout.PUSH + 3] = force_x, force_y, torque
 
     @property
     def samples(self) -> int:
         """Contact samples taken so far; number k was taken at ``start`` + k / tactile.rate."""
-        return int(self.state[layout.SAMPLES])
+        return int(self.memory[layout.SAMPLES])
 
     def sample(self, number: int) -> FloatArray:
         """Row of layout.SAMPLE columns: seq, t since start, then d, θ and gain of both tips.
@@ -154,23 +149,22 @@ class SimulatedHand:
 
     def energy(self) -> float:
         """Kinetic, elastic and gravitational energy of joints, tips and object [J]."""
-        p, s = self.params, self.state
-        rates = s[layout.VELOCITY : layout.VELOCITY + 5]
-        inertia = p[
-            [layout.JOINT_INERTIA, layout.JOINT_INERTIA, layout.MASS, layout.MASS, layout.INERTIA]
-        ]
-        gravity = p[layout.GRAVITY : layout.GRAVITY + 2]
-        low, high = (p[i : i + 2] for i in (layout.STOP_LOW, layout.STOP_HIGH))
+        m = self.memory
+        rates = m[layout.VELOCITY : layout.VELOCITY + 5]
+        joint, mass = m[layout.JOINT_INERTIA], m[layout.MASS]
+        inertia = np.array([joint, joint, mass, mass, m[layout.INERTIA]])
+        low, high = self._pair(layout.STOP_LOW), self._pair(layout.STOP_HIGH)
         beyond = np.minimum(self.q - low, 0.0) + np.maximum(self.q - high, 0.0)
         return float(
             0.5 * inertia @ rates**2
-            - p[layout.MASS] * gravity @ self.object_pose[:2]
-            + 0.5 * p[layout.STOP_STIFFNESS] * beyond @ beyond
-            + self._work[0:2, tip.ENERGY].sum()
+            - mass * self._pair(layout.GRAVITY) @ self.object_pose[:2]
+            + 0.5 * m[layout.STOP_STIFFNESS] * beyond @ beyond
+            + self._pair(layout.CONTACT_ENERGY).sum()
         )
 
+    def _pair(self, place: int) -> FloatArray:
+        return self.memory[place : place + 2]
+
     def _run(self, count: int) -> None:
-        plant.step(
-            self.state, self.params, self.goals, self.table.data, self._ring, self._work, count
-        )
+        plant.step(self.memory, self.table.data, self._ring, count)
         self._done += count

@@ -1,8 +1,12 @@
-"""Where the plant keeps what: places in its state, parameters, goals and samples. Numbers only."""
+"""Where the plant keeps what: places in its one block of memory, and the numbers of servo modes.
+
+The plant's kernels work on one float64 array, since every array that a compiled function hands to
+another costs time. It holds state, parameters, goals and scratch, in this order.
+"""
 
 from __future__ import annotations
 
-# Places in the state.
+# State.
 POSITION = 0  # q1, q2, x, y, φ
 VELOCITY = 5
 SHEAR = 10  # d_t of both tips [m]
@@ -17,57 +21,93 @@ CONTACT_FORCE = 24
 CONTACT_NORMAL = 26
 CONTACT_TANGENTIAL = 28
 CONTACT_RIM = 30
-STATE = 32
+CONTACT_ENERGY = 32
+STATE = 34  # length of the state
 
-# Places in the parameters; the first six are the tips' (daemon/simulation/tip.py).
-STEP = 6  # sub-step [s]
-HALF_SEPARATION = 7
-LENGTH = 8
-OFFSET = 9
-HALF_WIDTH = 10
-HALF_HEIGHT = 11
-MASS = 12
-INERTIA = 13  # of the object [kg·m²]
-GRAVITY = 14  # x, y [m/s²]
-TABLE_FORCE = 16  # Coulomb friction of the table on the object [N]
-TABLE_TORQUE = 17  # likewise when it spins [N·m]
-TABLE_SPEED = 18  # below it table friction is viscous [m/s]
-TABLE_SPIN = 19  # [rad/s]
-JOINT_INERTIA = 20
-JOINT_DAMPING = 21
-JOINT_FRICTION = 22
-JOINT_SPEED = 23  # below it joint friction is viscous [rad/s]
-TORQUE_CONSTANT = 24
-ELECTRIC_TIME = 25  # lag of the current [s]
-CURRENT_LIMIT = 26
-STALL_CURRENT = 27
-NO_LOAD_SPEED = 28
-POSITION_GAIN = 29  # A/rad
-RATE_GAIN = 30  # A·s/rad
-STOP_LOW = 31  # end stops of both joints [rad]
-STOP_HIGH = 33
-STOP_STIFFNESS = 35
-PRESENT = 36  # 1 where the tip takes part
-JOINTS_HELD = 38
-OBJECT_HELD = 39
-SCRIPT_SPEED = 40  # m/s of a held object's to and fro; 0 leaves it still
-SCRIPT_LEFT = 41  # how far it goes to the left [m], then to the right
-SCRIPT_RIGHT = 42
-SCRIPT_X = 43  # where it starts
-SAMPLE_PERIOD = 44
-PUSH = 45  # external force x, y [N] and torque [N·m] on the object
-PARAMETERS = 48
+# Parameters of the tips.
+RADIUS = 34
+SCALE = 35  # real modulus over the table's
+FRICTION = 36
+LOSS = 37  # damping over stiffness [s]
+RIM_STIFFNESS = 38
+D_MAX = 39  # largest d the table answers [m]
+# Parameters of hand and object.
+STEP = 40  # sub-step [s]
+HALF_SEPARATION = 41
+LENGTH = 42
+OFFSET = 43
+HALF_WIDTH = 44
+HALF_HEIGHT = 45
+MASS = 46
+INERTIA = 47  # of the object [kg·m²]
+GRAVITY = 48  # x, y [m/s²]
+TABLE_FORCE = 50  # Coulomb friction of the table on the object [N]
+TABLE_TORQUE = 51  # likewise when it spins [N·m]
+TABLE_SPEED = 52  # below it table friction is viscous [m/s]
+TABLE_SPIN = 53  # [rad/s]
+JOINT_INERTIA = 54
+JOINT_DAMPING = 55
+JOINT_FRICTION = 56
+JOINT_SPEED = 57  # below it joint friction is viscous [rad/s]
+TORQUE_CONSTANT = 58
+ELECTRIC_TIME = 59  # lag of the current [s]
+CURRENT_LIMIT = 60
+STALL_CURRENT = 61
+NO_LOAD_SPEED = 62
+POSITION_GAIN = 63  # A/rad
+RATE_GAIN = 64  # A·s/rad
+STOP_LOW = 65  # end stops of both joints [rad]
+STOP_HIGH = 67
+STOP_STIFFNESS = 69
+PRESENT = 70  # 1 where the tip takes part
+JOINTS_HELD = 72
+OBJECT_HELD = 73
+SCRIPT_SPEED = 74  # m/s of a held object's to and fro; 0 leaves it still
+SCRIPT_LEFT = 75  # how far it goes to the left [m], then to the right
+SCRIPT_RIGHT = 76
+SCRIPT_X = 77  # where it starts
+SAMPLE_PERIOD = 78
+PUSH = 79  # external force x, y [N] and torque [N·m] on the object
 
-# Columns of the goals (2, GOALS).
-MODE = 0
-TORQUE_ON = 1
-GOAL_Q = 2
-GOAL_CURRENT = 3
-GOALS = 4
+# Goals, one value for each joint.
+MODE = 82
+TORQUE_ON = 84
+GOAL_Q = 86
+GOAL_CURRENT = 88
 
-CURRENT_MODE = 0
-POSITION_MODE = 3
-CURRENT_BASED_POSITION_MODE = 5
+# Scratch: a row for each tip in both stages, then vectors.
+TIP = 90
+TIP_ROW = 28
+FORCES = 202  # on the five coordinates
+DRAG = 207
+LOAD = 212
+MATRIX = 217
+FIRST_X = 231  # and the currents' changes
+FIRST_V = 238
+SECOND_X = 243
+SECOND_V = 248
+MEMORY = 253  # length of the block
+
+# Places in a tip's row.
+D = 0  # normal displacement [m], negative is a gap
+THETA = 1  # tilt of the object against the tip [rad]
+GAIN = 2  # share of the tip that is on the face
+FORCE = 3  # total force on the tip's base, what a pressure grid sums to [N]
+ENERGY = 4  # elastic energy [J]
+RIM = 5  # how far the rim is pressed into the object [m], 0 when free
+NORMAL = 6  # N [N]
+TANGENTIAL = 7  # T [N]
+TIP_SHEAR = 8  # d_t within its limits [m]
+SHEAR_RATE = 9  # stick rate of d_t [m/s]
+JD = 10  # row of ∂d over (q, x, y, φ)
+JT = 14  # row of d_t's increments over (q, x, y, φ)
+Q = 18  # generalised forces on (q, x, y, φ)
+K_D = 22  # stiffness of the three rows d, θ, d_t
+K_THETA = 23
+K_T = 24
+C_D = 25  # damping of the three rows
+C_THETA = 26
+C_T = 27
 
 # Columns of the ring of samples.
 SAMPLE_SEQ = 0
@@ -77,13 +117,7 @@ SAMPLE_THETA = 4
 SAMPLE_GAIN = 6
 SAMPLE = 8
 
-# Rows of the work array (WORK_ROWS, tip.WORK): tips of both stages, then vectors.
-WORK_ROWS = 12
-FORCES = 4
-DRAG = 5
-FIRST_X = 6
-FIRST_V = 7
-SECOND_X = 8
-SECOND_V = 9
-MATRIX = 10
-RIGHT = 11
+# Operating modes, by the servos' own numbers.
+CURRENT_MODE = 0
+POSITION_MODE = 3
+CURRENT_BASED_POSITION_MODE = 5

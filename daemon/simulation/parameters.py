@@ -1,4 +1,4 @@
-"""From settings to the plant's parameter array, and the physical constants that no setting names.
+"""From settings to the plant's parameters, and the physical constants that no setting names.
 
 The defaults are this project's own choice of a plausible hand; they come from no publication.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from daemon.records import FINGERS
 from daemon.servos.models import by_name
 from daemon.settings import Settings, SettingsError
-from daemon.simulation import layout, tip
+from daemon.simulation import layout
 from kinematics.fingers import HandGeometry
 from kinematics.table import ContactTable
 
@@ -64,18 +64,17 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
-def parameters_of(settings: Settings, table: ContactTable, step: float) -> FloatArray:
-    """The plant's parameters [layout.PARAMETERS]. Raises SettingsError for an unknown servo."""
-    p = np.zeros(layout.PARAMETERS)
+def set_parameters(p: FloatArray, settings: Settings, table: ContactTable, step: float) -> None:
+    """Set the parameters in the plant's memory. Raises SettingsError for an unknown servo."""
     simulation = settings.simulation
     radius = settings.tip.radius
     modulus = float(table.data[3])
-    p[tip.RADIUS] = radius
-    p[tip.SCALE] = simulation.modulus_scale
-    p[tip.FRICTION] = simulation.tip_friction
-    p[tip.LOSS] = simulation.tip_loss
-    p[tip.RIM_STIFFNESS] = RIM_RATIO * math.pi * modulus * simulation.modulus_scale * radius
-    p[tip.D_MAX] = table.data[4] * radius * (1.0 - 1e-12)
+    p[layout.RADIUS] = radius
+    p[layout.SCALE] = simulation.modulus_scale
+    p[layout.FRICTION] = simulation.tip_friction
+    p[layout.LOSS] = simulation.tip_loss
+    p[layout.RIM_STIFFNESS] = RIM_RATIO * math.pi * modulus * simulation.modulus_scale * radius
+    p[layout.D_MAX] = table.data[4] * radius * (1.0 - 1e-12)
 
     p[layout.STEP] = step
     p[layout.HALF_SEPARATION] = 0.5 * settings.hand.pivot_separation
@@ -87,7 +86,6 @@ def parameters_of(settings: Settings, table: ContactTable, step: float) -> Float
         p[layout.PRESENT + FINGERS.index(name)] = 1.0
     _script(p, settings)
     p[layout.SAMPLE_PERIOD] = 1.0 / settings.tactile.rate
-    return p
 
 
 def _object(p: FloatArray, settings: Settings) -> None:

@@ -11,7 +11,7 @@ its secant, the motors' lag. Of the unknowns only the five accelerations are cou
 only through the object, so that a step costs two evaluations of the tips and one 3 × 3
 factorisation. Coulomb slip is a return of d_t into its limits at the start of a step.
 
-Only kernels live here; the forces are in forces.py, the layout of the arrays in layout.py.
+Only kernels live here; forces are in forces.py and tip.py, places in the memory in layout.py.
 """
 
 from __future__ import annotations
@@ -21,310 +21,307 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.simulation import tip as tips
-from daemon.simulation.forces import current_reference, evaluate_hand, script_place
-from daemon.simulation.layout import (
-    CONTACT_D,
-    CONTACT_FORCE,
-    CONTACT_GAIN,
-    CONTACT_NORMAL,
-    CONTACT_RIM,
-    CONTACT_TANGENTIAL,
-    CONTACT_THETA,
-    CURRENT,
-    CURRENT_LIMIT,
-    DRAG,
-    ELECTRIC_TIME,
-    FIRST_V,
-    FIRST_X,
-    FORCES,
-    INERTIA,
-    JOINT_INERTIA,
-    JOINTS_HELD,
-    MASS,
-    MATRIX,
-    OBJECT_HELD,
-    POSITION,
-    RIGHT,
-    SAMPLE_D,
-    SAMPLE_GAIN,
-    SAMPLE_PERIOD,
-    SAMPLE_SEQ,
-    SAMPLE_T,
-    SAMPLE_THETA,
-    SAMPLES,
-    SECOND_V,
-    SECOND_X,
-    SHEAR,
-    STEP,
-    STEPS,
-    STOP_HIGH,
-    STOP_LOW,
-    STOP_STIFFNESS,
-    TORQUE_CONSTANT,
-    VELOCITY,
+from daemon.simulation import layout
+from daemon.simulation.forces import (
+    current_reference,
+    evaluate_hand,
+    script_place,
+    stop_stiffness,
 )
 from kinematics.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
-
 _GAMMA = 1.0 - math.sqrt(0.5)
+_LATER = layout.TIP + 2 * layout.TIP_ROW  # the tips' rows of stage 2
 
 
 @kernel
-def factorise(position: FloatArray, params: FloatArray, work: FloatArray, g: float) -> None:
-    """Factorise M + gD + g²K of stage 1 into the matrix row; ``g`` = γh.
+def factorise(memory: FloatArray, g: float) -> None:
+    """Factorise M + gD + g²K of stage 1 into the matrix; ``g`` = γh.
 
     Places 0, 1: inverse joint pivots; 2-4 and 5-7: the joints' couplings to (x, y, φ); 8-13: the
     object's 3 × 3 Schur complement as L D Lᵀ (inverse d0, l10, l20, inverse d1, l21, inverse d2).
     """
-    m = work[MATRIX]
-    drag = work[DRAG]
-    a = params[MASS] + g * drag[2]
-    c = params[MASS] + g * drag[3]
-    f = params[INERTIA] + g * drag[4]
+    a = memory[layout.MASS] + g * memory[layout.DRAG + 2]
     b = 0.0
+    c = memory[layout.MASS] + g * memory[layout.DRAG + 3]
     d = 0.0
     e = 0.0
+    f = memory[layout.INERTIA] + g * memory[layout.DRAG + 4]
     for finger in range(2):
-        q = position[finger]
-        pivot = params[JOINT_INERTIA] + g * drag[finger]
-        if q < params[STOP_LOW + finger] or q > params[STOP_HIGH + finger]:
-            pivot += g * g * params[STOP_STIFFNESS]
-        out = work[finger]
+        row = layout.TIP + finger * layout.TIP_ROW
         side = 1.0 - 2.0 * finger
-        w_d = g * (out[tips.C_D] + g * out[tips.K_D])
-        w_theta = g * (out[tips.C_THETA] + g * out[tips.K_THETA])
-        w_t = g * (out[tips.C_T] + g * out[tips.K_T])
-        d0, d1, d2, d3 = out[tips.JD], out[tips.JD + 1], out[tips.JD + 2], out[tips.JD + 3]
-        t0, t1, t2, t3 = out[tips.JT], out[tips.JT + 1], out[tips.JT + 2], out[tips.JT + 3]
+        w_d = g * (memory[row + layout.C_D] + g * memory[row + layout.K_D])
+        w_theta = g * (memory[row + layout.C_THETA] + g * memory[row + layout.K_THETA])
+        w_t = g * (memory[row + layout.C_T] + g * memory[row + layout.K_T])
+        d0 = memory[row + layout.JD]
+        d1 = memory[row + layout.JD + 1]
+        d2 = memory[row + layout.JD + 2]
+        d3 = memory[row + layout.JD + 3]
+        t0 = memory[row + layout.JT]
+        t1 = memory[row + layout.JT + 1]
+        t2 = memory[row + layout.JT + 2]
+        t3 = memory[row + layout.JT + 3]
+        stop = stop_stiffness(memory, finger, memory[layout.POSITION + finger])
+        pivot = memory[layout.JOINT_INERTIA] + g * (memory[layout.DRAG + finger] + g * stop)
         pivot += w_d * d0 * d0 + w_theta + w_t * t0 * t0
-        inverse = 1.0 / pivot
-        if params[JOINTS_HELD] != 0.0:
-            inverse = 0.0
+        inverse = 0.0 if memory[layout.JOINTS_HELD] != 0.0 else 1.0 / pivot
         u0 = w_d * d0 * d1 + w_t * t0 * t1
         u1 = w_d * d0 * d2 + w_t * t0 * t2
         u2 = w_d * d0 * d3 + w_theta * side + w_t * t0 * t3
-        m[finger] = inverse
-        m[2 + 3 * finger] = u0
-        m[3 + 3 * finger] = u1
-        m[4 + 3 * finger] = u2
+        memory[layout.MATRIX + finger] = inverse
+        memory[layout.MATRIX + 2 + 3 * finger] = u0
+        memory[layout.MATRIX + 3 + 3 * finger] = u1
+        memory[layout.MATRIX + 4 + 3 * finger] = u2
         a += w_d * d1 * d1 + w_t * t1 * t1 - u0 * u0 * inverse
         b += w_d * d1 * d2 + w_t * t1 * t2 - u0 * u1 * inverse
         c += w_d * d2 * d2 + w_t * t2 * t2 - u1 * u1 * inverse
         d += w_d * d1 * d3 + w_t * t1 * t3 - u0 * u2 * inverse
         e += w_d * d2 * d3 + w_t * t2 * t3 - u1 * u2 * inverse
         f += w_d * d3 * d3 + w_theta + w_t * t3 * t3 - u2 * u2 * inverse
-    l10 = b / a
-    l20 = d / a
-    c -= l10 * b
-    l21 = (e - l10 * d) / c
-    f -= l20 * d + l21 * l21 * c
-    free = 0.0 if params[OBJECT_HELD] != 0.0 else 1.0
-    m[8] = free / a
-    m[9] = l10
-    m[10] = l20
-    m[11] = free / c
-    m[12] = l21
-    m[13] = free / f
+    free = 0.0 if memory[layout.OBJECT_HELD] != 0.0 else 1.0
+    first = 1.0 / a
+    l10 = b * first
+    l20 = d * first
+    second = 1.0 / (c - l10 * b)
+    rest = e - l10 * d
+    l21 = rest * second
+    memory[layout.MATRIX + 8] = free * first
+    memory[layout.MATRIX + 9] = l10
+    memory[layout.MATRIX + 10] = l20
+    memory[layout.MATRIX + 11] = free * second
+    memory[layout.MATRIX + 12] = l21
+    memory[layout.MATRIX + 13] = free / (f - l20 * d - l21 * rest)
 
 
 @kernel
-def solve(work: FloatArray, out: FloatArray) -> None:
-    """Solve the factorised matrix for the right row into ``out`` [5]; held parts stay 0."""
-    m = work[MATRIX]
-    r = work[RIGHT]
-    r0 = r[0] * m[0]
-    r1 = r[1] * m[1]
-    b0 = r[2] - m[2] * r0 - m[5] * r1
-    b1 = r[3] - m[3] * r0 - m[6] * r1 - m[9] * b0
-    b2 = r[4] - m[4] * r0 - m[7] * r1 - m[10] * b0 - m[12] * b1
-    z2 = b2 * m[13]
-    z1 = b1 * m[11] - m[12] * z2
-    z0 = b0 * m[8] - m[9] * z1 - m[10] * z2
-    if m[8] == 0.0:
-        z0 = 0.0
-        z1 = 0.0
-        z2 = 0.0
-    out[2] = z0
-    out[3] = z1
-    out[4] = z2
-    out[0] = r0 - m[0] * (m[2] * z0 + m[3] * z1 + m[4] * z2)
-    out[1] = r1 - m[1] * (m[5] * z0 + m[6] * z1 + m[7] * z2)
+def solve(memory: FloatArray, out: int) -> None:
+    """Solve the factorised matrix for the load; five results from ``out`` on, held parts 0."""
+    m = layout.MATRIX
+    r0 = memory[layout.LOAD] * memory[m]
+    r1 = memory[layout.LOAD + 1] * memory[m + 1]
+    b0 = memory[layout.LOAD + 2] - memory[m + 2] * r0 - memory[m + 5] * r1
+    b1 = memory[layout.LOAD + 3] - memory[m + 3] * r0 - memory[m + 6] * r1
+    b2 = memory[layout.LOAD + 4] - memory[m + 4] * r0 - memory[m + 7] * r1
+    b1 -= memory[m + 9] * b0
+    b2 -= memory[m + 10] * b0 + memory[m + 12] * b1
+    z2 = b2 * memory[m + 13]
+    z1 = b1 * memory[m + 11] - memory[m + 12] * z2
+    z0 = b0 * memory[m + 8] - memory[m + 9] * z1 - memory[m + 10] * z2
+    memory[out] = r0 - memory[m] * (memory[m + 2] * z0 + memory[m + 3] * z1 + memory[m + 4] * z2)
+    memory[out + 1] = r1 - memory[m + 1] * (
+        memory[m + 5] * z0 + memory[m + 6] * z1 + memory[m + 7] * z2
+    )
+    memory[out + 2] = z0
+    memory[out + 3] = z1
+    memory[out + 4] = z2
 
 
 @kernel
-def take_stiffness(
-    work: FloatArray, along: FloatArray, shear1: float, shear2: float, g: float
-) -> None:
-    """Take g K r from the right row, K of stage 1: r is ``along`` [5] and both shears' parts."""
-    right = work[RIGHT]
+def take_stiffness(memory: FloatArray, along: int, shear1: float, shear2: float, g: float) -> None:
+    """Take g K r from the load, K of stage 1; r stands from ``along`` on, then both shears."""
     for finger in range(2):
-        out = work[finger]
-        if out[tips.K_D] == 0.0:
-            continue
+        row = layout.TIP + finger * layout.TIP_ROW
         side = 1.0 - 2.0 * finger
-        rate_d = out[tips.JD] * along[finger]
-        for j in range(3):
-            rate_d += out[tips.JD + 1 + j] * along[2 + j]
-        by_d = g * out[tips.K_D] * rate_d
-        by_theta = g * out[tips.K_THETA] * (side * along[finger] + along[4])
-        by_t = g * out[tips.K_T] * (shear1 if finger == 0 else shear2)
-        right[finger] -= out[tips.JD] * by_d + side * by_theta + out[tips.JT] * by_t
-        for j in range(3):
-            right[2 + j] -= out[tips.JD + 1 + j] * by_d + out[tips.JT + 1 + j] * by_t
-        right[4] -= by_theta
+        turn = memory[along + 4]
+        d0 = memory[row + layout.JD]
+        d1 = memory[row + layout.JD + 1]
+        d2 = memory[row + layout.JD + 2]
+        d3 = memory[row + layout.JD + 3]
+        rate_q = memory[along + finger]
+        rate_d = d0 * rate_q + d1 * memory[along + 2] + d2 * memory[along + 3] + d3 * turn
+        by_d = g * memory[row + layout.K_D] * rate_d
+        by_theta = g * memory[row + layout.K_THETA] * (side * rate_q + turn)
+        by_t = g * memory[row + layout.K_T] * (shear1 if finger == 0 else shear2)
+        memory[layout.LOAD + finger] -= d0 * by_d + side * by_theta + memory[row + layout.JT] * by_t
+        memory[layout.LOAD + 2] -= d1 * by_d + memory[row + layout.JT + 1] * by_t
+        memory[layout.LOAD + 3] -= d2 * by_d + memory[row + layout.JT + 2] * by_t
+        memory[layout.LOAD + 4] -= d3 * by_d + by_theta + memory[row + layout.JT + 3] * by_t
 
 
 @kernel
-def shear_along(out: FloatArray, finger: int, along: FloatArray) -> float:
-    """Rate of the tip's d_t for the coordinates' rates ``along`` [5], with stage 1's row."""
+def shear_along(memory: FloatArray, finger: int, along: int) -> float:
+    """Rate of a tip's d_t by stage 1's row for the coordinates' rates from ``along`` on."""
+    row = layout.TIP + finger * layout.TIP_ROW + layout.JT
     rate: float = (
-        out[tips.JT] * along[finger]
-        + out[tips.JT + 1] * along[2]
-        + out[tips.JT + 2] * along[3]
-        + out[tips.JT + 3] * along[4]
+        memory[row] * memory[along + finger]
+        + memory[row + 1] * memory[along + 2]
+        + memory[row + 2] * memory[along + 3]
+        + memory[row + 3] * memory[along + 4]
     )
     return rate
 
 
 @kernel
-def record(state: FloatArray, params: FloatArray, work: FloatArray, ring: FloatArray) -> None:
-    """Write stage 1's tips into the state, and due samples, interpolated, into the ring."""
-    h = params[STEP]
-    t = state[STEPS] * h
-    due = state[SAMPLES] * params[SAMPLE_PERIOD]
-    while due <= t:
-        back = min((t - due) / h, 1.0)
-        row = ring[int(state[SAMPLES]) % ring.shape[0]]
-        row[SAMPLE_SEQ] = state[SAMPLES]
-        row[SAMPLE_T] = due
-        for finger in range(2):
-            out = work[finger]
-            for place, before, now in (
-                (SAMPLE_D, CONTACT_D, tips.D),
-                (SAMPLE_THETA, CONTACT_THETA, tips.THETA),
-                (SAMPLE_GAIN, CONTACT_GAIN, tips.GAIN),
-            ):
-                row[place + finger] = out[now] - back * (out[now] - state[before + finger])
-        state[SAMPLES] += 1.0
-        due = state[SAMPLES] * params[SAMPLE_PERIOD]
+def sample(memory: FloatArray, ring: FloatArray) -> None:
+    """Write the sample that is due into ``ring``, between the recorded tips and stage 1's."""
+    h = memory[layout.STEP]
+    number = memory[layout.SAMPLES]
+    due = number * memory[layout.SAMPLE_PERIOD]
+    back = min((memory[layout.STEPS] * h - due) / h, 1.0)
+    at = int(number) % ring.shape[0]
+    ring[at, layout.SAMPLE_SEQ] = number
+    ring[at, layout.SAMPLE_T] = due
     for finger in range(2):
-        out = work[finger]
-        state[SHEAR + finger] = out[tips.SHEAR]
-        state[CONTACT_D + finger] = out[tips.D]
-        state[CONTACT_THETA + finger] = out[tips.THETA]
-        state[CONTACT_GAIN + finger] = out[tips.GAIN]
-        state[CONTACT_FORCE + finger] = out[tips.FORCE]
-        state[CONTACT_NORMAL + finger] = out[tips.NORMAL]
-        state[CONTACT_TANGENTIAL + finger] = out[tips.TANGENTIAL]
-        state[CONTACT_RIM + finger] = out[tips.RIM]
+        row = layout.TIP + finger * layout.TIP_ROW
+        for place, before, now in (
+            (layout.SAMPLE_D, layout.CONTACT_D, layout.D),
+            (layout.SAMPLE_THETA, layout.CONTACT_THETA, layout.THETA),
+            (layout.SAMPLE_GAIN, layout.CONTACT_GAIN, layout.GAIN),
+        ):
+            change = memory[row + now] - memory[before + finger]
+            ring[at, place + finger] = memory[row + now] - back * change
+    memory[layout.SAMPLES] = number + 1.0
 
 
 @kernel
-def step(
-    state: FloatArray,
-    params: FloatArray,
-    goals: FloatArray,
-    data: FloatArray,
-    ring: FloatArray,
-    work: FloatArray,
-    count: int,
-) -> None:
-    """Advance ``state`` [STATE] in place by ``count`` sub-steps; the tips' truth is then current.
+def settle(memory: FloatArray, ring: FloatArray) -> None:
+    """Take the samples that fall due at the state's instant, then record what the tips feel."""
+    while (
+        memory[layout.SAMPLES] * memory[layout.SAMPLE_PERIOD]
+        <= memory[layout.STEPS] * memory[layout.STEP]
+    ):
+        sample(memory, ring)
+    for finger in range(2):
+        row = layout.TIP + finger * layout.TIP_ROW
+        memory[layout.SHEAR + finger] = memory[row + layout.TIP_SHEAR]
+        memory[layout.CONTACT_D + finger] = memory[row + layout.D]
+        memory[layout.CONTACT_THETA + finger] = memory[row + layout.THETA]
+        memory[layout.CONTACT_GAIN + finger] = memory[row + layout.GAIN]
+        memory[layout.CONTACT_FORCE + finger] = memory[row + layout.FORCE]
+        memory[layout.CONTACT_NORMAL + finger] = memory[row + layout.NORMAL]
+        memory[layout.CONTACT_TANGENTIAL + finger] = memory[row + layout.TANGENTIAL]
+        memory[layout.CONTACT_RIM + finger] = memory[row + layout.RIM]
+        memory[layout.CONTACT_ENERGY + finger] = memory[row + layout.ENERGY]
 
-    ``params`` [PARAMETERS], ``goals`` (2, GOALS), ``data`` the contact table, ``ring`` (n, SAMPLE)
-    takes the samples that fall due, ``work`` (WORK_ROWS, tips.WORK) is scratch.
+
+@kernel
+def first_stage(memory: FloatArray, g: float) -> tuple[float, float]:
+    """k1 of the coordinates, velocities and currents into FIRST_X, FIRST_V; that of the shears."""
+    factorise(memory, g)
+    for j in range(5):
+        memory[layout.LOAD + j] = memory[layout.FORCES + j]
+    for j in range(2):
+        q = memory[layout.POSITION + j]
+        rate = memory[layout.VELOCITY + j]
+        current = memory[layout.CURRENT + j]
+        reference = current_reference(memory, j, q, rate)
+        change = (reference - current) / (memory[layout.ELECTRIC_TIME] + g)
+        memory[layout.FIRST_X + 5 + j] = change
+        memory[layout.LOAD + j] += (
+            memory[layout.TORQUE_CONSTANT] * (current + g * change)
+            - g * stop_stiffness(memory, j, q) * rate
+        )
+    rate1 = memory[layout.TIP + layout.SHEAR_RATE]
+    rate2 = memory[layout.TIP + layout.TIP_ROW + layout.SHEAR_RATE]
+    take_stiffness(memory, layout.VELOCITY, rate1, rate2, g)
+    solve(memory, layout.FIRST_V)
+    for j in range(5):
+        memory[layout.FIRST_X + j] = memory[layout.VELOCITY + j] + g * memory[layout.FIRST_V + j]
+    return (
+        rate1 + g * shear_along(memory, 0, layout.FIRST_V),
+        rate2 + g * shear_along(memory, 1, layout.FIRST_V),
+    )
+
+
+@kernel
+def second_stage(memory: FloatArray, shear1: float, shear2: float, h: float, g: float) -> None:
+    """k2 and the step itself, from stage 2's forces; ``shear1``, ``shear2`` are the shears' k1."""
+    lag = memory[layout.ELECTRIC_TIME]
+    for j in range(5):
+        inertia = memory[layout.MASS]
+        if j < 2:
+            inertia = memory[layout.JOINT_INERTIA]
+        elif j == 4:
+            inertia = memory[layout.INERTIA]
+        memory[layout.LOAD + j] = (
+            memory[layout.FORCES + j] - 2.0 * inertia * memory[layout.FIRST_V + j]
+        )
+    for j in range(2):
+        before = memory[layout.FIRST_X + 5 + j]
+        current = memory[layout.CURRENT + j] + h * before
+        rate = memory[layout.SECOND_V + j]
+        reference = current_reference(memory, j, memory[layout.SECOND_X + j], rate)
+        change = (reference - current - 2.0 * lag * before) / (lag + g)
+        memory[layout.CURRENT + j] += h * (1.5 * before + 0.5 * change)
+        stop = stop_stiffness(memory, j, memory[layout.POSITION + j])
+        memory[layout.LOAD + j] += memory[layout.TORQUE_CONSTANT] * (
+            current + g * change
+        ) - g * stop * (rate - 2.0 * memory[layout.FIRST_X + j])
+    for j in range(5):
+        memory[layout.SECOND_X + j] = memory[layout.SECOND_V + j] - 2.0 * memory[layout.FIRST_X + j]
+    later1 = memory[_LATER + layout.SHEAR_RATE] - 2.0 * shear1
+    later2 = memory[_LATER + layout.TIP_ROW + layout.SHEAR_RATE] - 2.0 * shear2
+    take_stiffness(memory, layout.SECOND_X, later1, later2, g)
+    solve(memory, layout.SECOND_V)
+    later1 += g * shear_along(memory, 0, layout.SECOND_V)
+    later2 += g * shear_along(memory, 1, layout.SECOND_V)
+    memory[layout.SHEAR] += h * (1.5 * shear1 + 0.5 * later1)
+    memory[layout.SHEAR + 1] += h * (1.5 * shear2 + 0.5 * later2)
+    first = 2 if memory[layout.JOINTS_HELD] != 0.0 else 0
+    last = 2 if memory[layout.OBJECT_HELD] != 0.0 else 5
+    for j in range(first, last):
+        later = memory[layout.SECOND_X + j] + g * memory[layout.SECOND_V + j]
+        memory[layout.POSITION + j] += h * (1.5 * memory[layout.FIRST_X + j] + 0.5 * later)
+        memory[layout.VELOCITY + j] += h * (
+            1.5 * memory[layout.FIRST_V + j] + 0.5 * memory[layout.SECOND_V + j]
+        )
+
+
+@kernel
+def step(memory: FloatArray, data: FloatArray, ring: FloatArray, count: int) -> None:
+    """Advance the plant in ``memory`` by ``count`` sub-steps; the tips' truth is then current.
+
+    ``data`` is the contact table; ``ring`` (n, layout.SAMPLE) takes the samples that fall due.
     """
-    h = params[STEP]
+    h = memory[layout.STEP]
     g = _GAMMA * h
-    lag = params[ELECTRIC_TIME]
-    constant = params[TORQUE_CONSTANT]
-    limit = params[CURRENT_LIMIT]
-    position = state[POSITION : POSITION + 5]
-    velocity = state[VELOCITY : VELOCITY + 5]
-    forces = work[FORCES]
-    right = work[RIGHT]
-    x1 = work[FIRST_X]
-    v1 = work[FIRST_V]
-    x2 = work[SECOND_X]
-    v2 = work[SECOND_V]
-    joints_move = params[JOINTS_HELD] == 0.0
-    object_moves = params[OBJECT_HELD] == 0.0
+    held = memory[layout.OBJECT_HELD] != 0.0
     for _ in range(count):
-        if not object_moves:
-            t = state[STEPS] * h
-            velocity[2] = (script_place(t + h, params) - script_place(t, params)) / h
-        # Stage 1. Slip: evaluate_hand returns the shears within their limits.
+        if held:
+            t = memory[layout.STEPS] * h
+            way = script_place(memory, t + h) - script_place(memory, t)
+            memory[layout.VELOCITY + 2] = way / h
+        # Slip: the shears come back within their limits, and settle keeps them there.
         evaluate_hand(
-            position, velocity, state, state[SHEAR], state[SHEAR + 1], params, data, work, 0
-        )
-        record(state, params, work, ring)
-        factorise(position, params, work, g)
-        shear_rate1 = work[0, tips.SHEAR_RATE]
-        shear_rate2 = work[1, tips.SHEAR_RATE]
-        for j in range(5):
-            right[j] = forces[j]
-        for j in range(2):
-            reference = current_reference(goals[j], position[j], velocity[j], limit, params)
-            current = state[CURRENT + j]
-            change = (reference - current) / (lag + g)
-            x1[5 + j] = change
-            right[j] += constant * (current + g * change)
-            if position[j] < params[STOP_LOW + j] or position[j] > params[STOP_HIGH + j]:
-                right[j] -= g * params[STOP_STIFFNESS] * velocity[j]
-        take_stiffness(work, velocity, shear_rate1, shear_rate2, g)
-        solve(work, v1)
-        shear_k1 = shear_rate1 + g * shear_along(work[0], 0, v1)
-        shear_k2 = shear_rate2 + g * shear_along(work[1], 1, v1)
-        for j in range(5):
-            x1[j] = velocity[j] + g * v1[j]
-            x2[j] = position[j] + h * x1[j]
-            v2[j] = velocity[j] + h * v1[j]
-
-        # Stage 2.
-        evaluate_hand(
-            x2,
-            v2,
-            state,
-            state[SHEAR] + h * shear_k1,
-            state[SHEAR + 1] + h * shear_k2,
-            params,
+            memory,
             data,
-            work,
-            2,
+            layout.POSITION,
+            layout.VELOCITY,
+            layout.TIP,
+            memory[layout.SHEAR],
+            memory[layout.SHEAR + 1],
         )
-        right[0] = forces[0] - 2.0 * params[JOINT_INERTIA] * v1[0]
-        right[1] = forces[1] - 2.0 * params[JOINT_INERTIA] * v1[1]
-        right[2] = forces[2] - 2.0 * params[MASS] * v1[2]
-        right[3] = forces[3] - 2.0 * params[MASS] * v1[3]
-        right[4] = forces[4] - 2.0 * params[INERTIA] * v1[4]
-        for j in range(2):
-            current = state[CURRENT + j] + h * x1[5 + j]
-            reference = current_reference(goals[j], x2[j], v2[j], limit, params)
-            change = (reference - current - 2.0 * lag * x1[5 + j]) / (lag + g)
-            right[j] += constant * (current + g * change)
-            state[CURRENT + j] += h * (1.5 * x1[5 + j] + 0.5 * change)
-            if position[j] < params[STOP_LOW + j] or position[j] > params[STOP_HIGH + j]:
-                right[j] -= g * params[STOP_STIFFNESS] * (v2[j] - 2.0 * x1[j])
+        settle(memory, ring)
+        shear1, shear2 = first_stage(memory, g)
         for j in range(5):
-            x2[j] = v2[j] - 2.0 * x1[j]
-        shear_rate1 = work[2, tips.SHEAR_RATE] - 2.0 * shear_k1
-        shear_rate2 = work[3, tips.SHEAR_RATE] - 2.0 * shear_k2
-        take_stiffness(work, x2, shear_rate1, shear_rate2, g)
-        solve(work, v2)
-        shear_rate1 += g * shear_along(work[0], 0, v2)
-        shear_rate2 += g * shear_along(work[1], 1, v2)
-        state[SHEAR] += h * (1.5 * shear_k1 + 0.5 * shear_rate1)
-        state[SHEAR + 1] += h * (1.5 * shear_k2 + 0.5 * shear_rate2)
-        for j in range(5):
-            moves = joints_move if j < 2 else object_moves
-            if moves:
-                position[j] += h * (1.5 * x1[j] + 0.5 * (x2[j] + g * v2[j]))
-                velocity[j] += h * (1.5 * v1[j] + 0.5 * v2[j])
-        state[STEPS] += 1.0
-        if not object_moves:
-            position[2] = script_place(state[STEPS] * h, params)
-    evaluate_hand(position, velocity, state, state[SHEAR], state[SHEAR + 1], params, data, work, 0)
-    record(state, params, work, ring)
+            memory[layout.SECOND_X + j] = (
+                memory[layout.POSITION + j] + h * memory[layout.FIRST_X + j]
+            )
+            memory[layout.SECOND_V + j] = (
+                memory[layout.VELOCITY + j] + h * memory[layout.FIRST_V + j]
+            )
+        evaluate_hand(
+            memory,
+            data,
+            layout.SECOND_X,
+            layout.SECOND_V,
+            _LATER,
+            memory[layout.SHEAR] + h * shear1,
+            memory[layout.SHEAR + 1] + h * shear2,
+        )
+        second_stage(memory, shear1, shear2, h, g)
+        memory[layout.STEPS] += 1.0
+        if held:
+            memory[layout.POSITION + 2] = script_place(memory, memory[layout.STEPS] * h)
+    evaluate_hand(
+        memory,
+        data,
+        layout.POSITION,
+        layout.VELOCITY,
+        layout.TIP,
+        memory[layout.SHEAR],
+        memory[layout.SHEAR + 1],
+    )
+    settle(memory, ring)

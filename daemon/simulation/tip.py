@@ -24,41 +24,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.simulation import layout
 from kinematics.kernels import kernel
 from kinematics.table import lookup
 
 FloatArray = NDArray[np.float64]
-
-# Places in a tip's row of the work array.
-D = 0  # normal displacement [m], negative is a gap
-THETA = 1  # tilt of the object against the tip [rad]
-GAIN = 2  # w(s): share of the tip that is on the face
-FORCE = 3  # total force on the tip's base, what a pressure grid sums to [N]
-ENERGY = 4  # elastic energy [J]
-RIM = 5  # how far the rim is pressed into the object [m], 0 when free
-NORMAL = 6  # N [N]
-TANGENTIAL = 7  # T [N]
-SHEAR = 8  # d_t within its limits [m]
-SHEAR_RATE = 9  # stick rate of d_t [m/s]
-JD = 10  # row of ∂d over (q, x, y, φ)
-JT = 14  # row of d_t's increments over (q, x, y, φ)
-Q = 18  # generalised forces on (q, x, y, φ)
-K_D = 22  # stiffness of the three rows d, θ, d_t
-K_THETA = 23
-K_T = 24
-C_D = 25  # damping of the three rows
-C_THETA = 26
-C_T = 27
-WORK = 28
-
-# Places in the tip's part of the parameters.
-RADIUS = 0
-SCALE = 1  # real modulus over the table's
-FRICTION = 2
-LOSS = 3  # damping over stiffness [s]
-RIM_STIFFNESS = 4
-D_MAX = 5  # largest d the table answers [m]
-TIP_PARAMETERS = 6
 
 _D_MIN = 1e-9  # m, less is no contact
 _THETA_MAX = 1.3  # beyond this tilt only the rim is left, the soft part no longer changes with θ
@@ -109,7 +79,11 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 @kernel
 def evaluate_tip(
-    side: float,
+    memory: FloatArray,
+    data: FloatArray,
+    row: int,
+    finger: int,
+    velocity: int,
     cq: float,
     sq: float,
     vx: float,
@@ -119,22 +93,16 @@ def evaluate_tip(
     nx: float,
     ny: float,
     face: int,
-    half_width: float,
-    half_height: float,
     shear: float,
-    q_rate: float,
-    x_rate: float,
-    y_rate: float,
-    turn_rate: float,
-    tip: FloatArray,
-    data: FloatArray,
-    out: FloatArray,
 ) -> None:
-    """Fill ``out`` [WORK] for one tip.
+    """Fill the tip's ``row`` of the plant's ``memory``; ``velocity`` is where the velocities are.
 
     ``cq``, ``sq`` are cosine and sine of the joint angle, (vx, vy) the tip centre's derivative by
     it, (rx, ry) the tip's centre from the object's, (nx, ny) the object's n; ``shear`` is d_t.
     """
+    side = 1.0 - 2.0 * finger
+    half_width = memory[layout.HALF_WIDTH]
+    half_height = memory[layout.HALF_HEIGHT]
     # Inward normal m of the face, along which the tip presses, and the face's direction.
     if face == 0:
         mx, my = nx, ny
@@ -147,7 +115,7 @@ def evaluate_tip(
     upright = face == 0 or face == 2
     half_depth = half_width if upright else half_height
     half_face = half_height if upright else half_width
-    radius = tip[RADIUS]
+    radius = memory[layout.RADIUS]
     depth = rx * mx + ry * my
     s = ry * mx - rx * my
     d = radius + half_depth + depth
@@ -159,17 +127,18 @@ def evaluate_tip(
     theta = math.atan2(sine, cosine)
     fade = min(0.25 * radius, 0.9 * half_face)
     gain, gain_slope = edge_window(s, half_face, fade)
-    out[D] = d
-    out[THETA] = theta
-    out[GAIN] = gain
+    memory[row + layout.D] = d
+    memory[row + layout.THETA] = theta
+    memory[row + layout.GAIN] = gain
     if d <= _D_MIN or gain <= 0.0:
-        out[FORCE:WORK] = 0.0
+        for place in range(layout.FORCE, layout.TIP_ROW):
+            memory[row + place] = 0.0
         return
 
     # The rim, then the soft part within its range; d_soft_d, d_soft_theta are d_soft's derivatives.
     rim = max(d - radius * (1.0 - abs(sine)), 0.0)
     rim_theta = radius * cosine if sine >= 0.0 else -radius * cosine
-    rim_force = tip[RIM_STIFFNESS] * rim
+    rim_force = memory[layout.RIM_STIFFNESS] * rim
     turning = 1.0  # dθ_soft/dθ
     if abs(theta) > _THETA_MAX:
         turning = 0.0
@@ -183,46 +152,55 @@ def evaluate_tip(
         d_soft = radius * (1.0 - abs(sine))
         d_soft_d = 0.0
         d_soft_theta = -radius * cosine if sine >= 0.0 else radius * cosine
-    if d_soft > tip[D_MAX]:
-        d_soft = tip[D_MAX]
+    if d_soft > memory[layout.D_MAX]:
+        d_soft = memory[layout.D_MAX]
         d_soft_d = 0.0
         d_soft_theta = 0.0
     force, energy, force_d, force_theta, _, energy_theta, _ = lookup(data, d_soft, theta)
-    scale = tip[SCALE]
+    scale = memory[layout.SCALE]
     force *= scale
     force_d *= scale
     force_theta *= scale
     # ∂U₀/∂d = F/cos θ for every material; beyond the range U₀ goes on along that slope.
-    slope = force / cosine
-    tangent = sine / cosine
+    inverse_cosine = 1.0 / cosine
+    inverse_d = 1.0 / d_soft
+    tangent = sine * inverse_cosine
+    slope = force * inverse_cosine
     over = d - d_soft
     energy = scale * energy + slope * over
     energy_theta = (
         scale * energy_theta
-        + (force_theta + force * tangent + force_d * d_soft_theta) / cosine * over
+        + (force_theta + force * tangent + force_d * d_soft_theta) * inverse_cosine * over
     )
 
     # T and N are polynomials of the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
-    ratio = cosine / d_soft
+    ratio = cosine * inverse_d
     t0 = force * sine
     t1 = 2.0 * force * ratio
     n0 = slope - t0 * tangent + rim_force
     n1 = d_soft_d * force_d * sine - t1 * tangent
-    n2 = d_soft_d * ratio * (force_d - force / d_soft)
-    neutral = -t0 / t1
-    bend = max(n2, 0.25 * force * ratio / d_soft)
+    n2 = d_soft_d * ratio * (force_d - force * inverse_d)
+    bend = max(n2, 0.25 * force * ratio * inverse_d)
+    neutral = -0.5 * tangent * d_soft  # where T = 0
     at_neutral = n0 + neutral * (n1 + neutral * n2)
-    slope_there = n1 + 2.0 * n2 * neutral
-    highest = neutral + shear_limit(t1, at_neutral, slope_there, bend, tip[FRICTION])
-    lowest = neutral - shear_limit(t1, at_neutral, -slope_there, bend, tip[FRICTION])
-    shear = min(max(shear, lowest), highest)
-    normal = gain * (n0 + shear * (n1 + shear * n2))
-    tangential = gain * (t0 + t1 * shear)
+    # Most steps are far from slip, which two comparisons tell.
+    normal = n0 + shear * (n1 + shear * n2)
+    tangential = t0 + t1 * shear
+    friction = memory[layout.FRICTION]
+    if abs(tangential) > friction * normal or bend * (shear - neutral) ** 2 > at_neutral:
+        slope_there = n1 + 2.0 * n2 * neutral
+        highest = neutral + shear_limit(t1, at_neutral, slope_there, bend, friction)
+        lowest = neutral - shear_limit(t1, at_neutral, -slope_there, bend, friction)
+        shear = min(max(shear, lowest), highest)
+        normal = n0 + shear * (n1 + shear * n2)
+        tangential = t0 + t1 * shear
+    normal *= gain
+    tangential *= gain
 
     # U's second term G and its derivatives.
     stretch = sine * shear + ratio * shear * shear
-    by_soft = force_d * stretch - force * ratio / d_soft * shear * shear
-    by_theta = force_theta * stretch + force * shear * (cosine - sine / d_soft * shear)
+    by_soft = force_d * stretch - force * ratio * inverse_d * shear * shear
+    by_theta = force_theta * stretch + force * shear * (cosine - sine * inverse_d * shear)
     energy += force * stretch + 0.5 * rim_force * rim
     along_d = gain * (slope + d_soft_d * by_soft + rim_force)
     along_theta = gain * (
@@ -238,52 +216,56 @@ def evaluate_tip(
     t_x = -my + tangent * mx
     t_y = mx + tangent * my
     t_turn = arm + depth - tangent * s
+    q_rate = memory[velocity + finger]
+    x_rate = memory[velocity + 2]
+    y_rate = memory[velocity + 3]
+    turn_rate = memory[velocity + 4]
     rate_d = d_q * q_rate - mx * x_rate - my * y_rate + s * turn_rate
     rate_t = t_q * q_rate + t_x * x_rate + t_y * y_rate + t_turn * turn_rate
     rate_theta = side * q_rate + turn_rate
 
     # Losses: a tip that leaves doesn't pull, and shear's loss stays within friction.
-    stiffness_d = gain * force_d / cosine
-    stiffness_theta = turning * gain * force * d_soft / (1.5 * cosine * cosine)
+    stiffness_d = gain * force_d * inverse_cosine
+    stiffness_theta = turning * gain * slope * inverse_cosine * d_soft * (2.0 / 3.0)
     stiffness_t = gain * t1
     if rim > 0.0:
         # The rim's row is that of d plus rim_theta times that of θ: twice each bounds it.
-        stiffness_d += 2.0 * gain * tip[RIM_STIFFNESS]
-        stiffness_theta += 2.0 * gain * tip[RIM_STIFFNESS] * rim_theta * rim_theta
-    loss_d = tip[LOSS] * stiffness_d
+        stiffness_d += 2.0 * gain * memory[layout.RIM_STIFFNESS]
+        stiffness_theta += 2.0 * gain * memory[layout.RIM_STIFFNESS] * rim_theta * rim_theta
+    loss_d = memory[layout.LOSS] * stiffness_d
     if rate_d < 0.0:
         loss_d = min(loss_d, max(normal, 0.0) / -rate_d)
-    loss_theta = tip[LOSS] * stiffness_theta
-    loss_t = tip[LOSS] * stiffness_t
+    loss_theta = memory[layout.LOSS] * stiffness_theta
+    loss_t = memory[layout.LOSS] * stiffness_t
     if rate_t != 0.0:
         opposed = tangential if rate_t > 0.0 else -tangential
-        loss_t = min(loss_t, max(tip[FRICTION] * normal - opposed, 0.0) / abs(rate_t))
+        loss_t = min(loss_t, max(memory[layout.FRICTION] * normal - opposed, 0.0) / abs(rate_t))
     along_d += loss_d * rate_d
     along_theta += loss_theta * rate_theta
     along_t = tangential + loss_t * rate_t
 
-    out[FORCE] = gain * force
-    out[ENERGY] = gain * energy
-    out[RIM] = rim
-    out[NORMAL] = normal
-    out[TANGENTIAL] = tangential
-    out[SHEAR] = shear
-    out[SHEAR_RATE] = rate_t
-    out[JD] = d_q
-    out[JD + 1] = -mx
-    out[JD + 2] = -my
-    out[JD + 3] = s
-    out[JT] = t_q
-    out[JT + 1] = t_x
-    out[JT + 2] = t_y
-    out[JT + 3] = t_turn
-    out[Q] = -(along_d * d_q + along_theta * side + along_t * t_q + along_s * s_q)
-    out[Q + 1] = along_d * mx - along_t * t_x - along_s * my
-    out[Q + 2] = along_d * my - along_t * t_y + along_s * mx
-    out[Q + 3] = -(along_d * s + along_theta + along_t * t_turn - along_s * depth)
-    out[K_D] = stiffness_d
-    out[K_THETA] = stiffness_theta
-    out[K_T] = stiffness_t
-    out[C_D] = loss_d
-    out[C_THETA] = loss_theta
-    out[C_T] = loss_t
+    memory[row + layout.FORCE] = gain * force
+    memory[row + layout.ENERGY] = gain * energy
+    memory[row + layout.RIM] = rim
+    memory[row + layout.NORMAL] = normal
+    memory[row + layout.TANGENTIAL] = tangential
+    memory[row + layout.TIP_SHEAR] = shear
+    memory[row + layout.SHEAR_RATE] = rate_t
+    memory[row + layout.JD] = d_q
+    memory[row + layout.JD + 1] = -mx
+    memory[row + layout.JD + 2] = -my
+    memory[row + layout.JD + 3] = s
+    memory[row + layout.JT] = t_q
+    memory[row + layout.JT + 1] = t_x
+    memory[row + layout.JT + 2] = t_y
+    memory[row + layout.JT + 3] = t_turn
+    memory[row + layout.Q] = -(along_d * d_q + along_theta * side + along_t * t_q + along_s * s_q)
+    memory[row + layout.Q + 1] = along_d * mx - along_t * t_x - along_s * my
+    memory[row + layout.Q + 2] = along_d * my - along_t * t_y + along_s * mx
+    memory[row + layout.Q + 3] = -(along_d * s + along_theta + along_t * t_turn - along_s * depth)
+    memory[row + layout.K_D] = stiffness_d
+    memory[row + layout.K_THETA] = stiffness_theta
+    memory[row + layout.K_T] = stiffness_t
+    memory[row + layout.C_D] = loss_d
+    memory[row + layout.C_THETA] = loss_theta
+    memory[row + layout.C_T] = loss_t
