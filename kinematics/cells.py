@@ -14,17 +14,24 @@ from kinematics.footprint import (
     GAUSS_NODES,
     GAUSS_WEIGHTS,
     FloatArray,
+    Ends,
     Geometry,
+    Span,
     beyond_limit,
-    extremes,
     line_span,
 )
-from kinematics.kernels import kernel
+from kinematics.kernels import fast_kernel, kernel
 from kinematics.material import stress_at
 
 # Strips of one cell: up to 2 crossings of the outline with each side, 2 more of the base plane with
 # the face, the cell's own two ends.
 MAX_BREAKS = 12
+
+# Rows of the nodes.
+X, Y, WEIGHT, STRAIN, STRESS = range(5)
+NODE_ROWS = 5
+ANGLE_NODES = 10
+NODES_A_CELL = (MAX_BREAKS - 1) * ANGLE_NODES * 2 * ANGLE_NODES
 
 
 @kernel
@@ -49,67 +56,80 @@ def nodes_needed(a: float, half: float, far: float) -> int:
 
 
 @kernel
-def line_stress(
-    law: FloatArray,
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    y: float,
-    left: float,
-    right: float,
-    n: int,
-) -> float:
-    """∫ σ(ε) dx [Pa m] on the line ``y`` from ``left`` to ``right``, which lie in the footprint.
+def push_line(
+    nodes: FloatArray, count: int, a: float, y: float, left: float, right: float, n: int, w: float
+) -> int:
+    """Add the nodes of ∫ dx on the line ``y`` from ``left`` to ``right``, times ``w``.
 
-    With n = 0 the variable is the angle t of x = R sin t: σ(ε)√(a² − x² − y²) dt stays smooth at
-    the rim where σ(ε) dx does not.
+    ``nodes`` has the rows X, Y and WEIGHT. With n = 0 the variable is the angle t of x = R sin t:
+    σ(ε)√(a² − x² − y²) dt stays smooth at the rim where σ(ε) dx does not.
     """
-    total = 0.0
-    q = u - w * y
-    rim = a * a - y * y
     if n > 0:
         width = right - left
         for k in range(n):
-            x = left + width * GAUSS_NODES[n, k]
-            strain = min(1.0 - (q - v * x) / math.sqrt(rim - x * x), 1.0)
-            total += GAUSS_WEIGHTS[n, k] * stress_at(law, strain)
-        return total * width
-    radius = math.sqrt(rim)
+            nodes[X, count] = left + width * GAUSS_NODES[n, k]
+            nodes[Y, count] = y
+            nodes[WEIGHT, count] = w * width * GAUSS_WEIGHTS[n, k]
+            count += 1
+        return count
+    radius = math.sqrt(a * a - y * y)
     start = math.asin(max(left / radius, -1.0))
     width = math.asin(min(right / radius, 1.0)) - start
-    m = 10
-    for k in range(m):
-        t = start + width * GAUSS_NODES[m, k]
-        z = radius * math.cos(t)
-        face = q - v * radius * math.sin(t)
-        if z > 0.0:
-            strain = min(1.0 - face / z, 1.0) if face > 0.0 else 1.0
-            total += GAUSS_WEIGHTS[m, k] * stress_at(law, strain) * z
-    return total * width
+    for k in range(ANGLE_NODES):
+        t = start + width * GAUSS_NODES[ANGLE_NODES, k]
+        nodes[X, count] = radius * math.sin(t)
+        nodes[Y, count] = y
+        nodes[WEIGHT, count] = w * width * GAUSS_WEIGHTS[ANGLE_NODES, k] * radius * math.cos(t)
+        count += 1
+    return count
 
 
 @kernel
-def whole_cell_stress(
-    law: FloatArray,
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    x0: float,
-    x1: float,
-    y0: float,
-    y1: float,
-) -> float:
-    """Mean σ(ε) [Pa] of a cell that lies in the footprint."""
+def push_whole(
+    nodes: FloatArray, count: int, a: float, x0: float, x1: float, y0: float, y1: float
+) -> int:
+    """Add the nodes of the mean over a cell that lies in the footprint."""
     far = math.hypot(max(abs(x0), abs(x1)), max(abs(y0), abs(y1)))
     n = nodes_needed(a, 0.5 * max(x1 - x0, y1 - y0), far)
-    m = n if n > 0 else 10
-    total = 0.0
+    m = n if n > 0 else ANGLE_NODES
+    scale = 1.0 / (x1 - x0)
     for k in range(m):
         y = y0 + (y1 - y0) * GAUSS_NODES[m, k]
-        total += GAUSS_WEIGHTS[m, k] * line_stress(law, u, v, w, a, y, x0, x1, n)
-    return total / (x1 - x0)
+        count = push_line(nodes, count, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
+    return count
+
+
+@fast_kernel
+def _strains(nodes: FloatArray, count: int, u: float, v: float, w: float, a: float) -> None:
+    for k in range(count):
+        x = nodes[X, k]
+        y = nodes[Y, k]
+        length2 = max(a * a - x * x - y * y, 1e-30)
+        nodes[STRAIN, k] = min(max(1.0 - (u - v * x - w * y) / math.sqrt(length2), 0.0), 1.0)
+
+
+@fast_kernel
+def _polynomial(nodes: FloatArray, count: int, coefficients: FloatArray) -> None:
+    order = coefficients.shape[0]
+    for k in range(count):
+        nodes[STRESS, k] = coefficients[order - 1]
+    for j in range(order - 2, -1, -1):
+        c = coefficients[j]
+        for k in range(count):
+            nodes[STRESS, k] = nodes[STRESS, k] * nodes[STRAIN, k] + c
+
+
+@kernel
+def evaluate(
+    nodes: FloatArray, count: int, u: float, v: float, w: float, a: float, law: FloatArray
+) -> None:
+    """Fill the rows STRAIN, at most 1, and STRESS of the first ``count`` nodes, in SIMD lanes."""
+    _strains(nodes, count, u, v, w, a)
+    if law.shape[0] == 1:
+        _polynomial(nodes, count, law[0])
+    else:
+        for k in range(count):
+            nodes[STRESS, k] = stress_at(law, nodes[STRAIN, k])
 
 
 @kernel
@@ -126,44 +146,50 @@ def _insert(breaks: FloatArray, count: int, value: float, low: float, high: floa
 
 
 @kernel
-def cut_cell_stress(
-    law: FloatArray,
+def push_cut(
+    nodes: FloatArray,
+    count: int,
     u: float,
     v: float,
     w: float,
     a: float,
+    ends: Ends,
     x0: float,
     x1: float,
     y0: float,
     y1: float,
+    left_span: Span,
+    right_span: Span,
     breaks: FloatArray,
-) -> float:
-    """Mean σ(ε) [Pa] of a cell that the outline may cut; ``breaks`` [MAX_BREAKS] is scratch."""
-    ends = extremes(u, v, w, a)
+) -> int:
+    """Add the nodes of the mean over a cell that the outline may cut.
+
+    ``ends`` are the footprint's :func:`extremes`, the spans its parts on the lines x0 and x1;
+    ``breaks`` [MAX_BREAKS] is scratch.
+    """
     low = max(y0, ends[0])
     high = min(y1, ends[1])
     if not low < high:
-        return 0.0
+        return count
     breaks[0] = low
     breaks[1] = high
-    count = 2
-    for x in (x0, x1):
-        below, above = line_span(u, w, v, a, x)
-        count = _insert(breaks, count, below, low, high)
-        count = _insert(breaks, count, above, low, high)
+    number = 2
+    for span in (left_span, right_span):
+        number = _insert(breaks, number, span[0], low, high)
+        number = _insert(breaks, number, span[1], low, high)
     beyond = beyond_limit(u, v, w, a)
     if beyond and w != 0.0:
-        count = _insert(breaks, count, (u - v * x0) / w, low, high)
-        count = _insert(breaks, count, (u - v * x1) / w, low, high)
+        number = _insert(breaks, number, (u - v * x0) / w, low, high)
+        number = _insert(breaks, number, (u - v * x1) / w, low, high)
     if beyond:
         # Where the line face = base plane meets the rim the outline has a corner.
         slope = math.sqrt(v * v + w * w)
         foot = u / slope
         along = math.sqrt(max(a * a - foot * foot, 0.0))
-        count = _insert(breaks, count, (w * foot + v * along) / slope, low, high)
-        count = _insert(breaks, count, (w * foot - v * along) / slope, low, high)
-    total = 0.0
-    for piece in range(count - 1):
+        number = _insert(breaks, number, (w * foot + v * along) / slope, low, high)
+        number = _insert(breaks, number, (w * foot - v * along) / slope, low, high)
+    scale = 1.0 / ((x1 - x0) * (y1 - y0))
+    for piece in range(number - 1):
         start = breaks[piece]
         length = breaks[piece + 1] - start
         if length <= 1e-9 * (y1 - y0):
@@ -176,7 +202,7 @@ def cut_cell_stress(
         n = nodes_needed(a, 0.5 * max(x1 - x0, y1 - y0), math.hypot(x_far, y_far))
         # At the outline's lowest and highest point, and at the rim, lines end like a square root.
         rounded = n == 0 or start == ends[0] or start + length >= ends[1]
-        m = 10 if n == 0 else max(n, 7) if rounded else max(n, 4)
+        m = ANGLE_NODES if n == 0 else max(n, 7) if rounded else max(n, 4)
         for k in range(m):
             t = GAUSS_NODES[m, k]
             weight = GAUSS_WEIGHTS[m, k]
@@ -189,15 +215,14 @@ def cut_cell_stress(
             right = min(right, x1)
             if left >= right:
                 continue
-            weight *= length
+            weight *= length * scale
             inner = max(n, 4) if n > 0 else 0
             kink = (u - w * y) / v if beyond and v != 0.0 else math.inf
             if left < kink < right:
-                total += weight * line_stress(law, u, v, w, a, y, left, kink, inner)
-                total += weight * line_stress(law, u, v, w, a, y, kink, right, inner)
-            else:
-                total += weight * line_stress(law, u, v, w, a, y, left, right, inner)
-    return total / ((x1 - x0) * (y1 - y0))
+                count = push_line(nodes, count, a, y, left, kink, inner, weight)
+                left = kink
+            count = push_line(nodes, count, a, y, left, right, inner, weight)
+    return count
 
 
 # Planes of a grid's cells, float64 [rows, CELL_PLANES, cols]: means over the whole cell of g, x g

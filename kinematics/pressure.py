@@ -11,11 +11,68 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kinematics.cells import MAX_BREAKS, cut_cell_stress, whole_cell_stress
+from kinematics.cells import (
+    MAX_BREAKS,
+    NODE_ROWS,
+    NODES_A_CELL,
+    STRESS,
+    WEIGHT,
+    evaluate,
+    push_cut,
+    push_whole,
+)
 from kinematics.contact import Fingertip
-from kinematics.footprint import FloatArray, Geometry, band_columns, extremes, line_span, plane
+from kinematics.footprint import (
+    FloatArray,
+    Geometry,
+    IntArray,
+    band_columns,
+    extremes,
+    line_span,
+    plane,
+)
 from kinematics.kernels import kernel
 from kinematics.material import Material
+
+
+NODES = 512 + NODES_A_CELL
+OWNERS = 256
+
+
+def render_scratch(grid: SensorGrid) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Scratch arrays for :func:`render`, reusable from call to call."""
+    return (
+        np.empty((NODE_ROWS, NODES)),
+        np.empty((2, OWNERS), dtype=np.int64),
+        np.empty((grid.cols + 1, 2)),
+    )
+
+
+@kernel
+def _flush(
+    nodes: FloatArray,
+    count: int,
+    owners: IntArray,
+    waiting: int,
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    law: FloatArray,
+    gain: float,
+    out: FloatArray,
+) -> None:
+    """Sum the nodes of the ``waiting`` cells into ``out``; owners are (cell, end of its nodes)."""
+    evaluate(nodes, count, u, v, w, a, law)
+    cols = out.shape[1]
+    node = 0
+    for k in range(waiting):
+        total = 0.0
+        while node < owners[1, k]:
+            total += nodes[WEIGHT, node] * nodes[STRESS, node]
+            node += 1
+        cell = owners[0, k]
+        out[cell // cols, cell % cols] = gain * total
 
 
 @kernel
@@ -26,24 +83,33 @@ def render(
     d: float,
     n_x: float,
     n_y: float,
+    scratch: tuple[FloatArray, IntArray, FloatArray],
     out: FloatArray,
 ) -> None:
     """Write the pressure [Pa] of a contact, averaged over each cell, into ``out`` [rows, cols].
 
     ``geometry`` is :meth:`SensorGrid.geometry`, ``law`` the material's, (n_x, n_y) the first two
-    components of the object's outward normal in the sensor's axes. d ≤ 0 gives zeros. Beyond the
-    domain's limit the footprint ends at the rim and the strain stays ≤ 1.
+    components of the object's outward normal in the sensor's axes, ``scratch`` as
+    :func:`render_scratch` gives it. d ≤ 0 gives zeros. Beyond the domain's limit the footprint ends
+    at the rim and the strain stays ≤ 1.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
+    nodes, owners, columns = scratch
     rows, cols = out.shape
     out[:] = 0.0
     if not (d > 0.0 and n_x * n_x + n_y * n_y < 1.0):
         return
     u, v, w = plane(a, min(d, a), n_x, n_y)
     ends = extremes(u, v, w, a)
+    if not ends[0] < ends[1]:
+        return
     breaks = np.empty(MAX_BREAKS)
     first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
-    last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), 0), rows)
+    last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), first_row), rows)
+    for j in range(cols + 1):
+        columns[j, 0], columns[j, 1] = line_span(u, w, v, a, x_first + j * pitch_x)
+    count = 0
+    waiting = 0
     above = line_span(u, v, w, a, y_first + first_row * pitch_y)
     for i in range(first_row, last_row):
         y0 = y_first + i * pitch_y
@@ -57,10 +123,21 @@ def render(
             x0 = x_first + j * pitch_x
             x1 = x_first + (j + 1) * pitch_x
             if inner_first <= j < inner_last:
-                stress = whole_cell_stress(law, u, v, w, a, x0, x1, y0, y1)
+                count = push_whole(nodes, count, a, x0, x1, y0, y1)
             else:
-                stress = cut_cell_stress(law, u, v, w, a, x0, x1, y0, y1, breaks)
-            out[i, j] = gain * stress
+                left = (columns[j, 0], columns[j, 1])
+                right = (columns[j + 1, 0], columns[j + 1, 1])
+                count = push_cut(
+                    nodes, count, u, v, w, a, ends, x0, x1, y0, y1, left, right, breaks
+                )
+            owners[0, waiting] = i * cols + j
+            owners[1, waiting] = count
+            waiting += 1
+            if count > NODES - NODES_A_CELL or waiting == OWNERS:
+                _flush(nodes, count, owners, waiting, u, v, w, a, law, gain, out)
+                count = 0
+                waiting = 0
+    _flush(nodes, count, owners, waiting, u, v, w, a, law, gain, out)
 
 
 @dataclass(frozen=True)
@@ -139,7 +216,8 @@ class SensorGrid:
         elif out.shape != self.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
             raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
         s_x, s_y = self.to_sensor(n_x, n_y)
-        render(self.geometry(tip), material.law, float(gain), float(d), s_x, s_y, out)
+        scratch = render_scratch(self)
+        render(self.geometry(tip), material.law, float(gain), float(d), s_x, s_y, scratch, out)
         return out
 
 

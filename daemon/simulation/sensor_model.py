@@ -1,8 +1,8 @@
 """The simulated pressure sensor: a contact → the counts that a board would send.
 
-Holds the sensor's imperfections (noise, quantisation, saturation, gain spread, dead cells) round the
-forward model, and no time: hysteresis, drift, delay and lost frames are not here. Seeded: the same
-calls give the same counts.
+Holds the sensor's imperfections (noise, quantisation, saturation, gain spread, dead cells) round
+the forward model, and no time: hysteresis, drift, delay and lost frames are not here. Seeded: the
+same calls give the same counts.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from kinematics.contact import Fingertip
 from kinematics.kernels import kernel
 from kinematics.material import Material
-from kinematics.pressure import SensorGrid, render
+from kinematics.pressure import SensorGrid, render, render_scratch
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 @kernel
@@ -31,16 +32,18 @@ def sense(
     noise: float,
     full: int,
     pressure: FloatArray,
+    scratch: tuple[FloatArray, IntArray, FloatArray],
     out: NDArray[np.uint16],
 ) -> None:
     """Render ``contact`` (d, n_x, n_y in the sensor's axes) and write its counts into ``out``.
 
     All arrays are [rows, cols]. ``sensitivity`` is counts a Pa of each cell, 0 for a dead one;
     ``normals`` are standard normal numbers, ``noise`` counts a unit of them; counts are rounded to
-    the nearest and end at 0 and ``full``. ``pressure`` is scratch.
+    the nearest and end at 0 and ``full``. ``pressure`` and
+    ``scratch`` are scratch.
     """
     d, n_x, n_y = contact
-    render(geometry, law, 1.0, d, n_x, n_y, pressure)
+    render(geometry, law, 1.0, d, n_x, n_y, scratch, pressure)
     rows, cols = out.shape
     for i in range(rows):
         for j in range(cols):
@@ -93,6 +96,7 @@ class SensorModel:
             self._sensitivity[row, col] = 0.0
         self._normals = np.zeros(grid.shape)
         self._pressure = np.zeros(grid.shape)
+        self._scratch = render_scratch(grid)
 
     @property
     def live(self) -> NDArray[np.bool_]:
@@ -116,5 +120,6 @@ class SensorModel:
             self._noise,
             self._full,
             self._pressure,
+            self._scratch,
             out,
         )
