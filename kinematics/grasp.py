@@ -6,9 +6,9 @@ The energy is that of both tips and of gravity. A tip's energy with the shear d_
 
 with U₀ and F from the contact table; for a constant modulus it is πE[d³/(3cos²θ) + d² d_t tan θ +
 d d_t²], the parallel-distributed model. Its shear force is T = ∂U/∂d_t, its normal force
-N = ∂U/∂d − T tan θ. Shears follow the rolling increments of :mod:`kinematics.fingers`, which can't be
-integrated in general, so that a grasp depends on its path: what moves here moves in small steps and
-carries its shears along. Balance is where the energy is stationary along those increments.
+N = ∂U/∂d − T tan θ. Shears follow the rolling increments of :mod:`kinematics.fingers`, which can't
+be integrated in general, so that a grasp depends on its path: what moves here moves in small steps
+and carries its shears along. Balance is where the energy is stationary along those increments.
 """
 
 from __future__ import annotations
@@ -191,9 +191,7 @@ class Grasp:
         ]
         by_d, turning, tangential = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
         normal = by_d - tangential * np.tan(c.theta)
-        return GraspForces(
-            looked_up.force, normal, tangential, turning, self.gradient(state)[:2]
-        )
+        return GraspForces(looked_up.force, normal, tangential, turning, self.gradient(state)[:2])
 
     def balance(self, state: GraspState, q: ArrayLike | None = None) -> GraspState:
         """Bring the joints to ``q`` (2,) at once and let the object roll to where it balances.

@@ -19,7 +19,7 @@ from kinematics.table import ContactTable
 
 FloatArray = NDArray[np.float64]
 
-SAMPLES_KEPT = 64
+SPARE_SAMPLES = 8
 LONGEST_ADVANCE = 10.0  # s of simulated time in one kernel call
 
 _MODES = (
@@ -65,7 +65,9 @@ class SimulatedHand:
         memory[layout.POSITION + 2 : layout.POSITION + 4] = simulation.object_position
         memory[layout.POSITION + 4] = simulation.object_angle
         memory[layout.MODE : layout.MODE + 2] = layout.CURRENT_BASED_POSITION_MODE
-        self._ring = np.full((SAMPLES_KEPT, layout.SAMPLE), -1.0)
+        # As many as may be on their way to a sensor's reader.
+        kept = math.ceil(simulation.tactile_delay * settings.tactile.rate) + SPARE_SAMPLES
+        self._ring = np.full((kept, layout.SAMPLE), -1.0)
         self._done = 0
         self._torque_until = math.inf
         self._per_step = 1.0 / self.step
@@ -142,7 +144,7 @@ class SimulatedHand:
 
         Raises LookupError for one that is not taken yet or has left the ring.
         """
-        row: FloatArray = self._ring[number % SAMPLES_KEPT]
+        row: FloatArray = self._ring[number % len(self._ring)]
         if row[layout.SAMPLE_SEQ] != number:
             raise LookupError(f"sample {number} is not kept; {self.samples} were taken")
         return row
