@@ -158,7 +158,7 @@ class Control:
 
     def observe(self, reading: Reading, contacts: list[Contact], pose: ObjectPose) -> None:
         """Take in what the servos and sensors said. Commands are carried out on this picture."""
-        self._joints = Joints(reading.q.tolist(), reading.dq.tolist())
+        self._joints = Joints(reading.q, reading.dq)
         self._contacts = contacts
         self._pose = pose
 

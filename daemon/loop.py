@@ -139,7 +139,7 @@ class Loop:
             reading.valid = False
             self._fail(str(error))
         if reading.valid:
-            self._history.append(reading.t, reading.q.tolist())
+            self._history.append(reading.t, reading.q)
 
     def _feel(self) -> None:
         new = False

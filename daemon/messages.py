@@ -38,11 +38,11 @@ def state_message(state: State, fingers: tuple[bool, bool]) -> dict[str, Any]:
     timing = state.timing
     reading = state.reading
     joints = zip(
-        reading.q.tolist(),
-        reading.dq.tolist(),
-        reading.current.tolist(),
-        state.goal.q.tolist(),
-        state.goal.current.tolist(),
+        reading.q,
+        reading.dq,
+        reading.current,
+        state.goal.q,
+        state.goal.current,
         strict=True,
     )
     left, right = (

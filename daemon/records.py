@@ -1,8 +1,8 @@
 """The plain records that the pipeline's stages hand to each other, and nothing else.
 
-Per-finger arrays and lists have length 2, left finger first; a finger that the scene lacks stays 0
-and is flagged by ``valid``. SI units. Positive joint angle closes. ``t`` is the clock's time in
-seconds.
+Per-finger lists have length 2, left finger first; a finger that the scene lacks stays 0 and is
+flagged by ``valid``. Plain floats, since the tick takes them one by one. SI units. Positive joint
+angle closes. ``t`` is the clock's time in seconds.
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 FINGERS = ("left", "right")
 
-FloatArray = NDArray[np.float64]
 
-
-def _pair() -> FloatArray:
-    return np.zeros(2)
+def _pair() -> list[float]:
+    return [0.0, 0.0]
 
 
 @dataclass(slots=True)
@@ -28,9 +26,9 @@ class Reading:
     seq: int = 0
     t: float = 0.0
     valid: bool = False
-    q: FloatArray = field(default_factory=_pair)  # joint angle [rad]
-    dq: FloatArray = field(default_factory=_pair)  # joint velocity [rad/s]
-    current: FloatArray = field(default_factory=_pair)  # motor current [A], positive closes
+    q: list[float] = field(default_factory=_pair)  # joint angle [rad]
+    dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
+    current: list[float] = field(default_factory=_pair)  # motor current [A], positive closes
     alert: int = 0  # bit i: servo of finger i reports a hardware error
 
 
@@ -82,8 +80,8 @@ class Goal:
     seq: int = 0
     t: float = 0.0
     valid: bool = False
-    q: FloatArray = field(default_factory=_pair)  # goal angle [rad]
-    current: FloatArray = field(default_factory=_pair)  # bound on the current's magnitude [A]
+    q: list[float] = field(default_factory=_pair)  # goal angle [rad]
+    current: list[float] = field(default_factory=_pair)  # bound on the current's magnitude [A]
 
 
 @dataclass(slots=True)

@@ -34,7 +34,7 @@ class Safety:
         """Bound the goal in place; a goal that is not a number becomes invalid."""
         hand = self._settings.hand
         for index in self._fingers:
-            q, current = float(goal.q[index]), float(goal.current[index])
+            q, current = goal.q[index], goal.current[index]
             if not (math.isfinite(q) and math.isfinite(current)):
                 goal.valid = False
                 return
@@ -77,10 +77,10 @@ class Safety:
             return ""
         hand = self._settings.hand
         for index in self._fingers:
-            q = float(state.reading.q[index])
+            q = state.reading.q[index]
             if not hand.q_min[index] - _PAST_STOP <= q <= hand.q_max[index] + _PAST_STOP:
                 return f"{FINGERS[index]} joint at {q:.3f} rad, outside its limits"
-            dq = float(state.reading.dq[index])
+            dq = state.reading.dq[index]
             if abs(dq) > self._limits.velocity_max:
                 return f"{FINGERS[index]} joint at {dq:.2f} rad/s, too fast"
         return ""

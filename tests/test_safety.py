@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from daemon.modes import Mode
@@ -33,7 +32,7 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
 
 
 def goal(q: tuple[float, float], current: tuple[float, float]) -> Goal:
-    return Goal(valid=True, q=np.array(q), current=np.array(current))
+    return Goal(valid=True, q=list(q), current=list(current))
 
 
 def test_a_sound_state_has_no_cause() -> None:
@@ -44,8 +43,8 @@ def test_goals_are_bounded_by_joint_and_current_limits() -> None:
     bounded = goal((9.0, -9.0), (5.0, -0.2))
     safety().bound(bounded)
     assert bounded.valid
-    assert bounded.q.tolist() == [SETTINGS.hand.q_max[0], SETTINGS.hand.q_min[1]]
-    assert bounded.current.tolist() == [SETTINGS.safety.current_max, 0.0]
+    assert bounded.q == [SETTINGS.hand.q_max[0], SETTINGS.hand.q_min[1]]
+    assert bounded.current == [SETTINGS.safety.current_max, 0.0]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

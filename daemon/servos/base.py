@@ -26,9 +26,10 @@ class Servos(Protocol):
         """Open and check everything. Raises ServoError with the whole list of what is wrong."""
 
     def read(self, reading: Reading) -> None:
-        """Fill ``reading`` in place; when it failed, ``valid`` is False and all else but ``seq`` keeps.
+        """Fill ``reading`` in place.
 
-        So ``reading.t`` is the time of the last good one.
+        After a failed exchange ``valid`` is False and all else but ``seq`` keeps, so that
+        ``reading.t`` is the time of the last good one.
         """
 
     def set_torque(self, on: bool) -> None:

@@ -199,8 +199,8 @@ class DynamixelServos:
             self._check_watchdog()
         for finger, servo_id in self._ids.items():
             scale = self._scales[finger]
-            bound = min(scale.bound_counts(float(goal.current[finger])), self._bounds[finger])
-            position = scale.position_counts(float(goal.q[finger]))
+            bound = min(scale.bound_counts(goal.current[finger]), self._bounds[finger])
+            position = scale.position_counts(goal.q[finger])
             goals.changeParam(servo_id, _GOAL.pack(bound, position))
         if goals.txPacket() == COMM_SUCCESS:
             self._last_sent = time.monotonic()

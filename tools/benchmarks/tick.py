@@ -11,7 +11,7 @@ import numpy as np
 import zmq
 
 from daemon.assembly import Daemon
-from daemon.clock import VirtualClock
+from daemon.clock import Clock
 from daemon.loop import Loop
 from daemon.records import Frame, Goal, Reading
 from daemon.settings import Settings
@@ -78,7 +78,8 @@ def _run(loop: Loop, daemon: Daemon) -> list[float]:
 class _CannedServos:
     """Always the same good reading; goals go nowhere."""
 
-    def __init__(self, reading: Reading) -> None:
+    def __init__(self, reading: Reading, clock: Clock) -> None:
+        self._clock = clock
         self._q = reading.q.copy()
         self._current = reading.current.copy()
 
@@ -87,6 +88,7 @@ class _CannedServos:
     def read(self, reading: Reading) -> None:
         reading.seq += 1
         reading.valid = True
+        reading.t = self._clock.now()
         reading.q[:] = self._q
         reading.current[:] = self._current
 
@@ -103,7 +105,7 @@ class _CannedServos:
 class _CannedSensor:
     """The same counts again and again, a new frame at the sensor's rate."""
 
-    def __init__(self, counts: np.ndarray[Any, np.dtype[np.uint16]], period: float, clock: Any):
+    def __init__(self, counts: np.ndarray[Any, np.dtype[np.uint16]], period: float, clock: Clock):
         self._counts = counts
         self._period = period
         self._clock = clock
@@ -126,10 +128,9 @@ class _CannedSensor:
 def _can(daemon: Daemon) -> Loop:
     """Put canned backends in place of the simulated ones, with what those last said."""
     loop = daemon.loop
-    assert isinstance(daemon.clock, VirtualClock)
     for perception in loop.perceptions:
         assert perception.frame is not None
         period = 1.0 / daemon.settings.tactile.rate
         perception.sensor = _CannedSensor(perception.frame.data, period, daemon.clock)
-    loop.servos = _CannedServos(loop.state.reading)
+    loop.servos = _CannedServos(loop.state.reading, daemon.clock)
     return loop
