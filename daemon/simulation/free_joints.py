@@ -8,10 +8,12 @@ The defaults are about an XM430-W350 with nothing on its horn.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from daemon.records import FloatArray
 from daemon.servos.registers import CURRENT_MODE
 from kinematics.kernels import kernel
+
+FloatArray = NDArray[np.float64]
 
 
 @kernel

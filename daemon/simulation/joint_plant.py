@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from daemon.records import FloatArray
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
 
 
 class JointPlant(Protocol):
