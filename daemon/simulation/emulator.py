@@ -1,0 +1,230 @@
+"""The stand-in hand's process: physics in real time, behind servos and tactile boards on ptys.
+
+One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
+due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
+before it looks for bytes again. Here live that loop and its time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from daemon.model import make_material, make_table
+from daemon.records import FINGERS
+from daemon.settings import Settings, TactileSettings
+from daemon.simulation.bus_faults import FaultError
+from daemon.simulation.fault_words import Faults
+from daemon.simulation.hand import SimulatedHand
+from daemon.simulation.link_folder import FolderError, LinkFolder
+from daemon.simulation.pty_bus import PtyServoBus
+from daemon.simulation.servo_bus import ServoBus
+from daemon.simulation.tactile_board import ENCODERS, TactileBoard
+from daemon.tactile.simulated import SimulatedTactile
+
+_STEP = 0.002  # s, longest that the physics lags behind
+_STALL = 0.05  # s; a longer interruption is left out of the hand's time
+# The board that stands in where a profile names none: that of config/hil.toml.
+DEFAULT_BOARD = {
+    "backend": "flexitac",
+    "rows": 32,
+    "cols": 32,
+    "pitch": 0.0018125,
+    "pascal_per_count": 500.0,
+}
+
+
+class EmulatorError(Exception):
+    """The stand-in hand can't be set up. The message says why, and what mends it."""
+
+
+class EmulatorClock:
+    """Time of the stand-in hand: real time from 0, less the interruptions of its process.
+
+    Without that a process that was stopped for a minute would have to compute that minute, and
+    would answer nobody meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._origin = self._last = time.monotonic()
+
+    def now(self) -> float:
+        """The hand's time [s]. What passed since the last call counts up to a limit."""
+        now = time.monotonic()
+        self._origin += max(now - self._last - _STALL, 0.0)
+        self._last = now
+        return now - self._origin
+
+    def wall(self) -> float:
+        """Unix time [s]."""
+        return time.time()
+
+    def sleep_until(self, t: float) -> None:
+        """Return at the hand's time ``t``."""
+        while (delay := t - self.now()) > 0.0:
+            time.sleep(min(delay, 0.5 * _STALL))
+
+
+class Emulator:
+    """A stand-in hand on ptys, linked in ``folder``; :meth:`run` keeps it alive.
+
+    The scene of ``settings`` says what there is: a finger that is absent has no board, and servos
+    or tactile backends of ``none`` have no port.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        folder: Path,
+        *,
+        baud: int = 0,
+        faults: Iterable[str] = (),
+        table_cache: Path | None = None,
+    ) -> None:
+        """Build it; nothing answers before :meth:`run`.
+
+        ``baud`` 0: servos answer at once and at any rate. ``faults``: see :class:`Faults`.
+        ``table_cache``: a folder where the contact table is kept. Raises EmulatorError, and
+        SettingsError when the settings' material is no stress-strain law.
+        """
+        self._closers: list[Callable[[], None]] = []
+        self._wake = os.pipe()
+        self._closers.append(self._close_wake)
+        self._stopping = False
+        try:
+            self._build(with_board(settings), folder, baud, faults, table_cache)
+        except (FolderError, FaultError) as error:
+            self.close()
+            raise EmulatorError(str(error)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _build(
+        self,
+        settings: Settings,
+        folder: Path,
+        baud: int,
+        words: Iterable[str],
+        table_cache: Path | None,
+    ) -> None:
+        faults = Faults(words, settings.servos.ids)
+        links = LinkFolder(folder)
+        self._closers.append(links.close)
+        self.clock = EmulatorClock()
+        table = make_table(settings, make_material(settings.material), table_cache)
+        self.hand = SimulatedHand(settings, 0.0, table)
+        self._servos: PtyServoBus | None = None
+        self._servo_faults = faults.servos
+        if settings.servos.backend != "none":
+            self._servos = self._make_servos(settings, links, baud)
+            self._closers.append(self._servos.close)
+        self._boards: list[TactileBoard] = []
+        self._sources: list[SimulatedTactile] = []
+        tactile = settings.tactile
+        if tactile.backend != "none":
+            for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+                source = SimulatedTactile(settings, self.hand, self.clock, finger)
+                source.open()
+                board = TactileBoard(
+                    source,
+                    ENCODERS[tactile.backend],
+                    tactile.rate,
+                    settings.simulation.tactile_delay,
+                    tuple(faults.boards[finger]),
+                    settings.simulation.seed + finger,
+                )
+                self._sources.append(source)
+                self._boards.append(board)
+                self._closers.append(board.close)
+                links.link(f"tactile-{FINGERS[finger]}", board.path)
+        self._advance_due = 0.0
+
+    def _make_servos(self, settings: Settings, links: LinkFolder, baud: int) -> PtyServoBus:
+        try:
+            bus = ServoBus.from_settings(settings, self.hand, baud=baud)
+        except KeyError as error:
+            raise EmulatorError(f"servos.model: {error.args[0]}") from None
+        except ValueError as error:
+            raise EmulatorError(str(error)) from None
+        return PtyServoBus(bus, links.path / "servos", baud=baud, clock=self.clock.now)
+
+    def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
+        """Answer until :meth:`stop`. ``on_ready`` is called once everything answers."""
+        ready = False
+        while not self._stopping:
+            self._turn()
+            if not ready and all(source.latest() is not None for source in self._sources):
+                ready = True
+                on_ready()
+
+    def stop(self) -> None:
+        """End :meth:`run`; may be called from a signal handler or another thread."""
+        self._stopping = True
+        with contextlib.suppress(OSError):
+            os.write(self._wake[1], b"x")
+
+    def close(self) -> None:
+        """Take the ports and their links away. Never raises."""
+        while self._closers:
+            with contextlib.suppress(OSError):
+                self._closers.pop()()
+
+    def _close_wake(self) -> None:
+        for end in self._wake:
+            os.close(end)
+
+    def _turn(self) -> None:
+        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
+        servos, boards = self._servos, self._boards
+        t = self.clock.now()
+        due = min([self._advance_due, *[board.next_event() for board in boards]])
+        watched: list[int | TactileBoard] = [self._wake[0], *boards]
+        if servos is not None:
+            due = min(due, servos.next_event(t))
+            if servos.fileno() >= 0:
+                watched.append(servos.fileno())
+        ready, _, _ = select.select(watched, (), (), max(due - t, 0.0))
+        t = self.clock.now()
+        if servos is not None and (servos.fileno() in ready or servos.next_event(t) <= t):
+            servos.service(t)
+        for board in boards:
+            if board in ready:
+                board.hear()
+        late = [board for board in boards if board.next_event() <= t]
+        if late:
+            self._advance(t)
+            late[0].service(t)
+        elif self._advance_due <= t:
+            self._advance(t)
+
+    def _advance(self, t: float) -> None:
+        while self._servo_faults and self._servo_faults[0][0] <= t:
+            self._apply(self._servo_faults.pop(0)[1], t)
+        if self._servos is not None:
+            self._servos.bus.advance(t)
+        else:
+            self.hand.advance(t)
+        self._advance_due = t + _STEP
+
+    def _apply(self, fault: str, t: float) -> None:
+        if self._servos is None:
+            return
+        if fault == "unplug":
+            self._servos.unplug()
+        elif fault == "plug":
+            self._servos.plug()
+        else:
+            self._servos.bus.fault(fault, t)
+
+
+def with_board(settings: Settings) -> Settings:
+    """``settings`` with the default board where its tactile backend names none of ours."""
+    if settings.tactile.backend in (*ENCODERS, "none"):
+        return settings
+    tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})
+    return settings.model_copy(update={"tactile": tactile})

@@ -1,0 +1,437 @@
+"""The stand-in hand: the real process behind its command line, and its parts one by one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dynamixel_sdk import COMM_SUCCESS, PacketHandler, PortHandler
+
+from daemon.clock import RealClock
+from daemon.settings import Settings, load
+from daemon.simulation import emulator as module
+from daemon.simulation.emulator import (
+    DEFAULT_BOARD,
+    Emulator,
+    EmulatorClock,
+    EmulatorError,
+    with_board,
+)
+from daemon.simulation.link_folder import LINKS, FolderError, LinkFolder
+from daemon.tactile.base import TactileError
+from daemon.tactile.flexitac import FlexiTac
+from tools.cli import main
+
+HIL = Path(__file__).parent.parent / "config" / "hil.toml"
+READY_WITHIN = 60.0  # s; kernels may have to be compiled
+
+OPERATING_MODE, TORQUE_ENABLE = 11, 64
+GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
+
+
+def until(condition: Callable[[], object], timeout: float = 10.0) -> None:
+    """Wait for what another process or thread brings about."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        select.select([], [], [], 0.002)
+
+
+class Process:
+    """``softfinger emulate`` with these arguments."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        self.popen = subprocess.Popen(
+            [sys.executable, "-m", "tools.cli", "emulate", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def ready(self) -> Process:
+        """Wait for the first line, which must be ``ready``."""
+        assert self.popen.stdout is not None
+        found = select.select([self.popen.stdout], [], [], READY_WITHIN)[0]
+        line = self.popen.stdout.readline() if found else "nothing"
+        if line != "ready\n":
+            self.popen.kill()
+            raise AssertionError(f"{line!r} instead of ready: {self.popen.communicate()[1]}")
+        return self
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
+        """Send a signal; exit status and what else was printed."""
+        self.popen.send_signal(number)
+        out, err = self.popen.communicate(timeout=20)
+        return self.popen.returncode, out, err
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.popen.poll() is None:
+            self.popen.kill()
+        self.popen.communicate()
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of a running stand-in hand as it is by default."""
+    folder = tmp_path_factory.mktemp("hand")
+    with Process("--dir", folder) as process:
+        process.ready()
+        yield folder
+        assert process.end() == (0, "", "")
+
+
+@contextlib.contextmanager
+def thread(folder: Path, *faults: str, settings: Settings | None = None) -> Iterator[Emulator]:
+    """An emulator in a thread of this process, where a test wants several."""
+    made = Emulator(settings or Settings(), folder, faults=faults)
+    ready = threading.Event()
+    runner = threading.Thread(target=made.run, args=(ready.set,))
+    runner.start()
+    try:
+        assert ready.wait(READY_WITHIN)
+        yield made
+    finally:
+        made.stop()
+        runner.join()
+        made.close()
+
+
+class Servos:
+    """The maker's own SDK on the servos' port."""
+
+    def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
+        self.port = PortHandler(str(folder / "servos"))
+        assert self.port.openPort()
+        assert self.port.setBaudRate(baud)
+        self.packets = PacketHandler(2.0)
+
+    def ping(self, servo: int) -> int | None:
+        model, result, _ = self.packets.ping(self.port, servo)
+        return model if result == COMM_SUCCESS else None
+
+    def read(self, servo: int, address: int, size: int) -> int:
+        read = {
+            1: self.packets.read1ByteTxRx,
+            2: self.packets.read2ByteTxRx,
+            4: self.packets.read4ByteTxRx,
+        }[size]
+        value, result, error = read(self.port, servo, address)
+        assert (result, error) == (COMM_SUCCESS, 0)
+        return int(value)
+
+    def write(self, servo: int, address: int, size: int, value: int) -> None:
+        write = {
+            1: self.packets.write1ByteTxRx,
+            2: self.packets.write2ByteTxRx,
+            4: self.packets.write4ByteTxRx,
+        }[size]
+        assert write(self.port, servo, address, value) == (COMM_SUCCESS, 0)
+
+    def close(self) -> None:
+        self.port.closePort()
+
+
+@pytest.fixture
+def servos(hand: Path) -> Iterator[Servos]:
+    made = Servos(hand)
+    yield made
+    made.close()
+
+
+def board(folder: Path, finger: int, timeout: float = 2.0, **changes: object) -> FlexiTac:
+    """The daemon's own backend on one of the stand-in hand's boards."""
+    tactile = load(HIL, folder).tactile
+    tactile = tactile.model_copy(update={"open_timeout": timeout, **changes})
+    return FlexiTac(tactile, RealClock(), finger)
+
+
+def test_default_servos_answer_and_are_limp_in_current_based_position_mode(servos):
+    for servo in (1, 2):
+        assert servos.ping(servo) == 1020
+        assert servos.read(servo, OPERATING_MODE, 1) == 5
+        assert servos.read(servo, TORQUE_ENABLE, 1) == 0
+        assert servos.read(servo, PRESENT_POSITION, 4) == 2048
+    assert servos.ping(3) is None
+
+
+def test_links_lead_to_terminals(hand):
+    for name in LINKS:
+        assert (hand / name).is_symlink()
+        assert (hand / name).is_char_device()
+
+
+def test_answers_come_soon(servos):
+    taken = []
+    for _ in range(200):
+        start = time.perf_counter()
+        assert servos.read(1, PRESENT_POSITION, 4) in range(2040, 2056)
+        taken.append(time.perf_counter() - start)
+    assert np.median(taken) < 0.002  # measured 0.2 ms, most of it the SDK's
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_boards_send_the_default_grid_at_their_rate(hand, finger):
+    sensor = board(hand, finger)
+    sensor.open()
+    first = sensor.latest()
+    assert first is not None
+    until(lambda: sensor.latest().seq >= first.seq + 50)
+    last = sensor.latest()
+    sensor.close()
+    period = (last.t_arrival - first.t_arrival) / (last.seq - first.seq)
+    assert period == pytest.approx(0.01, rel=0.05)
+    assert last.data.shape == (32, 32)
+    # Nothing touches the tips: noise of about 3 counts, cut off below 0.
+    assert 0 < last.data.mean() < 3
+    counters = sensor.counters()
+    assert counters["resyncs"] == counters["skipped_bytes"] == 0
+
+
+def test_the_physics_stands_behind_servos_and_boards(hand, servos):
+    sensors = [board(hand, finger) for finger in (0, 1)]
+    for sensor in sensors:
+        sensor.open()
+    limp = [int(sensor.latest().data.sum()) for sensor in sensors]
+    for servo, goal in ((1, 2048 + 400), (2, 2048 - 400)):
+        servos.write(servo, TORQUE_ENABLE, 1, 1)
+        servos.write(servo, GOAL_CURRENT, 2, 150)  # 0.4 A
+        servos.write(servo, GOAL_POSITION, 4, goal)
+    until(lambda: all(sensor.latest().data.max() > 40 for sensor in sensors))
+    pressed = [int(sensor.latest().data.sum()) for sensor in sensors]
+    assert all(after > before + 500 for before, after in zip(limp, pressed, strict=True))
+    assert servos.read(1, PRESENT_POSITION, 4) > 2060
+    assert servos.read(2, PRESENT_POSITION, 4) < 2036
+    for servo in (1, 2):
+        servos.write(servo, GOAL_POSITION, 4, 2048)
+    until(lambda: all(sensor.latest().data.max() < 30 for sensor in sensors))
+    until(lambda: all(abs(servos.read(servo, PRESENT_POSITION, 4) - 2048) < 8 for servo in (1, 2)))
+    for servo in (1, 2):
+        servos.write(servo, TORQUE_ENABLE, 1, 0)
+    for sensor in sensors:
+        sensor.close()
+
+
+def test_clients_may_come_and_go(hand):
+    for _ in range(3):
+        servos = Servos(hand)
+        assert servos.ping(2) == 1020
+        servos.close()
+        sensor = board(hand, 0)
+        sensor.open()
+        sensor.close()
+
+
+def test_a_folder_in_use_is_refused_and_the_first_lives_on(hand, servos):
+    with Process("--dir", hand) as second:
+        out, err = second.popen.communicate(timeout=READY_WITHIN)
+        assert second.popen.returncode == 1
+    assert out == ""
+    assert "in use by another emulator (process " in err
+    assert len(err.splitlines()) == 1
+    assert servos.ping(1) == 1020
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(tmp_path, number):
+    with Process("--dir", tmp_path / "new", "--config", HIL) as process:
+        process.ready()
+        assert process.end(number) == (0, "", "")
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived(tmp_path):
+    options = ("--model", "XL330-M288", "--ids", "7,3")
+    with Process("--dir", tmp_path, *options) as process:
+        process.ready()
+        process.popen.kill()
+        process.popen.wait()
+    assert all((tmp_path / name).is_symlink() for name in LINKS)
+    with Process("--dir", tmp_path, *options) as process:
+        process.ready()
+        servos = Servos(tmp_path)
+        assert [servos.ping(servo) for servo in (7, 3, 1)] == [1200, 1200, None]
+        process.popen.send_signal(signal.SIGSTOP)
+        assert servos.ping(7) is None
+        process.popen.send_signal(signal.SIGCONT)
+        servos.port.ser.reset_input_buffer()
+        until(lambda: servos.ping(7) == 1200)
+        servos.close()
+        process.end()
+
+
+def test_paced_servos_are_deaf_at_another_rate(tmp_path):
+    with Process("--dir", tmp_path, "--baud", "1000000") as process:
+        process.ready()
+        for baud, model in ((1_000_000, 1020), (2_000_000, None), (57_600, None)):
+            servos = Servos(tmp_path, baud)
+            assert servos.ping(1) == model
+            servos.close()
+        process.end()
+
+
+def test_something_else_in_a_links_place_is_left_alone(tmp_path):
+    (tmp_path / "servos").write_text("mine")
+    with pytest.raises(EmulatorError, match="servos: is in the way"):
+        Emulator(Settings(), tmp_path)
+    assert (tmp_path / "servos").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["servos"]
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FolderError, match="can't be used as --dir"):
+        LinkFolder(tmp_path / "file" / "hand")
+
+
+def test_links_that_lead_elsewhere_by_now_are_left_alone(tmp_path):
+    folder = LinkFolder(tmp_path)
+    folder.link("servos", "/dev/ours")
+    folder.link("tactile-left", "/dev/ours-too")
+    (tmp_path / "servos").unlink()
+    (tmp_path / "servos").symlink_to("/dev/theirs")
+    folder.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["servos"]
+    assert str((tmp_path / "servos").readlink()) == "/dev/theirs"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--fault", "melted"], "wrong-size"),
+        (["--fault", "silent=9"], "no servo has that ID"),
+        (["--model", "AX-12"], "XM430-W350"),
+        (["--baud", "1234"], "baud"),
+    ],
+)
+def test_what_cannot_be_emulated_is_told_in_one_line(tmp_path, capsys, options, told):
+    assert main(["emulate", "--dir", str(tmp_path), *options]) == 1
+    err = capsys.readouterr().err
+    assert told in err
+    assert len(err.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ids", ["1", "1,1", "1,x", "1,2,3"])
+def test_wrong_ids_are_told(tmp_path, capsys, ids):
+    with pytest.raises(SystemExit) as end:
+        main(["emulate", "--dir", str(tmp_path), "--ids", ids])
+    assert end.value.code == 2
+    assert "two different IDs" in capsys.readouterr().err
+
+
+def test_ids_out_of_range_and_wrong_settings_are_told(tmp_path, capsys):
+    assert main(["emulate", "--dir", str(tmp_path), "--ids", "1,253"]) == 2
+    assert "--ids" in capsys.readouterr().err
+    (tmp_path / "wrong.toml").write_text("tactile.rows = 3")
+    assert main(["emulate", "--dir", str(tmp_path), "--config", str(tmp_path / "wrong.toml")]) == 2
+    assert "tactile.rows" in capsys.readouterr().err
+
+
+def test_the_default_board_is_the_one_of_the_hil_profile(tmp_path):
+    hil = load(HIL, tmp_path)
+    assert with_board(hil) is hil
+    default = with_board(Settings()).tactile
+    for key in ("rows", "cols", "pitch", "pascal_per_count", "rate", "baud", "backend"):
+        assert getattr(default, key) == getattr(hil.tactile, key), key
+        if key in DEFAULT_BOARD:
+            assert DEFAULT_BOARD[key] == getattr(default, key)
+    assert hil.simulation == Settings().simulation
+
+
+def test_a_scene_has_only_the_ports_it_needs(tmp_path):
+    (tmp_path / "one.toml").write_text(
+        'scene.fingers = ["right"]\nservos.backend = "none"\n[tactile]\nrows = 16\ncols = 8\n'
+        'backend = "flexitac"\n'
+    )
+    settings = load(tmp_path / "one.toml", tmp_path)
+    with thread(tmp_path / "hand", settings=settings):
+        names = {path.name for path in (tmp_path / "hand").iterdir()}
+        assert names & set(LINKS) == {"tactile-right"}
+        sensor = board(tmp_path / "hand", 1, rows=16, cols=8)
+        sensor.open()
+        sensor.close()
+
+
+def test_board_faults_reach_the_daemons_backend(tmp_path):
+    with thread(tmp_path, "left:wrong-size", "right:torn=0.5"):
+        with pytest.raises(TactileError, match=r"256 cells.*1024"):
+            board(tmp_path, 0, timeout=0.4).open()
+        sensor = board(tmp_path, 1)
+        sensor.open()
+        until(lambda: sensor.counters()["resyncs"] >= 3)
+        assert sensor.latest().data.mean() < 10
+        sensor.close()
+
+
+def test_silent_frozen_and_noisy_boards(tmp_path):
+    with thread(tmp_path, "left:frozen", "right:noisy=0.3", "right:silent@1.0"):
+        left, right = board(tmp_path, 0), board(tmp_path, 1)
+        right.open()
+        left.open()
+        kept = left.latest().data
+        seq = left.latest().seq
+        until(lambda: left.latest().seq > seq + 10)
+        assert np.array_equal(left.latest().data, kept)
+        until(lambda: time.monotonic() - right.latest().t_arrival > 0.2)
+        assert right.counters()["resyncs"] > 0
+        left.close()
+        right.close()
+        with pytest.raises(TactileError, match="no byte came"):
+            board(tmp_path, 1, timeout=0.1).open()
+
+
+def test_servo_faults_reach_the_sdk(tmp_path):
+    with thread(tmp_path, "silent=2"):
+        servos = Servos(tmp_path)
+        assert servos.ping(1) == 1020
+        assert servos.ping(2) is None
+        servos.close()
+    with thread(tmp_path, "unplug@0.3", "plug@0.6"):
+        servos = Servos(tmp_path)
+        assert servos.ping(1) == 1020
+        until(lambda: not (tmp_path / "servos").exists())
+        until(lambda: (tmp_path / "servos").exists())
+        servos.close()
+        servos = Servos(tmp_path)
+        assert servos.ping(1) == 1020
+        servos.close()
+
+
+def test_time_leaves_interruptions_out(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(module.time, "monotonic", lambda: now)
+    clock = EmulatorClock()
+    assert clock.now() == 0.0
+    now += 0.01
+    assert clock.now() == pytest.approx(0.01)
+    now += 60.0
+    assert clock.now() == pytest.approx(0.06)
+    now += 0.01
+    assert clock.now() == pytest.approx(0.07)
+
+
+def test_a_board_that_nobody_reads_disturbs_nothing(tmp_path):
+    with thread(tmp_path) as made:
+        boards = made._boards
+        until(lambda: all(board.dropped > 20 for board in boards))
+        servos = Servos(tmp_path)
+        assert servos.ping(1) == 1020
+        servos.close()
+        sensor = board(tmp_path, 0)
+        sensor.open()
+        assert sensor.counters()["skipped_bytes"] < 2 * 1026
+        sensor.close()
+    assert not os.path.lexists(tmp_path / "servos")

@@ -1,0 +1,113 @@
+"""``softfinger emulate``: the stand-in hand's process. Arguments, signals and exit status."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from daemon.settings import ServoSettings, Settings, SettingsError, load
+
+_FAULTS = """\
+faults, each KIND[=VALUE][@SECONDS], given as often as needed:
+  tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size;
+                   both boards, or one: left:silent, right:torn=0.2
+  servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY
+  servos           silent, answer, reboot, overheat, overload, undervoltage, recover =ID
+  servos' port     unplug, plug
+  @SECONDS         when it starts; at once without
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``emulate``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _FAULTS
+    parser.add_argument(
+        "--dir",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="where servos, tactile-left and tactile-right are linked; made if absent",
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    parser.add_argument("--model", metavar="NAME", help="the servos' model")
+    parser.add_argument("--ids", type=_ids, metavar="L,R", help="the servos' IDs, left first")
+    parser.add_argument(
+        "--baud",
+        type=int,
+        default=0,
+        metavar="N",
+        help="servos take the wire's time at this rate and are deaf at others; "
+        "0 answers at once and at any rate (default)",
+    )
+    parser.add_argument(
+        "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
+    )
+
+
+def _ids(text: str) -> tuple[int, ...]:
+    try:
+        ids = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        ids = ()
+    if len(ids) != 2 or ids[0] == ids[1]:
+        raise argparse.ArgumentTypeError(f"expected two different IDs such as 1,2, found {text}")
+    return ids
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Emulate until SIGINT or SIGTERM; 1 with one line when it can't be set up."""
+    try:
+        settings = _settings(arguments)
+    except SettingsError as error:
+        print(error, file=sys.stderr)
+        return 2
+    # What follows imports numpy and numba: wrong settings are told without waiting for them.
+    from daemon.realtime import settle
+    from daemon.simulation.emulator import Emulator, EmulatorError
+    from tools.run import cache_folder
+
+    try:
+        emulator = Emulator(
+            settings,
+            arguments.dir,
+            baud=arguments.baud,
+            faults=arguments.fault,
+            table_cache=cache_folder(),
+        )
+    except (EmulatorError, SettingsError) as error:
+        print(f"softfinger: {error}", file=sys.stderr)
+        return 1
+
+    def ready() -> None:
+        settle()
+        print("ready", flush=True)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: emulator.stop())
+    try:
+        emulator.run(ready)
+    finally:
+        emulator.close()
+    return 0
+
+
+def _settings(arguments: argparse.Namespace) -> Settings:
+    settings = load(arguments.config, arguments.dir)
+    changes = {}
+    if arguments.model is not None:
+        changes["model"] = arguments.model
+    if arguments.ids is not None:
+        changes["ids"] = arguments.ids
+    if not changes:
+        return settings
+    try:
+        servos = ServoSettings.model_validate({**settings.servos.model_dump(), **changes})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SettingsError(f"--ids, --model: {first['msg']}") from None
+    return settings.model_copy(update={"servos": servos})
