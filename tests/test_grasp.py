@@ -1,0 +1,198 @@
+"""Grasps in balance: the closed forms of the symmetric grasp, steering, stiffness and slip."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kinematics.contact import Fingertip
+from kinematics.fingers import HandGeometry
+from kinematics.grasp import (
+    Grasp,
+    GraspError,
+    GraspState,
+    moment_limit,
+    sheared_contact,
+    slip_margin,
+)
+from kinematics.material import Material
+from kinematics.table import ContactTable
+
+MODULUS = 0.304e6
+TIP = Fingertip(radius=0.020)
+WIDTH = 0.040
+
+# d [mm], q [°], N [N], N times its lever arm [mN·m], for L 80, B 50, W 40, e 0, a 20 mm.
+SYMMETRIC = [
+    (2, 8.6269265587, 3.8421597806, 303.895166),
+    (4, 10.0786581078, 15.4013956785, 1213.098241),
+    (6, 11.5369590328, 34.7397315634, 2723.027716),
+    (8, 13.0028781629, 61.9376635610, 4827.960422),
+]
+
+
+@pytest.fixture(scope="module")
+def paper() -> ContactTable:
+    return ContactTable.build(TIP, Material.constant(MODULUS))
+
+
+@pytest.fixture(scope="module")
+def table_i() -> ContactTable:
+    return ContactTable.build(TIP, Material.table_i(), tolerance=1e-6)
+
+
+@pytest.fixture(params=["paper", "table_i"])
+def table(request) -> ContactTable:
+    return request.getfixturevalue(request.param)
+
+
+def closed_energy(d, theta, shear, modulus=MODULUS):
+    """Energy of the parallel-distributed model with a tangential displacement."""
+    c, t = np.cos(theta), np.tan(theta)
+    return math.pi * modulus * (d**3 / (3 * c**2) + d**2 * shear * t + d * shear**2)
+
+
+def test_sheared_energy_equals_its_closed_form_and_checkpoint(paper):
+    energy = sheared_contact(paper.data, 0.006, math.radians(20), 0.0015)[0]
+    assert energy == pytest.approx(0.10953644560057, rel=1e-12)
+    generator = np.random.default_rng(1)
+    for _ in range(100):
+        d = generator.uniform(1e-4, 0.010)
+        theta = generator.uniform(-0.5, 0.5)
+        shear = generator.uniform(-0.5, 0.5) * d
+        found = sheared_contact(paper.data, d, theta, shear)[0]
+        assert found == pytest.approx(closed_energy(d, theta, shear), rel=1e-11)
+
+
+def test_sheared_partials_are_the_gradient_for_any_material(table):
+    generator = np.random.default_rng(2)
+    step = 1e-7
+    for _ in range(50):
+        at = np.array([generator.uniform(1e-3, 0.010), generator.uniform(-0.5, 0.5), 0.0])
+        at[2] = generator.uniform(-0.4, 0.4) * at[0]
+        partials = sheared_contact(table.data, *at)[1:4]
+        for j in range(3):
+            ahead, behind = at.copy(), at.copy()
+            ahead[j] += step
+            behind[j] -= step
+            slope = (
+                sheared_contact(table.data, *ahead)[0] - sheared_contact(table.data, *behind)[0]
+            ) / (2 * step)
+            assert partials[j] == pytest.approx(slope, rel=2e-6, abs=2e-6)
+
+
+@pytest.mark.parametrize(("d", "degrees", "normal", "moment"), SYMMETRIC)
+def test_symmetric_grasp_table(paper, d, degrees, normal, moment):
+    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    state = grasp.symmetric(d * 1e-3)
+    forces = grasp.forces(state)
+    np.testing.assert_allclose(np.degrees(state.q), degrees, rtol=1e-10)
+    np.testing.assert_allclose(forces.normal, normal, rtol=1e-10)
+    np.testing.assert_allclose(forces.tangential, 0, atol=1e-12)
+    lever = 0.080 * np.cos(state.q)
+    np.testing.assert_allclose(forces.normal * lever * 1e3, moment, rtol=1e-8)
+    # A joint also bears the moment by which the tilted tip turns; it is 0.1 to 0.4 % here.
+    turning = forces.turning * [1, -1]
+    np.testing.assert_allclose(forces.torque, forces.normal * lever + turning, rtol=1e-12)
+    np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)
+
+
+def test_balance_finds_the_symmetric_grasp_from_elsewhere(table):
+    grasp = Grasp(HandGeometry(), table, WIDTH)
+    best = grasp.symmetric(0.004)
+    generator = np.random.default_rng(4)
+    for _ in range(5):
+        # The object displaced with its shears rolled along: the way back must lead back.
+        away = best.pose + generator.uniform(-1, 1, 3) * [5e-4, 5e-4, 0.02]
+        middle = 0.5 * (away + best.pose)
+        rows = grasp.hand.rolling(best.q, middle, WIDTH)
+        moved = GraspState(best.q, away, best.shear + rows[:, 2:] @ (away - best.pose))
+        energy = grasp.energy(moved)
+        back = grasp.balance(moved)
+        assert grasp.energy(back) < energy
+        np.testing.assert_allclose(grasp.gradient(back)[2:], 0, atol=1e-9)
+        # Rolling is not integrable, so the loop closes only to second order of the way.
+        np.testing.assert_allclose(back.pose, best.pose, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "gain"), [(0.01, 1.5207), (1, 1.520), (5, 1.5076), (10, 1.471)]
+)
+def test_steering_gain(paper, degrees, gain):
+    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    delta = math.radians(degrees)
+    turned = grasp.steer(grasp.symmetric(0.004), delta)
+    # The sign: fingers to the right turn the object to the left, counter-clockwise.
+    assert turned.pose[2] / delta == pytest.approx(gain, abs=4e-4)
+    assert grasp.steer(grasp.symmetric(0.004), -delta).pose[2] == pytest.approx(
+        -turned.pose[2], rel=1e-9
+    )
+
+
+def test_steering_by_ten_degrees_raises_the_normal_force(paper):
+    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    start = grasp.symmetric(0.004)
+    turned = grasp.steer(start, math.radians(10), steps=128)
+    np.testing.assert_allclose(grasp.forces(start).normal, 15.40, atol=0.005)
+    np.testing.assert_allclose(grasp.forces(turned).normal, 18.35, atol=0.005)
+
+
+def test_path_integration_converges_at_second_order(paper):
+    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    start = grasp.symmetric(0.004)
+    angles = [grasp.steer(start, 0.15, steps).pose[2] for steps in (4, 8, 16, 256)]
+    errors = np.abs(np.array(angles[:3]) - angles[3])
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(4, rel=0.1)
+
+
+def test_gravity_is_borne_by_shear(table):
+    weight = 0.98
+    grasp = Grasp(HandGeometry(), table, WIDTH, weight=(0.0, -weight))
+    free = Grasp(HandGeometry(), table, WIDTH)
+    hung = grasp.balance(free.symmetric(0.004))
+    assert hung.pose[1] < free.symmetric(0.004).pose[1]
+    forces = grasp.forces(hung)
+    # Each tip's N and T in the hand's plane sum to the weight; the tips' own moments balance too.
+    np.testing.assert_allclose(forces.tangential[0], -forces.tangential[1], rtol=1e-6)
+    np.testing.assert_allclose(np.abs(forces.tangential).sum(), weight, rtol=1e-6)
+    margin = grasp.slip_margin(hung, 0.6)
+    np.testing.assert_allclose(margin, 1 - np.abs(forces.tangential) / (0.6 * forces.normal))
+
+
+def test_stiffness_predicts_the_answer_to_a_push(table):
+    free = Grasp(HandGeometry(), table, WIDTH)
+    state = free.symmetric(0.005)
+    stiffness = free.stiffness(state)[2:, 2:]
+    np.testing.assert_allclose(stiffness, stiffness.T, atol=1e-3 * np.abs(stiffness).max())
+    assert np.linalg.eigvalsh(stiffness)[0] > 0
+    push = np.array([1e-3, 2e-3])
+    pushed = Grasp(HandGeometry(), table, WIDTH, weight=tuple(push)).balance(state)
+    expected = np.linalg.solve(stiffness, [*push, 0.0])
+    np.testing.assert_allclose(pushed.pose - state.pose, expected, rtol=1e-3, atol=1e-12)
+
+
+def test_moment_limit_and_limit_surface():
+    limits = moment_limit([0.002, 0.004, 0.006, 0.008], 0.020, MODULUS, 1.0) * 1e3
+    np.testing.assert_allclose(
+        limits, [18.026678395647, 100.84588674463, 274.74235693693, 557.41116521988], rtol=1e-12
+    )
+    assert slip_margin(0.0, 0.0, 5.0, 0.5, 0.1) == 1.0
+    assert slip_margin(1.5, 0.08, 5.0, 0.5, 0.1) == pytest.approx(0.0)
+    assert slip_margin(3.0, 0.0, 5.0, 0.5, 0.1) < 0
+
+
+def test_impossible_grasps_are_refused(paper):
+    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    with pytest.raises(GraspError, match="open"):
+        grasp.symmetric(-0.001)
+    with pytest.raises(GraspError, match="outside"):
+        grasp.symmetric(0.017)
+    with pytest.raises(ValueError, match="out of reach"):
+        Grasp(HandGeometry(pivot_separation=0.3), paper, WIDTH).symmetric(0.004)
+    with pytest.raises(GraspError):
+        grasp.balance(grasp.symmetric(0.004), (0.05, 0.05))
+    with pytest.raises(ValueError, match="width"):
+        Grasp(HandGeometry(), paper, 0.0)
