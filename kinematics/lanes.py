@@ -16,25 +16,26 @@ from numba.core.extending import intrinsic
 
 LANES = 5  # polynomials
 STRIDE = 8  # coefficients stored for each power: the lanes, padded to a vector register
-TRIANGLE = 0
-SQUARE = 1
 
 _DOUBLE = ir.DoubleType()
 _VECTOR = ir.VectorType(_DOUBLE, STRIDE)
 _INDEX = ir.IntType(64)
 
 
-def _patch(context: Any, data: Any, at: Any, degree: Any, shape: Any, x: Any, y: Any) -> Any:
-    """Type of, and code for, the evaluation; see :data:`patch`."""
-    signature = types.UniTuple(types.float64, LANES)(data, types.intp, degree, shape, x, y)
+def _code(columns: Any, context: Any, data: Any, x: Any, y: Any, literals: Any) -> Any:
+    """Signature and code generator of a sum over powers of y of polynomials in x."""
+    signature = types.UniTuple(types.float64, LANES)(data, types.intp, *literals, x, y)
 
     def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         array = codegen.make_array(sig.args[0])(codegen, builder, arguments[0])
-        _, at, _, _, x, y = arguments
+        at, x, y = arguments[1], arguments[-2], arguments[-1]
         # llvmlite's own fma takes scalars only.
-        fma = cgutils.get_or_insert_function(
+        function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fma.v{STRIDE}f64"
         )
+
+        def fma(a: Any, b: Any, c: Any) -> Any:
+            return builder.call(function, [a, b, c])
 
         def spread(value: Any) -> Any:
             single = builder.insert_element(
@@ -45,17 +46,18 @@ def _patch(context: Any, data: Any, at: Any, degree: Any, shape: Any, x: Any, y:
 
         xs, ys = spread(x), spread(y)
         pointer = builder.bitcast(builder.gep(array.data, [at]), _VECTOR.as_pointer())
-        # All rows are independent until they are summed.
-        result = None
+        # All powers of y are independent, and the machine may work on them before y is known.
+        rows = []
         read = 0
-        for terms in row_lengths(degree.literal_value, shape.literal_value):
+        for terms in columns([literal.literal_value for literal in literals]):
             row = None
             for _ in range(terms):
                 place = builder.gep(pointer, [ir.Constant(_INDEX, read)])
                 vector = builder.load(place, align=8)
-                row = vector if row is None else builder.call(fma, [row, ys, vector])
+                row = vector if row is None else fma(row, xs, vector)
                 read += 1
-            result = row if result is None else builder.call(fma, [result, xs, row])
+            rows.append(row)
+        result = _in_powers(builder, fma, rows, ys)
         lanes = [
             builder.extract_element(result, ir.Constant(ir.IntType(32), i)) for i in range(LANES)
         ]
@@ -64,17 +66,46 @@ def _patch(context: Any, data: Any, at: Any, degree: Any, shape: Any, x: Any, y:
     return signature, generate
 
 
-# patch(data, at, degree, shape, x, y): the five sums Σ c_ij x^i y^j, over i + j ≤ degree when shape
-# is TRIANGLE and over i, j ≤ degree when it is SQUARE; degree and shape are literals. From data[at]
-# on stand, for i = degree … 0, the coefficients of falling powers of y, STRIDE numbers each.
-patch = cast(Any, intrinsic(prefer_literal=True))(_patch)
+def _in_powers(builder: Any, fma: Any, rows: list[Any], y: Any) -> Any:
+    """Σ rows[j] y^j by four interleaved Horner schemes in y⁴, so that the chain is short."""
+    if len(rows) < 4:
+        total = rows[-1]
+        for row in reversed(rows[:-1]):
+            total = fma(total, y, row)
+        return total
+    y2 = builder.fmul(y, y)
+    y4 = builder.fmul(y2, y2)
+    sums = []
+    for k in range(4):
+        total = None
+        for row in reversed(rows[k::4]):
+            total = row if total is None else fma(total, y4, row)
+        sums.append(total)
+    return fma(fma(sums[3], y, sums[2]), y2, fma(sums[1], y, sums[0]))
 
 
-def row_lengths(degree: int, shape: int) -> list[int]:
-    """How many coefficients stand for each power of x, the highest first."""
-    return [k + 1 if shape == TRIANGLE else degree + 1 for k in range(degree + 1)]
+def _slab(context: Any, data: Any, at: Any, nx: Any, ny: Any, x: Any, y: Any) -> Any:
+    """Type of, and code for, the evaluation; see :data:`slab`."""
+    return _code(lambda n: slab_columns(n[0], n[1]), context, data, x, y, (nx, ny))
 
 
-def patch_size(degree: int, shape: int) -> int:
-    """Numbers that :data:`patch` reads."""
-    return STRIDE * sum(row_lengths(degree, shape))
+def _square(context: Any, data: Any, at: Any, n: Any, x: Any, y: Any) -> Any:
+    """Type of, and code for, the evaluation; see :data:`square`."""
+    return _code(lambda n: square_columns(n[0]), context, data, x, y, (n,))
+
+
+# slab(data, at, nx, ny, x, y): the five sums Σ c_ij x^i y^j over the triangle of powers with the
+# corners x^nx and y^ny; square(data, at, n, x, y): over all i, j ≤ n. The degrees are literals. From
+# data[at] on stand, for j = 0, 1, …, the coefficients of falling powers of x, STRIDE numbers each.
+slab = cast(Any, intrinsic(prefer_literal=True))(_slab)
+square = cast(Any, intrinsic(prefer_literal=True))(_square)
+
+
+def slab_columns(nx: int, ny: int) -> list[int]:
+    """How many coefficients :data:`slab` has for each power of y, the lowest first."""
+    return [int((nx + 0.5) * (1.0 - j / (ny + 0.5))) + 1 for j in range(ny + 1)]
+
+
+def square_columns(n: int) -> list[int]:
+    """How many coefficients :data:`square` has for each power of y."""
+    return [n + 1] * (n + 1)

@@ -72,7 +72,13 @@ def ratios(
     """
     # h − s without cancellation: near 1, by h² − s² = c² − ρ².
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
-    y0 = math.sqrt(gap) if gap > 0.0 else 0.0
+    y0 = 0.0
+    if gap > 0.0:
+        y0 = math.sqrt(gap)
+    else:
+        # At the limit, up to θ's rounding.
+        s = h
+        c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
     span = delta / (y0 + y1)  # y1 − y0
     pieces = parts.shape[1]

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinematics.contact import Fingertip, closed_form, flatten, theta_limit
 from kinematics.kernels import kernel, source_digest
-from kinematics.lanes import SQUARE, TRIANGLE, patch
+from kinematics.lanes import slab, square
 from kinematics.material import Material
 
 FloatArray = NDArray[np.float64]
@@ -36,29 +36,41 @@ HALF_PI = math.pi / 2
 # Header of a table's array, by index.
 FORMAT, FORM, RADIUS, MODULUS, INVERSE_RADIUS = 0, 1, 2, 3, 4
 LOWEST, SHIFT, FIRST, H_PIECES, Y_PIECES = 5, 6, 7, 8, 9
-PIECES, SIZE, START, CORNER = 10, 11, 12, 13
-TOLERANCE, MAX_ERROR, WORST_D, WORST_THETA = 14, 15, 16, 17
-HEADER = 24  # a whole number of vector registers, so that coefficients stay aligned
+SIZE, CORNER, TOLERANCE, MAX_ERROR, WORST_D, WORST_THETA = 10, 11, 12, 13, 14, 15
+CENTRES = 16  # of the pieces of h, each with the inverse of its half width
 
 VERSION = 1.0
 
 # The corner h → 0: pieces over y, and terms in h and y of A and B in each; the same for all forms.
-CORNER_PIECES = 2
-CORNER_TERMS = (9, 16)
+CORNER_PIECES = 6
+CORNER_TERMS = (8, 10)
 CORNER_SIZE = 10 * CORNER_TERMS[0] * CORNER_TERMS[1]
 
-# Forms by number: degree and shape of the local polynomials. 0 is the closed form.
-CLOSED = 0
+
+class Form(NamedTuple):
+    """One representation: degrees of its local polynomials and the grid of their pieces."""
+
+    name: str
+    nx: int  # degree in h
+    ny: int  # degree in y; with ny = nx all powers, else the triangle between the two
+    bits: int  # 2^bits pieces an octave of h
+    y_pieces: int
+
+
+# Forms by number, as the header has it, cheapest first. The slabs span all of y, so that where their
+# coefficients stand depends on d alone and they are read while θ's cosine is still being computed.
 FORMS = (
-    (0, TRIANGLE),
-    (1, SQUARE),
-    (3, SQUARE),
-    (5, TRIANGLE),
-    (7, TRIANGLE),
-    (9, TRIANGLE),
-    (12, TRIANGLE),
-    (14, TRIANGLE),
+    Form("closed", 0, 0, 0, 0),
+    Form("bilinear", 1, 1, 3, 16),
+    Form("bicubic", 3, 3, 2, 8),
+    Form("quintic", 5, 5, 2, 4),
+    Form("slab 6-11", 6, 11, 2, 1),
+    Form("slab 7-18", 7, 18, 2, 1),
+    Form("slab 10-21", 10, 21, 2, 1),
+    Form("slab 12-28", 12, 28, 2, 1),
 )
+CLOSED = 0
+_SLABS = 4  # the first form that spans all of y
 
 
 class TableError(Exception):
@@ -66,23 +78,65 @@ class TableError(Exception):
 
 
 @kernel
-def _evaluate(
-    data: FloatArray, form: int, at: int, x: float, y: float
+def _sine_cosine(theta: float) -> tuple[float, float]:
+    """sin θ and cos θ to an ulp, both relative, for |θ| ≤ π/2; inlined, unlike the C library's."""
+    size = abs(theta)
+    far = size > 0.7853981633974483
+    # π/2 − |θ| keeps its digits near π/2, and so does the cosine.
+    r = (HALF_PI - size) + 6.123233995736766e-17 if far else size
+    z = r * r
+    z2 = z * z
+    z4 = z2 * z2
+    p = (-0.16666666666666666 + z * 0.00833333333333095) + z2 * (
+        -0.00019841269836759774 + z * 2.755731610309567e-06
+    )
+    p += z4 * (-2.505113194542731e-08 + z * 1.5918135792566938e-10)
+    q = (0.041666666666666664 - z * 0.0013888888888887398) + z2 * (
+        2.4801587298766353e-05 - z * 2.755731727203115e-07
+    )
+    q += z4 * (2.087614632409855e-09 - z * 1.1382636028190913e-11)
+    sine = r + r * z * p
+    half = 0.5 * z
+    most = 1.0 - half
+    cosine = most + (((1.0 - most) - half) + z2 * q)
+    if far:
+        sine, cosine = cosine, sine
+    return math.copysign(sine, theta), cosine
+
+
+_START_SLABS = CENTRES + 24  # three octaves of four pieces
+
+
+@kernel
+def _evaluate_slab(
+    data: FloatArray, form: int, i: int, x: float, y: float
 ) -> tuple[float, float, float, float, float]:
-    """The five ratios of one patch. The degrees are literals, as FORMS says."""
+    """The five ratios of a piece of h. The degrees are literals, as FORMS says."""
+    at = _START_SLABS + i * int(data[SIZE])
     if form == 5:
-        return patch(data, at, 9, 0, x, y)
+        return slab(data, at, 7, 18, x, y)
     if form == 6:
-        return patch(data, at, 12, 0, x, y)
-    if form == 3:
-        return patch(data, at, 5, 0, x, y)
+        return slab(data, at, 10, 21, x, y)
     if form == 4:
-        return patch(data, at, 7, 0, x, y)
-    if form == 7:
-        return patch(data, at, 14, 0, x, y)
+        return slab(data, at, 6, 11, x, y)
+    return slab(data, at, 12, 28, x, y)
+
+
+@kernel
+def _evaluate_local(
+    data: FloatArray, form: int, i: int, x: float, y: float
+) -> tuple[float, float, float, float, float]:
+    """The five ratios of the piece of h and y."""
+    count = int(data[Y_PIECES])
+    y *= count
+    j = min(int(y), count - 1)
+    y = 2.0 * (y - j) - 1.0
+    at = CENTRES + 2 * int(data[H_PIECES]) + (i * count + j) * int(data[SIZE])
+    if form == 1:
+        return square(data, at, 1, x, y)
     if form == 2:
-        return patch(data, at, 3, 1, x, y)
-    return patch(data, at, 1, 1, x, y)
+        return square(data, at, 3, x, y)
+    return square(data, at, 5, x, y)
 
 
 @kernel
@@ -134,68 +188,73 @@ def lookup(
     """
     radius = data[RADIUS]
     inside = True
-    limited = False
-    c = math.cos(theta)
-    rho2 = d * (radius - d + radius) * data[INVERSE_RADIUS] * data[INVERSE_RADIUS]
-    inverse = 1.0 / c
-    g = rho2 * inverse * inverse
-    if not (d > 0.0 and g <= 1.0 and d <= radius and abs(theta) <= HALF_PI):
+    h = (radius - d) * data[INVERSE_RADIUS]
+    rho2 = d * data[INVERSE_RADIUS] * (1.0 + h)
+    s, c = _sine_cosine(theta)
+    gap = c * c - rho2  # cos² θ u², and h² − sin² θ
+    if not (d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= HALF_PI):
         if math.isnan(d) or math.isnan(theta):
             nan = math.nan
             return nan, nan, nan, nan, nan, nan, False
         if d <= 0.0:
             return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
-        inside = d <= radius
-        d = min(d, radius)
-        limit = theta_limit(radius, d)
-        # Rounding alone may put g above 1 within the limit.
-        limited = True
-        inside = inside and abs(theta) <= limit
-        theta = min(max(theta, -limit), limit)
-        c = math.cos(theta)
-        inverse = 1.0 / c
-        g = min(d * (radius - d + radius) * (inverse / radius) ** 2, 1.0)
-    slope = math.sin(theta) * inverse
-    force_d = 2.0 * math.pi * data[MODULUS] * d * inverse
-    force = 0.5 * d * force_d
-    energy = force * inverse * d * (1.0 / 3.0)
+        d, theta, inside = _clamp(radius, d, theta)
+        h = (radius - d) * data[INVERSE_RADIUS]
+        s, c = _sine_cosine(theta)
+        gap = 0.0
     form = int(data[FORM])
+    # One division for 1/(h cos θ) and 1/cos θ; for h = 0 the corner does without the former.
+    over = 1.0 / (c * max(h, 1e-300))
+    inverse = over * max(h, 1e-300)
+    slope = s * inverse
+    push = math.pi * data[MODULUS] * d * inverse
+    force = push * d
+    energy = force * inverse * d * (1.0 / 3.0)
     if form == CLOSED:
         return (
             force,
             energy,
-            force_d,
+            2.0 * push,
             force * slope,
             force * inverse,
             2.0 * energy * slope,
             inside,
         )
-    h = (radius - d) * data[INVERSE_RADIUS]
-    count = int(data[Y_PIECES])
-    size = int(data[SIZE])
     if h >= data[LOWEST]:
         i = (np.float64(h).view(np.int64) >> int(data[SHIFT])) - int(data[FIRST])
         i = min(i, int(data[H_PIECES]) - 1)
-        x = (h - data[HEADER + 2 * i]) * data[HEADER + 2 * i + 1]
-        y = math.sqrt(1.0 - g) / h * count
-        j = min(int(y), count - 1)
-        at = int(data[START]) + (i * count + j) * size
-        r_f, r_u, r_fd, r_ft, r_ut = _evaluate(data, form, at, x, 2.0 * (y - j) - 1.0)
+        x = (h - data[CENTRES + 2 * i]) * data[CENTRES + 2 * i + 1]
+        y = math.sqrt(gap) * over
+        if form >= _SLABS:
+            ratios = _evaluate_slab(data, form, i, x, 2.0 * y - 1.0)
+        else:
+            ratios = _evaluate_local(data, form, i, x, y)
     else:
-        s = abs(math.sin(theta))
-        y = math.sqrt((h - s) * (h + s)) / (c * h) if h > s else 0.0
-        r_f, r_u, r_fd, r_ft, r_ut = _evaluate_corner(data, h, y)
+        s = abs(s)
+        y = math.sqrt((h - s) * (h + s)) * over if h > s else 0.0
+        ratios = _evaluate_corner(data, h, y)
+    r_f, r_u, r_fd, r_ft, r_ut = ratios
     force_theta = force * slope * r_ft
     force *= r_f
     return (
         force,
         energy * r_u,
-        force_d * r_fd,
+        2.0 * push * r_fd,
         force_theta,
         force * inverse,
         2.0 * energy * slope * r_ut,
         inside,
     )
+
+
+@kernel
+def _clamp(radius: float, d: float, theta: float) -> tuple[float, float, bool]:
+    """The nearest d and θ of the domain, and whether they were in it (rounding aside)."""
+    inside = d <= radius
+    d = min(d, radius)
+    limit = theta_limit(radius, d)
+    inside = inside and abs(theta) <= limit
+    return d, min(max(theta, -limit), limit), inside
 
 
 @kernel
@@ -254,11 +313,11 @@ class ContactTable:
         tip: Fingertip,
         material: Material,
         tolerance: float = 1e-9,
-        form: int | None = None,
+        form: str | None = None,
     ) -> ContactTable:
         """Build and certify the cheapest table that meets ``tolerance``, relative, on all outputs.
 
-        ``form`` asks for one form of FORMS by its number, whatever its cost. Raises TableError,
+        ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
         with the best that was reached, when the tolerance can't be met within 256 KiB.
         """
         # Imported here: a table that is loaded needs none of the quadrature.
@@ -337,9 +396,9 @@ class ContactTable:
         return Certificate(*(float(self.data[i]) for i in (MAX_ERROR, WORST_D, WORST_THETA)))
 
     @property
-    def form(self) -> int:
-        """Number of its form in FORMS; 0 is the closed form."""
-        return int(self.data[FORM])
+    def form(self) -> Form:
+        """Its representation."""
+        return FORMS[int(self.data[FORM])]
 
     @property
     def tip(self) -> Fingertip:

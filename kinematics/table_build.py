@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -12,10 +11,11 @@ from numpy.typing import NDArray
 
 from kinematics.contact import Fingertip, theta_limits
 from kinematics.kernels import kernel
-from kinematics.lanes import LANES, STRIDE, TRIANGLE, patch_size, row_lengths
+from kinematics.lanes import LANES, STRIDE, slab_columns, square_columns
 from kinematics.material import Material
 from kinematics.quadrature import circle_rule, exact, gauss_rule, ratios
 from kinematics.table import (
+    CENTRES,
     CLOSED,
     CORNER,
     CORNER_PIECES,
@@ -26,21 +26,19 @@ from kinematics.table import (
     FORMAT,
     FORMS,
     H_PIECES,
-    HEADER,
     INVERSE_RADIUS,
     LOWEST,
     MAX_ERROR,
     MODULUS,
-    PIECES,
     RADIUS,
     SHIFT,
     SIZE,
-    START,
     TOLERANCE,
     VERSION,
     WORST_D,
     WORST_THETA,
     Y_PIECES,
+    Form,
     TableError,
     aligned,
     lookup,
@@ -53,27 +51,6 @@ _MANTISSA = 52
 _OCTAVES = 3  # of h above the corner, where the ratios contain log h
 _SAFETY = 0.5  # of the tolerance that the fit's own estimate may use up
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
-
-
-class Plan(NamedTuple):
-    """A form and the grid of its pieces: 2^bits an octave of h, y_pieces over y."""
-
-    form: int
-    bits: int
-    y_pieces: int
-
-
-# Cheapest first, as measured; each grid is the one whose pieces suit the degree best.
-PLANS = (
-    Plan(1, 3, 16),
-    Plan(2, 2, 8),
-    Plan(3, 1, 8),
-    Plan(4, 1, 4),
-    Plan(4, 2, 8),
-    Plan(5, 1, 4),
-    Plan(6, 1, 4),
-    Plan(7, 1, 4),
-)
 
 
 @dataclass(frozen=True)
@@ -140,101 +117,123 @@ def _errors(
         out[i] = worst
 
 
-def build(tip: Fingertip, material: Material, tolerance: float, form: int | None) -> FloatArray:
+def build(tip: Fingertip, material: Material, tolerance: float, form: str | None) -> FloatArray:
     """The array of the cheapest certified table; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
+    names = [known.name for known in FORMS]
+    if form is not None and form not in names:
+        raise TableError(f"no form is called {form!r}; there are {', '.join(names)}")
     law = Law.of(material)
     best = math.inf
-    if material.is_linear and form in (None, CLOSED):
-        data = _header(tip, law, Plan(CLOSED, 0, 0), tolerance)
-        best = certify(data, law)
-        if best <= tolerance:
-            return data
-    for plan in PLANS:
-        if form is not None and plan.form != form:
+    for number, plan in enumerate(FORMS):
+        if form not in (None, plan.name) or (number == CLOSED and not material.is_linear):
             continue
-        fitted, estimate = fit(tip, law, plan, tolerance)
-        if fitted is None:
-            best = min(best, estimate)
+        data = _header(tip, law, number, tolerance)
+        if data.nbytes > MEMORY_LIMIT:
             continue
-        reached = certify(fitted, law)
-        if reached <= tolerance:
-            return fitted
-        best = min(best, reached)
+        estimate = _fit(data, law, plan, tolerance) if number != CLOSED else 0.0
+        if estimate <= _SAFETY * tolerance:
+            estimate = certify(data, law)
+            if estimate <= tolerance:
+                return data
+        best = min(best, estimate)
     raise TableError(
         f"no table within {MEMORY_LIMIT // 1024} KiB reaches {tolerance:.3g} for this material; "
         f"the best reached {best:.3g}"
     )
 
 
-def _header(tip: Fingertip, law: Law, plan: Plan, tolerance: float) -> FloatArray:
+def _header(tip: Fingertip, law: Law, number: int, tolerance: float) -> FloatArray:
     """The array with its header filled in, coefficients zero."""
-    degree, shape = FORMS[plan.form]
-    size = patch_size(degree, shape) if plan.form != CLOSED else 0
-    h_pieces = _OCTAVES << plan.bits
-    start = HEADER + -(-2 * h_pieces // STRIDE) * STRIDE
-    corner = start + h_pieces * plan.y_pieces * size
-    total = corner + CORNER_PIECES * CORNER_SIZE if plan.form != CLOSED else HEADER
-    data = aligned(total)
+    form = FORMS[number]
+    h_pieces = _OCTAVES << form.bits if number != CLOSED else 0
+    size = STRIDE * sum(_columns(form))
+    corner = CENTRES + 2 * h_pieces + h_pieces * form.y_pieces * size
+    data = aligned(corner + (CORNER_PIECES * CORNER_SIZE if number != CLOSED else 0))
+    shift = _MANTISSA - form.bits
     lowest = 0.5**_OCTAVES
-    shift = _MANTISSA - plan.bits
-    data[[FORMAT, FORM, TOLERANCE]] = VERSION, plan.form, tolerance
+    data[[FORMAT, FORM, TOLERANCE]] = VERSION, number, tolerance
     data[[RADIUS, MODULUS, INVERSE_RADIUS]] = tip.radius, law.modulus, 1.0 / tip.radius
-    if plan.form != CLOSED:
-        data[[LOWEST, SHIFT]] = lowest, shift
-        data[FIRST] = int(np.float64(lowest).view(np.int64)) >> shift
-        data[[H_PIECES, Y_PIECES, SIZE]] = h_pieces, plan.y_pieces, size
-        data[[PIECES, START, CORNER]] = h_pieces * plan.y_pieces, start, corner
-        for i in range(h_pieces):
-            low, high = _h_piece(plan, i)
-            data[HEADER + 2 * i : HEADER + 2 * i + 2] = (low + high) / 2, 2 / (high - low)
+    data[[LOWEST, SHIFT]] = lowest, shift
+    data[FIRST] = int(np.float64(lowest).view(np.int64)) >> shift
+    data[[H_PIECES, Y_PIECES, SIZE, CORNER]] = h_pieces, form.y_pieces, size, corner
+    for i in range(h_pieces):
+        low, high = _h_piece(form, i)
+        data[CENTRES + 2 * i : CENTRES + 2 * i + 2] = 0.5 * (low + high), 2.0 / (high - low)
     return data
 
 
-def _h_piece(plan: Plan, i: int) -> tuple[float, float]:
-    octave, part = divmod(i, 1 << plan.bits)
+def _columns(form: Form) -> list[int]:
+    """How many powers of x the form has for each power of y."""
+    return square_columns(form.nx) if form.nx == form.ny else slab_columns(form.nx, form.ny)
+
+
+def _h_piece(form: Form, i: int) -> tuple[float, float]:
+    octave, part = divmod(i, 1 << form.bits)
     base = 0.5 ** (_OCTAVES - octave)
-    width = base / (1 << plan.bits)
+    width = base / (1 << form.bits)
     return base + part * width, base + (part + 1) * width
 
 
-def fit(
-    tip: Fingertip, law: Law, plan: Plan, tolerance: float
-) -> tuple[FloatArray | None, float]:
-    """Fit one plan: (array, estimate), or (None, estimate) as soon as it can't meet the tolerance.
+def _fit(data: FloatArray, law: Law, form: Form, tolerance: float) -> float:
+    """Fill in a form's coefficients; returns the largest relative error to be expected.
 
-    The estimate is the largest sum of the discarded Chebyshev coefficients over the ratio.
+    That is the largest sum of the discarded Chebyshev coefficients, over the ratio. Gives up as
+    soon as it is too large for the tolerance.
     """
-    data = _header(tip, law, plan, tolerance)
-    if data.nbytes > MEMORY_LIMIT:
-        return None, math.inf
-    degree, shape = FORMS[plan.form]
-    count = degree + 3  # two more than needed, which tell what is left out
-    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-    inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
-    size, start, corner = (int(data[i]) for i in (SIZE, START, CORNER))
+    columns = _columns(form)
+    # Two more than needed in each direction, which tell what is left out.
+    x, in_x = _nodes(form.nx + 3)
+    y, in_y = _nodes(form.ny + 3)
+    kept = np.zeros((x.size, y.size), dtype=np.bool_)
+    for j, count in enumerate(columns):
+        kept[:count, j] = True
+    at = CENTRES + 2 * int(data[H_PIECES])
     estimate = 0.0
-    # From the domain's deep end, where the pieces are hardest: plans that fail, fail soon.
-    for i in reversed(range(int(data[H_PIECES]))):
-        low, high = _h_piece(plan, i)
-        h = 0.5 * (low + high) + 0.5 * (high - low) * nodes
-        for j in range(plan.y_pieces):
-            y = (j + 0.5 * (nodes + 1.0)) / plan.y_pieces
-            values = _ratios_at(law, h[:, None], y[None, :])
-            terms = np.einsum("ai,bj,kij->kab", inverse, inverse, values)
-            scale = np.abs(values).min(axis=(1, 2))
-            estimate = max(estimate, _discarded(terms, scale, degree, shape))
+    for i in range(int(data[H_PIECES])):
+        low, high = _h_piece(form, i)
+        h = 0.5 * (low + high) + 0.5 * (high - low) * x
+        for j in range(form.y_pieces):
+            places = (j + 0.5 * (y + 1.0)) / form.y_pieces
+            values = _ratios_at(law, h[:, None], places[None, :])
+            terms = np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True)
+            lost = (np.abs(terms) * ~kept).sum(axis=(1, 2)) / np.abs(values).min(axis=(1, 2))
+            estimate = max(estimate, float(lost.max()))
             if estimate > _SAFETY * tolerance:
-                return None, estimate
-            at = start + (i * plan.y_pieces + j) * size
-            data[at : at + size] = _patch(terms, degree, shape)
+                return estimate
+            numbers = _powers(terms * kept, columns)
+            data[at : at + numbers.size] = numbers
+            at += numbers.size
     for j in range(CORNER_PIECES):
         numbers, misfit = _corner(law, j)
         estimate = max(estimate, misfit)
-        at = corner + j * CORNER_SIZE
         data[at : at + CORNER_SIZE] = numbers
-    return (data if estimate <= _SAFETY * tolerance else None), estimate
+        at += CORNER_SIZE
+    return estimate
+
+
+def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
+    """Chebyshev nodes on [−1, 1] and the matrix from values there to Chebyshev coefficients."""
+    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    return nodes, np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
+
+
+def _powers(terms: FloatArray, columns: list[int]) -> FloatArray:
+    """Chebyshev coefficients [5, x, y] as the numbers that the kernels in `lanes` read."""
+    rising = np.einsum(
+        "ai,bj,kij->kab",
+        _to_powers(terms.shape[1]),
+        _to_powers(terms.shape[2]),
+        terms,
+        optimize=True,
+    )
+    out = np.zeros((sum(columns), STRIDE))
+    at = 0
+    for j, count in enumerate(columns):
+        out[at : at + count, :LANES] = rising[:, count - 1 :: -1, j].T if count else 0.0
+        at += count
+    return out.reshape(-1)
 
 
 def _ratios_at(law: Law, h: FloatArray, y: FloatArray) -> FloatArray:
@@ -253,18 +252,21 @@ def _corner(law: Law, piece: int) -> tuple[FloatArray, float]:
     """
     rows, columns = CORNER_TERMS
     lowest = 0.5**_OCTAVES
-    nodes = np.cos(np.pi * (np.arange(columns) + 0.5) / columns)
+    nodes, in_y = _nodes(columns)
     y = (piece + 0.5 * (nodes + 1.0)) / CORNER_PIECES
-    near = 0.5 * lowest * (1.0 + np.cos(np.pi * (np.arange(3 * rows) + 0.5) / (3 * rows)))
-    h = np.concatenate([near, lowest * 0.5 ** np.arange(1, _CORNER_DEEPEST, 1.0)])
+    near, _ = _nodes(2 * rows)
+    h = np.concatenate(
+        [0.5 * lowest * (near + 1.0), lowest * 0.5 ** np.arange(1, _CORNER_DEEPEST, 1.0)]
+    )
     values = np.moveaxis(_ratios_at(law, h[:, None], y[None, :]), 0, 1).reshape(h.size, -1)
     basis = chebyshev.chebvander(2.0 * h / lowest - 1.0, rows - 1)
     matrix = np.concatenate([basis, basis * np.log(h)[:, None]], axis=1)
     found = np.linalg.lstsq(matrix, values, rcond=1e-14)[0]
     misfit = float(np.max(np.abs(matrix @ found / values - 1.0)))
     terms = found.reshape(2, rows, LANES, columns)
-    in_y = _to_powers(columns) @ np.linalg.inv(chebyshev.chebvander(nodes, columns - 1))
-    powers = np.einsum("ai,bj,pikj->abpk", _to_powers(rows), in_y, terms)
+    powers = np.einsum(
+        "ai,bj,pikj->abpk", _to_powers(rows), _to_powers(columns) @ in_y, terms, optimize=True
+    )
     return powers[::-1, ::-1].reshape(-1), misfit
 
 
@@ -272,29 +274,6 @@ def _to_powers(count: int) -> FloatArray:
     """Matrix from ``count`` Chebyshev coefficients to those of rising powers."""
     columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]
     return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
-
-
-def _discarded(terms: FloatArray, scale: FloatArray, degree: int, shape: int) -> float:
-    count = terms.shape[-1]
-    i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
-    outside = i + j > degree if shape == TRIANGLE else np.maximum(i, j) > degree
-    return float(np.max((np.abs(terms) * outside).sum(axis=(1, 2)) / scale))
-
-
-def _patch(terms: FloatArray, degree: int, shape: int) -> FloatArray:
-    """Chebyshev coefficients [5, ≥ n, ≥ n] as the numbers that `lanes.patch` reads."""
-    kept = terms[:, : degree + 1, : degree + 1].copy()
-    lengths = row_lengths(degree, shape)
-    for i in range(degree + 1):
-        kept[:, i, lengths[degree - i] :] = 0.0
-    change = _to_powers(degree + 1)
-    powers = np.einsum("ai,bj,kij->abk", change, change, kept)
-    rows: list[Any] = []
-    for i in range(degree, -1, -1):
-        rows.extend(powers[i, j] for j in range(lengths[degree - i] - 1, -1, -1))
-    out = np.zeros((len(rows), STRIDE))
-    out[:, :LANES] = rows
-    return out.reshape(-1)
 
 
 def certify(data: FloatArray, law: Law, points: int = 8000, seed: int | None = None) -> float:
