@@ -13,8 +13,8 @@ import math
 from kinematics.footprint import (
     GAUSS_NODES,
     GAUSS_WEIGHTS,
-    FloatArray,
     Ends,
+    FloatArray,
     Geometry,
     Span,
     beyond_limit,

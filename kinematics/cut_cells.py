@@ -49,8 +49,14 @@ def integrate_lines(
         rim = a2 - y * y
         q = u - w * y
         root = math.sqrt(max(stretch * rim - q * q, 0.0))
-        left = max((v * q - root) * e, x0)
-        right = min((v * q + root) * e, x0 + pitch_x)
+        # A root under the base plane is no edge: there the rim is.
+        edge = math.sqrt(max(rim, 0.0))
+        left = (v * q - root) * e
+        right = (v * q + root) * e
+        left = -edge if q < v * left else left
+        right = edge if q < v * right else right
+        left = max(left, x0)
+        right = min(right, x0 + pitch_x)
         width = max(right - left, 0.0)
         left += width * lines[PART_FROM, k]
         width *= lines[PART, k]
@@ -60,6 +66,9 @@ def integrate_lines(
         gb = 1.0 / math.sqrt(max(rim - xb * xb, 1e-9 * a2))
         weight = lines[STRIP, k] * width
         half = 0.5 * weight
+        # Under the base plane the strain stays 1.
+        ga = ga if q > v * xa else 0.0
+        gb = gb if q > v * xb else 0.0
         face_a = (q - v * xa) * ga
         face_b = (q - v * xb) * gb
         lines[AREA, k] = weight

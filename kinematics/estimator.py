@@ -1,8 +1,8 @@
 """Pressure grid → displacement, tilt, gain and their covariance.
 
 Holds `ContactEstimator` and its result. The ladder it climbs for a frame, in one compiled call, is
-in ladder.py: an activity test; centroid and extent over the footprint (moments.py); Gauss-Newton on
-the likelihood of every cell in the footprint (gauss_newton.py).
+in ladder.py: an activity test (activity.py); centroid and extent over the footprint (moments.py);
+Gauss-Newton on the likelihood of every cell in the footprint (gauss_newton.py).
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ class ContactEstimate:
     cells: int = 0  # cells in the fit
     iterations: int = 0
     rejected: int = 0  # hot cells left out
+    second: bool = False  # something else presses too, off the footprint
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
     @property
@@ -86,7 +87,7 @@ class ContactEstimator:
     step, in units of the noise floor, is below it (below 1 where it started from the frame alone):
     a step leaves an error of its square's order, so one of 4 σ ends well inside the noise.
     ``peak_level`` and ``patch_level`` set the activity test, see
-    :func:`kinematics.moments.activity`; ``explained_min`` is the share of the frame's squared
+    :func:`kinematics.activity.activity`; ``explained_min`` is the share of the frame's squared
     pressure below which an estimate is not valid.
 
     Raises ValueError for arguments out of their range.
@@ -108,7 +109,7 @@ class ContactEstimator:
         iterations: int = 20,
         peak_level: float = 3.0,
         patch_level: float = 4.9,
-        explained_min: float = 0.7,
+        explained_min: float = 0.8,
     ) -> None:
         if not (math.isfinite(noise) and noise > 0.0):
             raise ValueError(f"noise must be a positive number of Pa, got {noise}")
@@ -230,6 +231,7 @@ class ContactEstimator:
         result.cells = int(state[ladder.CELLS])
         result.iterations = int(state[ladder.ITERATIONS])
         result.rejected = int(state[ladder.REJECTED])
+        result.second = state[ladder.SECOND] > 0.0
         return result
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from kinematics.footprint import FloatArray, Geometry, IntArray, plane
 from kinematics.kernels import kernel
-from kinematics.likelihood import SUMS, accumulate, pack
+from kinematics.likelihood import SUMS, accumulate, footprint_energy, pack
 
 # Places in what a fit leaves in ``result``.
 D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)
@@ -126,6 +126,9 @@ def fit(
     law: FloatArray,
     free: bool,
     saturation: float,
+    clipped: bool,
+    energy: float,
+    number: float,
     variance: float,
     tolerance: float,
     iterations: int,
@@ -138,7 +141,9 @@ def fit(
 ) -> bool:
     """Gauss-Newton from the contact in ``result`` (D, N_X, N_Y, GAIN), the estimate left there.
 
-    ``variance`` [Pa²] is a cell's, ``saturation`` [Pa] its end. Stops when the promised decrement
+    ``variance`` [Pa²] is a cell's, ``saturation`` [Pa] its end;
+    ``clipped``: cells can't read below 0. ``energy`` and ``number`` are Σ p² [Pa²] and the number
+    of the live cells in the tip's disc. Stops when the promised decrement
     is below ``tolerance`` · variance, that is the step is that part of the noise floor, squared.
     RESIDUAL takes Σ over the footprint of (reading − model)² − reading² [Pa²]. False when the
     frame doesn't determine the contact or the iteration doesn't settle.
@@ -157,7 +162,16 @@ def fit(
     solved = False
     for iteration in range(iterations):
         count = pack(u, v, w, geometry, cells, frame, scale, columns, lines, owners, packed)
-        accumulate(packed, count, u, v, w, gain, saturation, law, sums)
+        clip = 0.0
+        if clipped:
+            # Free cells that end at 0 show half of the noise's variance; where a board sends no
+            # noise at all there is nothing to correct.
+            inside, inside_number = footprint_energy(packed, count)
+            clip = math.sqrt(variance)
+            if number - inside_number >= 16.0:
+                free_square = max(energy - inside, 0.0) / (number - inside_number)
+                clip = min(clip, math.sqrt(2.0 * free_square))
+        accumulate(packed, count, u, v, w, gain, saturation, clip, law, sums)
         now = sums[14] - sums[15]
         if solved and not now <= cost + variance and halvings < 5:
             # Too far: half way back.

@@ -11,13 +11,14 @@ import math
 import numpy as np
 
 from kinematics import gauss_newton
+from kinematics.activity import activity, is_spike, presses_outside
 from kinematics.cells import LIVE
 from kinematics.cut_cells import LINE_ROWS, LINES, OWNERS, PLANES
 from kinematics.footprint import FloatArray, IntArray
 from kinematics.gauss_newton import RESULT, fit
 from kinematics.kernels import fast_kernel, kernel
 from kinematics.likelihood import SUMS
-from kinematics.moments import RATIO_POINTS, activity, coarse, is_spike, refine
+from kinematics.moments import RATIO_POINTS, coarse, refine
 
 # Places in the state: what a frame leaves, and where the next one starts. The estimate in the
 # sensor's axes comes first, then what is told in the finger's.
@@ -38,8 +39,9 @@ from kinematics.moments import RATIO_POINTS, activity, coarse, is_spike, refine
     EXPLAINED,
     PEAK,
     REJECTED,
-) = range(16)
-TOLD = 16
+    SECOND,
+) = range(17)
+TOLD = 17
 COVARIANCE = TOLD  # 4 × 4 of (d, tilt_x, tilt_y, gain) in the finger's axes
 STATE = COVARIANCE + 16
 
@@ -61,6 +63,8 @@ STATE = COVARIANCE + 16
 OPTIONS = 17
 
 SPIKES_MAX = 6  # hot cells left out of one frame
+GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
+D_MAX = 0.75  # of the radius
 
 
 @fast_kernel
@@ -79,8 +83,7 @@ def _row_energy(row: FloatArray, live: FloatArray) -> tuple[float, float]:
 @kernel
 def _energy(frame: FloatArray, cells: FloatArray, runs: IntArray) -> tuple[float, float]:
     """Σ p² over the live cells in the tip's disc, and their number."""
-    total = 0.0
-    number = 0.0
+    total = number = 0.0
     for i in range(frame.shape[0]):
         first = runs[i, 0]
         last = runs[i, 1]
@@ -137,6 +140,7 @@ def _likelihood(
     covariance: FloatArray,
     floats: FloatArray,
     owners: IntArray,
+    clipped: bool,
 ) -> bool:
     """Maximum likelihood from the last estimate, or from the frame's moments if that fails."""
     geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
@@ -146,12 +150,13 @@ def _likelihood(
     line_end = small + LINE_ROWS * LINES
     lines = floats[small:line_end].reshape(LINE_ROWS, LINES)
     packed = floats[line_end : line_end + PLANES * rows * cols].reshape(PLANES, rows * cols)
+    noise = math.sqrt(variance) / scale
     energy, number = _energy(frame, cells, runs)
     energy *= scale * scale
-    noise = math.sqrt(variance) / scale
     for attempt in range(2):
         if attempt == 0 and not state[WARM] > 0.0:
             continue
+        state[SECOND] = 0.0
         if attempt == 1:
             _start(frame, cells, runs, ratios, plan, scale, noise, row, col, state, covariance)
         if not free:
@@ -164,6 +169,9 @@ def _likelihood(
             law,
             free,
             plan[SATURATION] * scale,
+            clipped,
+            energy,
+            number,
             variance,
             plan[TOLERANCE] if attempt == 0 else min(plan[TOLERANCE], 1.0),
             int(plan[ITERATIONS_MAX]),
@@ -177,7 +185,17 @@ def _likelihood(
             # Share of the frame's squared pressure, noise apart, that the model accounts for.
             misfit = max(energy + state[RESIDUAL] - number * variance, 0.0)
             state[EXPLAINED] = 1.0 - misfit / max(energy, variance)
-            if state[EXPLAINED] >= plan[EXPLAINED_MIN]:
+            if state[EXPLAINED] < plan[EXPLAINED_MIN]:
+                continue
+            if not (GAIN_MIN < state[GAIN] < GAIN_MAX and state[D] < D_MAX * geometry[0]):
+                continue
+            # Only pressure beyond the footprint that is no noise and no small part asks for a look.
+            if misfit > 8.0 * variance * math.sqrt(2.0 * number) + 0.003 * energy:
+                level = max(5.0 * noise, 0.15 * state[PEAK] / scale)
+                state[SECOND] = presses_outside(
+                    frame, cells, geometry, runs, level, state[D], state[N_X], state[N_Y]
+                )
+            if not state[SECOND] > 0.0:
                 return True
     return False
 
@@ -242,7 +260,7 @@ def estimate_frame(
     confined = 6.0 * plan[MODULUS] * (max(plan[3], plan[4]) / plan[0]) ** 2 / scale
     spikes = np.empty((SPIKES_MAX, 2), dtype=np.int64)
     rejected = 0
-    contact, row, col, peak, low, finite = activity(
+    contact, row, col, peak, mean, finite = activity(
         frame, cells, runs, noise, plan[PEAK_LEVEL], plan[PATCH_LEVEL]
     )
     while (
@@ -255,13 +273,13 @@ def estimate_frame(
         spikes[rejected, 0] = row
         spikes[rejected, 1] = col
         rejected += 1
-        contact, row, col, peak, low, finite = activity(
+        contact, row, col, peak, mean, finite = activity(
             frame, cells, runs, noise, plan[PEAK_LEVEL], plan[PATCH_LEVEL]
         )
     state[PEAK] = peak * scale
     state[REJECTED] = rejected
     # A baseline far below zero is a sensor to tare, not a tip in the air.
-    valid = finite and low <= 2 and rejected < SPIKES_MAX
+    valid = finite and mean > -3.0 * noise and rejected < SPIKES_MAX
     done = False
     if contact and finite:
         state[CONTACT] = 1.0
@@ -303,6 +321,7 @@ def estimate_frame(
                 covariance,
                 floats,
                 owners,
+                step > 0.0,
             )
         _tell(plan, state, covariance)
         valid = valid and done

@@ -48,6 +48,12 @@ from kinematics.footprint import (
 from kinematics.kernels import fast_kernel, kernel
 
 SUMS = 17
+
+# A cell that can't read below 0 reads more than the pressure on average, by E[max(z + e, 0)] − z
+# standard deviations at a pressure of z, e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this
+# polynomial, within 3e-4.
+CLIP_END = 3.5
+CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 LAW_PIECES = 128
 
 
@@ -131,8 +137,9 @@ def pack(
                 fine = x_far * x_far + y_far * y_far > 0.81 * a * a
                 crossings = (columns[j, 0], columns[j, 1], columns[j + 1, 0], columns[j + 1, 1])
                 line = push_lines(lines, line, x0, y0, y1, ends[0], ends[1], crossings, fine)
-                packed[READING, count] = frame[i, j] * scale
-                packed[WEIGHT, count] = cells[i, LIVE, j]
+                live = cells[i, LIVE, j]
+                packed[READING, count] = frame[i, j] * scale if live > 0.0 else 0.0
+                packed[WEIGHT, count] = live
                 owners[0, waiting] = count
                 owners[1, waiting] = line
                 waiting += 1
@@ -172,8 +179,22 @@ def copy_whole(
             + v * (v * cells[X_VAR, k] + 2.0 * w * cells[X_Y, k])
             + w * w * cells[Y_VAR, k]
         )
-        out[READING, k] = row[k] * scale
-        out[WEIGHT, k] = cells[LIVE, k]
+        reading = row[k]
+        live = cells[LIVE, k]
+        out[READING, k] = reading * scale if live > 0.0 else 0.0
+        out[WEIGHT, k] = live
+
+
+@fast_kernel
+def footprint_energy(packed: FloatArray, count: int) -> tuple[float, float]:
+    """Σ W p² [Pa²] and Σ W over the packed cells."""
+    energy = 0.0
+    number = 0.0
+    for k in range(count):
+        weight = packed[WEIGHT, k]
+        energy += weight * packed[READING, k] * packed[READING, k]
+        number += weight
+    return energy, number
 
 
 @fast_kernel
@@ -185,6 +206,7 @@ def accumulate(
     w: float,
     gain: float,
     saturation: float,
+    clip: float,
     law: FloatArray,
     sums: FloatArray,
 ) -> None:
@@ -193,9 +215,11 @@ def accumulate(
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
     factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
     sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
-    below its end.
+    below its end. ``clip`` > 0 is the noise of cells that can't read below 0 [Pa].
     """
     pieces = law.shape[0] - 1
+    clipped = 1.0 if clip > 0.0 else 0.0
+    per_clip = 1.0 / clip if clip > 0.0 else 0.0
     s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
     r0 = r1 = r2 = r3 = rr = yy = ww = 0.0
     for k in range(count):
@@ -217,8 +241,17 @@ def accumulate(
         reading = packed[5, k]
         weight = packed[6, k]
         model = gain * stress
-        weight = 0.0 if (reading >= saturation and model >= saturation) else weight
-        residual = reading - model
+        z = min(model * per_clip, CLIP_END)
+        above = 1.0 - z / CLIP_END
+        base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
+        rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
+        residual = reading - model - clip * above * above * base
+        response = 1.0 + clipped * above * (above * rise - 2.0 / CLIP_END * base)
+        full = reading >= saturation and model >= saturation
+        squares = weight * reading * reading
+        weight = 0.0 if full else weight
+        stress *= response
+        slope *= response
         a1 = slope * g
         a2 = slope * g_x
         a3 = slope * g_y
@@ -241,7 +274,7 @@ def accumulate(
         r2 += w2 * residual
         r3 += w3 * residual
         rr += weight * residual * residual
-        yy += weight * reading * reading
+        yy += squares
         ww += weight
     sums[0] = s00
     sums[1] = s01

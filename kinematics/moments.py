@@ -1,7 +1,7 @@
-"""From a pressure grid to a first estimate: is there a contact, its centroid and its extent.
+"""From a pressure grid to a first estimate: the contact's centroid and extent.
 
-Kernels for the activity test and for the moments of the pressure over the footprint, and the
-relations between those and (d, n). For a constant modulus they are closed:
+Kernels for the moments of the pressure over the footprint, and the relations between those and
+(d, n). For a constant modulus they are closed:
 
     F = πE d²/cos θ,   centroid = (a − d/3)(n_x, n_y),
     trace of the covariance = d(4a − d)/6 − sin²θ d(12a − 5d)/36;
@@ -80,107 +80,6 @@ def _ratio(ratios: FloatArray, a: float, d: float, column: int) -> float:
     k = int(t)
     t -= k
     return float(ratios[k, column] * (1.0 - t) + ratios[k + 1, column] * t)
-
-
-@fast_kernel
-def _row_scan(row: FloatArray, live: FloatArray, level: float) -> tuple[float, float, float]:
-    """Live cells of a row above ``level`` and below −4 · level, and the sum, which tells NaN."""
-    over = 0.0
-    under = 0.0
-    total = 0.0
-    bottom = -4.0 * level
-    for j in range(row.shape[0]):
-        value = row[j]
-        mask = live[j]
-        value = value if mask > 0.0 else 0.0
-        over += 1.0 if value > level else 0.0
-        under += 1.0 if value < bottom else 0.0
-        total += value
-    return over, under, total
-
-
-@kernel
-def _neighbourhood(frame: FloatArray, cells: FloatArray, i: int, j: int) -> float:
-    """How far the 5 × 5 cells round (i, j), without the middle one, stand above noise 1.
-
-    Weights (1, 2, 2, 2, 1) both ways; the sum over its standard deviation.
-    """
-    rows, cols = frame.shape
-    total = 0.0
-    squares = 1e-30
-    for k in range(max(i - 2, 0), min(i + 3, rows)):
-        row_weight = 1.0 if abs(k - i) == 2 else 2.0
-        for m in range(max(j - 2, 0), min(j + 3, cols)):
-            if cells[k, LIVE, m] > 0.0 and not (k == i and m == j):
-                weight = row_weight if abs(m - j) == 2 else 2.0 * row_weight
-                total += weight * frame[k, m]
-                squares += weight * weight
-    return total / math.sqrt(squares)
-
-
-@kernel
-def activity(
-    frame: FloatArray,
-    cells: FloatArray,
-    runs: IntArray,
-    noise: float,
-    peak_level: float,
-    patch_level: float,
-) -> tuple[bool, int, int, float, float, bool]:
-    """Cheap test: (contact, row and column of the largest cell, that cell, low cells, finite).
-
-    ``noise`` is a cell's standard deviation in the frame's unit. A contact is a cell above
-    ``peak_level`` · noise whose neighbours' weighted sum, itself left out, passes ``patch_level``
-    standard deviations: one hot cell alone is none. ``runs`` [rows, 2] are the columns inside the
-    tip's disc.
-    """
-    level = peak_level * noise
-    contact = False
-    row = -1
-    col = -1
-    peak = 0.0
-    low = 0.0
-    total = 0.0
-    for i in range(frame.shape[0]):
-        first = runs[i, 0]
-        last = runs[i, 1]
-        over, under, row_sum = _row_scan(frame[i, first:last], cells[i, LIVE, first:last], level)
-        total += row_sum
-        low += under
-        if over > 0.0:
-            for j in range(first, last):
-                value = frame[i, j]
-                if value > level and cells[i, LIVE, j] > 0.0:
-                    if value > peak:
-                        peak = value
-                        row = i
-                        col = j
-                    if not contact:
-                        contact = _neighbourhood(frame, cells, i, j) > patch_level * noise
-    return contact, row, col, peak, low, math.isfinite(total) and math.isfinite(peak)
-
-
-@kernel
-def is_spike(
-    frame: FloatArray, cells: FloatArray, i: int, j: int, noise: float, confined: float
-) -> bool:
-    """Whether the cell stands alone as no contact can: a hot cell.
-
-    ``confined`` is what a contact no wider than a cell could press at most.
-    """
-    rows, cols = frame.shape
-    total = 0.0
-    number = 0
-    for k, m in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
-        if 0 <= k < rows and 0 <= m < cols and cells[k, LIVE, m] > 0.0:
-            total += frame[k, m]
-            number += 1
-    if number == 0:
-        return False
-    return bool(
-        frame[i, j] > 10.0 * noise + confined
-        and frame[i, j] > 4.0 * (max(total, 0.0) / number + 3.0 * noise)
-    )
 
 
 @fast_kernel

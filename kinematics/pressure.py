@@ -34,7 +34,6 @@ from kinematics.footprint import (
 from kinematics.kernels import kernel
 from kinematics.material import Material
 
-
 NODES = 512 + NODES_A_CELL
 OWNERS = 256
 
