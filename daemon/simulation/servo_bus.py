@@ -26,6 +26,16 @@ from daemon.simulation.joint_plant import JointPlant
 from daemon.simulation.protocol import BROADCAST, Packet, Parser
 from daemon.simulation.servo import EmulatedServo
 
+_READS = frozenset(
+    (
+        protocol.PING,
+        protocol.READ,
+        protocol.SYNC_READ,
+        protocol.FAST_SYNC_READ,
+        protocol.BULK_READ,
+        protocol.FAST_BULK_READ,
+    )
+)
 _FACTORY_RESET_GUARD = 42  # firmware that ignores a broadcast reset of everything
 
 
@@ -59,6 +69,7 @@ class ServoBus:
         self.packets = 0
         self._crc_reply = crc_reply
         self._now = -math.inf
+        self._due = -math.inf  # no servo does anything by itself before then
         self._unicast: dict[int, Callable[[EmulatedServo, bytes, float], tuple[int, bytes]]] = {
             protocol.PING: self._ping,
             protocol.READ: self._read,
@@ -124,17 +135,19 @@ class ServoBus:
         """Bring plant and servos to time t [s]; each servo's own events happen at their time."""
         if t <= self._now:
             return
-        servos, plant = self.servos, self.plant
-        while (due := min(servo.next_event() for servo in servos)) <= t:
-            plant.advance(due)
-            for servo in servos:
-                servo.act(due)
-        plant.advance(t)
+        if t >= self._due:
+            servos, plant = self.servos, self.plant
+            while (due := min(servo.next_event() for servo in servos)) <= t:
+                plant.advance(due)
+                for servo in servos:
+                    servo.act(due)
+            self._due = due
+        self.plant.advance(t)
         self._now = t
 
     def next_event(self) -> float:
-        """When a servo next does something by itself [s]."""
-        return min(servo.next_event() for servo in self.servos)
+        """When a servo next does something by itself [s]; possibly too early, never too late."""
+        return self._due
 
     # --- bytes -----------------------------------------------------------------------------
 
@@ -155,6 +168,8 @@ class ServoBus:
                 for servo in listening:
                     servo.heard(t)
                 replies += self._answers(packet, listening, t)
+                if packet.instruction not in _READS:
+                    self._due = min(servo.next_event() for servo in self.servos)
             elif self._crc_reply:
                 replies += [
                     self._status(servo, protocol.CRC_ERROR)
@@ -176,6 +191,7 @@ class ServoBus:
             FaultError: it can't be understood, or no servo has that ID.
         """
         kind, number = parse_fault(text)
+        self._due = -math.inf
         if kind in REPLY_FAULTS:
             setattr(self.faults.rates, kind, number)
             return
