@@ -36,21 +36,21 @@ NODES_A_CELL = (MAX_BREAKS - 1) * ANGLE_NODES * 2 * ANGLE_NODES
 
 @kernel
 def nodes_needed(a: float, half: float, far: float) -> int:
-    """Gauss points in one direction for a relative 1e-7 in a cell, 0 where the angle must be used.
+    """Gauss points a direction that keep a cell well within 1e-6 E; 0 where the angle is needed.
 
     ``far`` is the distance of the farthest point from the axis, ``half`` half the cell's longer
     side: the rim is a branch point at (a − far)/half half-lengths behind the cell's end.
     """
     t = (a - far) / half
-    if t > 12.0:
+    if t > 18.0:
         return 2
-    if t > 4.5:
+    if t > 6.0:
         return 3
-    if t > 2.0:
+    if t > 3.0:
         return 4
-    if t > 1.0:
+    if t > 1.3:
         return 6
-    if t > 0.5:
+    if t > 0.7:
         return 8
     return 0
 
@@ -200,8 +200,9 @@ def push_cut(
         y_far = max(abs(start), abs(start + length))
         x_far = max(abs(max(left, x0)), abs(min(right, x1)))
         n = nodes_needed(a, 0.5 * max(x1 - x0, y1 - y0), math.hypot(x_far, y_far))
-        # At the outline's lowest and highest point, and at the rim, lines end like a square root.
-        rounded = n == 0 or start == ends[0] or start + length >= ends[1]
+        # Near the outline's lowest and highest point, and the rim, lines end like a square root.
+        near = min(start - ends[0], ends[1] - start - length)
+        rounded = n == 0 or near < 0.5 * length
         m = ANGLE_NODES if n == 0 else max(n, 7) if rounded else max(n, 4)
         for k in range(m):
             t = GAUSS_NODES[m, k]
