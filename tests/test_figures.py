@@ -1,0 +1,259 @@
+"""The figures' numbers against published and derived values, their files, and their pictures."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tools import cli, figures
+from tools.figure_pages import style
+from tools.figure_pages.integrals import double_integrals
+from tools.figure_pages.sheets import sheet
+
+# Radius 20 mm, E = 0.304 MPa: d [mm], θ [deg], F [N], U [mJ].
+CHECKPOINTS = (
+    (2, 0, 3.8201766667652, 2.5467844445101),
+    (2, 15, 3.9549379080604, 2.7296353408105),
+    (2, 30, 4.4111600538176, 3.3957125926802),
+    (4, 0, 15.280706667061, 20.374275556081),
+    (4, 15, 15.819751632242, 21.837082726484),
+    (4, 30, 17.64464021527, 27.165700741441),
+    (6, 15, 35.594441172543, 73.700154201884),
+    (6, 30, 39.700440484359, 91.684240002365),
+    (8, 0, 61.122826668243, 162.99420444865),
+    (8, 15, 63.279006528966, 174.69666181187),
+    (8, 30, 70.578560861082, 217.32560593153),
+)
+
+
+def read(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Columns of a CSV of numbers by their header; an empty cell is NaN."""
+    with path.open(encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    numbers = np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
+    return dict(zip(rows[0], numbers.T, strict=True))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All figures, written by the command itself into a folder that it has to make."""
+    path = tmp_path_factory.mktemp("figures") / "new" / "folder"
+    assert cli.main(["figures", "--out", str(path)]) == 0
+    return path
+
+
+@pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
+def test_checkpoints_over_displacement(
+    folder: Path, d: int, theta: int, force: float, energy: float
+) -> None:
+    for name, equation, unit, value in (("4b", 3, "N", force), ("5b", 10, "mJ", energy)):
+        columns = read(folder / f"fig{name}.csv")
+        (row,) = np.flatnonzero(columns["d [mm]"] == d)
+        symbol = "F" if unit == "N" else "U"
+        closed = columns[f"{symbol} at {theta} deg [{unit}]"][row]
+        integral = columns[f"{symbol} by eq. {equation} at {theta} deg [{unit}]"][row]
+        assert closed == pytest.approx(value, rel=1e-13)
+        assert integral == pytest.approx(value, rel=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("d", "theta", "force", "energy"), [each for each in CHECKPOINTS if each[1] < 30]
+)
+def test_checkpoints_over_tilt(
+    folder: Path, d: int, theta: int, force: float, energy: float
+) -> None:
+    for name, symbol, unit, value in (("4a", "F", "N", force), ("5a", "U", "mJ", energy)):
+        columns = read(folder / f"fig{name}.csv")
+        tilt = columns["theta [deg]"]
+        curve = columns[f"{symbol} at d = {d} mm [{unit}]"]
+        assert (tilt[0], tilt[-1]) == (-25.0, 25.0)
+        assert curve[np.abs(tilt) == theta] == pytest.approx(value, rel=1e-13)
+        assert np.argmin(curve) == np.flatnonzero(tilt == 0.0)[0]
+
+
+@pytest.mark.parametrize(("name", "exponent"), [("fig4b", 2), ("fig5b", 3)])
+def test_exponents_are_exact_and_only_the_prefactor_depends_on_the_tilt(
+    folder: Path, name: str, exponent: int
+) -> None:
+    columns = list(read(folder / f"{name}_exponents.csv").values())
+    theta, fitted, factor, expected = columns
+    np.testing.assert_array_equal(theta, np.arange(0.0, 31.0, 5.0))
+    np.testing.assert_allclose(fitted, exponent, atol=1e-11)
+    np.testing.assert_allclose(expected, np.cos(np.radians(theta)) ** (1 - exponent), rtol=1e-13)
+    np.testing.assert_allclose(factor, expected, rtol=1e-11)
+    curves = read(folder / f"{name}.csv")
+    for tilt, value in zip(theta, expected, strict=True):
+        flat = curves[f"factor at {tilt:g} deg [1]"]
+        assert np.isnan(flat[0])  # nothing over nothing at d = 0
+        np.testing.assert_allclose(flat[1:], value, rtol=1e-10)
+
+
+def test_double_integrals_meet_the_one_dimensional_form() -> None:
+    # Another route to eqs. 3 and 10: y by hand, x by Gauss in t. Tilted close to the limit, 36.87°.
+    a, d, theta, modulus = 0.02, 0.008, np.radians(34.0), 0.304e6
+    points, weights = np.polynomial.legendre.leggauss(200)
+    t = points * np.pi / 2
+    s, c, h = np.sin(theta), np.cos(theta), a - d
+    rho = np.sqrt(2 * a * d - d * d)
+    x, b = h * s + rho * c * np.sin(t), rho * np.cos(t)
+    dx = weights * np.pi / 2 * rho * c * np.cos(t)
+    q, r2 = (h - x * s) / c, a * a - x * x
+    angle = np.arcsin(b / np.sqrt(r2))
+    force = modulus * np.sum((2 * b - 2 * q * angle) * dx)
+    energy = 0.5 * modulus * np.sum(((r2 + 2 * q * q) * angle - 3 * q * b) * dx)
+    got = double_integrals(a, modulus, d, theta)
+    np.testing.assert_allclose(got, (force, energy), rtol=1e-9)
+
+
+def test_table_i(folder: Path) -> None:
+    with (folder / "table_i.csv").open(encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == [
+        "entry",
+        "strain [%]",
+        "modulus in the paper [MPa]",
+        "modulus of the law [MPa]",
+    ]
+    assert [row[0] for row in rows[1:]] == ["Min", "20 %", "40 %", "60 %", "80 %", "100 %", "Max"]
+    printed = (0.135, 0.149, 0.182, 0.201, 0.207, 0.255, 0.304)
+    assert [float(row[2]) for row in rows[1:]] == pytest.approx(printed)
+    for row in rows[1:-1]:
+        assert float(row[3]) == pytest.approx(float(row[2]), rel=1e-12)
+    assert rows[-1][1] == rows[-1][3] == ""  # beyond the law's range
+    curve = read(folder / "fig3.csv")
+    slope = np.gradient(curve["stress [MPa]"], curve["strain [%]"] / 100.0)
+    np.testing.assert_allclose(slope[1:-1], curve["modulus [MPa]"][1:-1], rtol=2e-3)
+    assert curve["stress [MPa]"][0] == 0.0
+
+
+def test_compression_through_the_sensor(folder: Path) -> None:
+    columns = read(folder / "fig7.csv")
+    d = columns["d [mm]"]
+    assert (d[0], d[-1]) == (0.0, 8.0)
+    for tilt in range(0, 31, 5):
+        model = columns[f"F at {tilt} deg [N]"]
+        sensed = columns[f"F through the sensor at {tilt} deg [N]"]
+        law = columns[f"F of Table I's law at {tilt} deg [N]"]
+        expected = np.pi * 0.304 * d**2 / np.cos(np.radians(tilt))
+        np.testing.assert_allclose(model, expected, rtol=1e-12)
+        # The cells' quadrature loses some digits; the paper's sensor has three.
+        np.testing.assert_allclose(sensed, model, rtol=1e-4)
+        # Between what the least and the greatest modulus below full compression would give.
+        assert np.all(law[1:] > 0.135 / 0.304 * model[1:])
+        assert np.all(law[1:] < 0.255 / 0.304 * model[1:])
+
+
+def test_path_of_tilt_and_roll(folder: Path) -> None:
+    rotation, rolling = read(folder / "fig10a.csv"), read(folder / "fig10b.csv")
+    theta = rolling["theta [deg]"]
+    assert (theta[0], theta[-1]) == (-11.5, 9.2)
+    for d in (2, 4, 6, 8):
+        ratio = rolling[f"F/F(0) at d = {d} mm [1]"]
+        assert ratio[0] == pytest.approx(1.02048656931, rel=1e-11)
+        assert ratio[-1] == pytest.approx(1.01303136698, rel=1e-11)
+        law = rolling[f"F/F(0) of Table I's law at d = {d} mm [1]"]
+        for curve in (ratio, law):
+            assert theta[np.argmin(curve)] == 0.0
+        # A modulus that rises with strain deepens the minimum.
+        assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
+        # The rotation ends where the rolling starts.
+        last = rotation[f"F, d up to {d} mm [N]"][-1]
+        assert last == pytest.approx(rolling[f"F at d = {d} mm [N]"][0], rel=1e-12)
+        assert rotation[f"d up to {d} mm [mm]"][0] == 0.0
+        assert rotation[f"d up to {d} mm [mm]"][-1] == pytest.approx(d, rel=1e-12)
+
+
+def test_every_figure_has_picture_and_errata(folder: Path) -> None:
+    from matplotlib.image import imread
+
+    for name, page in figures.pages().items():
+        picture = imread(folder / f"{name}.png")
+        height, width = picture.shape[:2]
+        size = (width / style.DPI, height / style.DPI)
+        assert size == pytest.approx(page.size, abs=0.01)
+        # Something is drawn, in every quarter of it.
+        dark = picture[..., :3].min(axis=-1) < 0.8
+        for rows in (slice(None, height // 2), slice(height // 2, None)):
+            for columns in (slice(None, width // 2), slice(width // 2, None)):
+                assert dark[rows, columns].mean() > 0.01, name
+    with (folder / "errata.csv").open(encoding="utf-8") as file:
+        errata = list(csv.DictReader(file))
+    holds = dict.fromkeys(figures.NAMES, "")
+    for row in errata:
+        holds[row["figure"]] += row["holds"]
+    assert "exponent is exactly 2" in holds["fig4b"]
+    assert "exponent is exactly 3" in holds["fig5b"]
+    assert "1/cos θ" in holds["fig4b"]
+    assert "1/cos² θ" in holds["fig5b"]
+    assert "rises with strain" in holds["fig3"]
+
+
+def test_errata_and_labels_stand_in_the_pictures() -> None:
+    for page in figures.pages().values():
+        with style.settings():
+            figure = style.new_figure(*page.size)
+            page.draw(figure, page.sheets())
+            figure.draw_without_rendering()
+            text = " ".join(figure.get_supxlabel().split())
+            for erratum in page.errata:
+                assert erratum.holds in text
+            assert all("[" in axes.get_xlabel() for axes in figure.axes[-1:])  # a unit
+            # Nothing written lies outside the sheet.
+            box = figure.get_tightbbox()
+            assert box.x0 > -0.02
+            assert box.y0 > -0.02
+            assert box.x1 < page.size[0] + 0.02
+            assert box.y1 < page.size[1] + 0.02
+
+
+def test_lines_are_told_apart_without_colour() -> None:
+    with style.settings():
+        family = style.ordered(7)
+    assert len({str(each["linestyle"]) for each in family}) == 7
+    lightness = [np.dot(each["color"][:3], (0.2126, 0.7152, 0.0722)) for each in family]
+    assert np.all(np.diff(lightness) < -0.02)
+    assert max(lightness) < 0.7  # not too light for paper
+
+
+def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["figures", "fig3", "--out", str(tmp_path)]) == 0
+    written = {"fig3.csv", "table_i.csv", "errata.csv", "fig3.png"}
+    assert {path.name for path in tmp_path.iterdir()} == written
+    assert {Path(line).name for line in capsys.readouterr().out.splitlines()} == written
+
+
+def test_unknown_figure_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["figures", "fig6", "--out", str(tmp_path / "out")]) == 2
+    assert "found 'fig6', expected one of fig3, fig4a" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    assert cli.main(["figures", "fig3", "--out", str(file)]) == 1
+    assert str(file) in capsys.readouterr().err
+
+
+def test_without_matplotlib_the_numbers_are_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert cli.main(["figures", "fig4a", "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"fig4a.csv", "errata.csv"}
+    error = capsys.readouterr().err
+    assert "only the CSV files were written" in error
+    assert "pip install '.[plot]'" in error
+
+
+def test_cells_of_a_sheet(tmp_path: Path) -> None:
+    columns = sheet("s", ("x", "m", [1.5, np.nan]), ("word", "", ["a, b", 'say "c"']))
+    lines = columns.write(tmp_path).read_text(encoding="utf-8").splitlines()
+    assert lines == ["x [m],word", '1.5,"a, b"', ',"say ""c"""']
+    with pytest.raises(KeyError):
+        columns["y"]

@@ -1,0 +1,73 @@
+"""``softfinger figures``: the paper's figures from this model, as CSV and PNG, errata marked."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tools.figure_pages.sheets import Page
+
+NAMES = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig10")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``figures``."""
+    parser.add_argument(
+        "names", metavar="NAME", nargs="*", help=f"which: {', '.join(NAMES)}; all if none is named"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("figures"),
+        metavar="DIR",
+        help="where to write them, made if missing (default: figures)",
+    )
+
+
+def pages() -> dict[str, Page]:
+    """All figures by name."""
+    from tools.figure_pages import experiment_pages, material_page, model_pages
+
+    found = {"fig3": material_page.PAGE, **model_pages.PAGES, **experiment_pages.PAGES}
+    return {name: found[name] for name in NAMES}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the numbers, then the pictures where matplotlib is installed."""
+    unknown = [name for name in arguments.names if name not in NAMES]
+    if unknown:
+        print(f"figures: found {unknown[0]!r}, expected one of {', '.join(NAMES)}", file=sys.stderr)
+        return 2
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        write({name: pages()[name] for name in arguments.names or NAMES}, arguments.out)
+    except OSError as error:
+        print(f"figures: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def write(chosen: dict[str, Page], folder: Path) -> None:
+    """Write these pages into ``folder`` and print each file's path. Raises OSError."""
+    from tools.figure_pages import style
+    from tools.figure_pages.sheets import errata_sheet
+
+    numbers = {name: page.sheets() for name, page in chosen.items()}
+    for sheets in numbers.values():
+        for each in sheets:
+            print(each.write(folder))
+    if any(page.errata for page in chosen.values()):
+        print(errata_sheet(chosen).write(folder))
+    try:
+        with style.settings():
+            for name, page in chosen.items():
+                figure = style.new_figure(*page.size)
+                figure.suptitle(page.title, fontsize=10)
+                page.draw(figure, numbers[name])
+                style.save(figure, folder / f"{name}.png")
+                print(folder / f"{name}.png")
+    except style.NoMatplotlib as error:
+        print(f"figures: only the CSV files were written; {error}", file=sys.stderr)
