@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
 from numba.core.extending import intrinsic
@@ -24,13 +24,13 @@ _INDEX = ir.IntType(64)
 
 def _code(columns: Any, context: Any, data: Any, x: Any, y: Any, literals: Any) -> Any:
     """Signature and code generator of a sum over powers of y of polynomials in x."""
-    signature = types.UniTuple(types.float64, LANES)(data, types.intp, *literals, x, y)
+    signature = cast(Any, types).UniTuple(types.float64, LANES)(data, types.intp, *literals, x, y)
 
     def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         array = codegen.make_array(sig.args[0])(codegen, builder, arguments[0])
         at, x, y = arguments[1], arguments[-2], arguments[-1]
         # llvmlite's own fma takes scalars only.
-        function = cgutils.get_or_insert_function(
+        function = cast(Any, cgutils).get_or_insert_function(
             builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fma.v{STRIDE}f64"
         )
 
@@ -95,8 +95,9 @@ def _square(context: Any, data: Any, at: Any, n: Any, x: Any, y: Any) -> Any:
 
 
 # slab(data, at, nx, ny, x, y): the five sums Σ c_ij x^i y^j over the triangle of powers with the
-# corners x^nx and y^ny; square(data, at, n, x, y): over all i, j ≤ n. The degrees are literals. From
-# data[at] on stand, for j = 0, 1, …, the coefficients of falling powers of x, STRIDE numbers each.
+# corners x^nx and y^ny; square(data, at, n, x, y): over all i, j ≤ n. The degrees are literals.
+# From data[at] on stand, for j = 0, 1, …, the coefficients of falling powers of x, STRIDE numbers
+# each.
 slab = cast(Any, intrinsic(prefer_literal=True))(_slab)
 square = cast(Any, intrinsic(prefer_literal=True))(_square)
 

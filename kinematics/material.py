@@ -39,19 +39,20 @@ def stress_at(law: FloatArray, strain: float) -> float:
     pieces, order = law.shape
     if not strain < 1.0:
         # Value and slope at the end of the last piece, u = 1 there.
-        value = 0.0
-        slope = 0.0
+        value: float = 0.0
+        slope: float = 0.0
         for j in range(order):
             value += law[pieces - 1, j]
             slope += j * law[pieces - 1, j]
-        return value + slope * pieces * (strain - 1.0)
+        more: float = pieces * (strain - 1.0)
+        return value + more * slope
     u = strain * pieces
     k = int(u)
     u -= k
-    value = law[k, order - 1]
+    result: float = law[k, order - 1]
     for j in range(order - 2, -1, -1):
-        value = value * u + law[k, j]
-    return value
+        result = result * u + law[k, j]
+    return result
 
 
 @kernel
@@ -61,22 +62,22 @@ def energy_density_at(energy_law: FloatArray, strain: float) -> float:
         return 0.0
     pieces, order = energy_law.shape
     if not strain < 1.0:
-        value = 0.0
-        slope = 0.0
-        curve = 0.0
+        value: float = 0.0
+        slope: float = 0.0
+        curve: float = 0.0
         for j in range(order):
             value += energy_law[pieces - 1, j]
             slope += j * energy_law[pieces - 1, j]
             curve += j * (j - 1) * energy_law[pieces - 1, j]
-        more = pieces * (strain - 1.0)
+        more: float = pieces * (strain - 1.0)
         return value + more * (slope + 0.5 * more * curve)
     u = strain * pieces
     k = int(u)
     u -= k
-    value = energy_law[k, order - 1]
+    result: float = energy_law[k, order - 1]
     for j in range(order - 2, -1, -1):
-        value = value * u + energy_law[k, j]
-    return value
+        result = result * u + energy_law[k, j]
+    return result
 
 
 @kernel
@@ -153,6 +154,36 @@ class Material:
         modulus = _solve(rows, [*values, Fraction(0)])
         return cls(tuple(_integral(modulus)[1:]), name="table_i")
 
+    @classmethod
+    def paper(cls) -> Material:
+        """The constant modulus that the paper works with: the greatest of its Table I."""
+        return cls.constant(TABLE_I_MAXIMUM)
+
+    @classmethod
+    def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
+        """A smooth monotone law near measured points of strain (a ratio) and stress [Pa].
+
+        The origin belongs to every curve and need not be given. Points beyond strain 1 are not
+        used; short of it the curve goes on with its last slope. ``fit_error`` tells how far the law
+        runs from the points. Raises MaterialError, with everything that is wrong, for points that
+        are too few, not finite, not rising, start off zero, or that no such law comes near to.
+        """
+        from kinematics.material_fit import fit_law
+
+        coefficients, misfit = fit_law(strain, stress)
+        return cls(tuple(coefficients), name="points", fit_error=misfit)
+
+    @classmethod
+    def from_csv(cls, text: str, branch: str = "load") -> Material:
+        """A law from CSV text with the columns strain, stress [Pa] and optionally branch.
+
+        The third column says ``load`` or ``unload``; ``branch`` chooses one. Unloading points may
+        fall in strain, as they are measured. A header line and lines that start with # are skipped.
+        Raises MaterialError naming the line that can't be read, and as :meth:`from_points` does.
+        """
+        strain, stress = parse_points(text, branch)
+        return cls.from_points(strain, stress)
+
     @property
     def reference_modulus(self) -> float:
         """E₀ = dσ/dε at zero strain [Pa]."""
@@ -202,13 +233,38 @@ class Material:
         return np.stack([self._expand([*row, *[Fraction(0)] * (order - len(row))]) for row in rows])
 
     def _expand(self, polynomial: Sequence[Fraction]) -> FloatArray:
-        """Expand a polynomial in ε about the pieces' starts, in u = ε·pieces − k; exact, rounded."""
+        """Expand a polynomial in ε about the pieces' starts, in u = ε·pieces − k; exactly."""
         pieces = 1 if self.degree <= _PIECE_DEGREE else _PIECES
         table = np.empty((pieces, len(polynomial)))
         for k in range(pieces):
             shifted = _shift(polynomial, Fraction(k, pieces))
             table[k] = [float(value / pieces**j) for j, value in enumerate(shifted)]
         return table
+
+
+def parse_points(text: str, branch: str = "load") -> tuple[list[float], list[float]]:
+    """Strain and stress [Pa] of one branch of a CSV text; see Material.from_csv."""
+    if branch not in ("load", "unload"):
+        raise MaterialError(f"the branch is load or unload, not {branch!r}")
+    points = []
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = [cell.strip() for cell in line.split(",")]
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if number == 1 and cells[0].lower().startswith("strain"):
+            continue
+        phase = cells[2].lower() if len(cells) > 2 and cells[2] else "load"
+        try:
+            point = float(cells[0]), float(cells[1])
+        except (ValueError, IndexError):
+            raise MaterialError(f"line {number} holds no strain and stress: {line!r}") from None
+        if phase not in ("load", "unload"):
+            raise MaterialError(f"line {number}: the branch is load or unload, not {cells[2]!r}")
+        if phase == branch:
+            points.append(point)
+    if len(points) > 1 and points[0][0] > points[-1][0] and branch == "unload":
+        points.reverse()
+    return [x for x, _ in points], [y for _, y in points]
 
 
 def _integral(polynomial: Sequence[Fraction]) -> list[Fraction]:

@@ -48,7 +48,7 @@ def circle_rule(degree: int) -> FloatArray:
 @kernel
 def _horner(table: FloatArray, row: int, piece: int, u: float) -> float:
     order = table.shape[2]
-    value = table[row, piece, order - 1]
+    value: float = table[row, piece, order - 1]
     for j in range(order - 2, -1, -1):
         value = value * u + table[row, piece, j]
     return value
@@ -67,8 +67,8 @@ def ratios(
     """Ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
 
     gauss: [2, n] points and weights on [0, 1]. circle: [2, m] cos χ and sin² χ of the equidistant
-    angles. parts: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it so that
-    both keep their digits; s = |sin θ| ≤ h, c = cos θ.
+    angles. parts: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it so
+    that both keep their digits; s = |sin θ| ≤ h, c = cos θ.
     """
     # h − s without cancellation: near 1, by h² − s² = c² − ρ².
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)

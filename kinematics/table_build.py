@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from kinematics.contact import Fingertip, theta_limits
 from kinematics.kernels import kernel
 from kinematics.lanes import LANES, STRIDE, slab_columns, square_columns
-from kinematics.material import Material
-from kinematics.quadrature import circle_rule, exact, gauss_rule, ratios
-from kinematics.table import (
+from kinematics.lookup import (
     CENTRES,
     CLOSED,
     CORNER,
@@ -39,10 +37,11 @@ from kinematics.table import (
     WORST_THETA,
     Y_PIECES,
     Form,
-    TableError,
-    aligned,
     lookup,
 )
+from kinematics.material import Material
+from kinematics.quadrature import circle_rule, exact, gauss_rule, ratios
+from kinematics.table import TableError, aligned
 
 FloatArray = NDArray[np.float64]
 
@@ -215,8 +214,9 @@ def _fit(data: FloatArray, law: Law, form: Form, tolerance: float) -> float:
 
 def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
     """Chebyshev nodes on [−1, 1] and the matrix from values there to Chebyshev coefficients."""
-    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-    return nodes, np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
+    nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
+    return nodes, np.asarray(inverse, dtype=np.float64)
 
 
 def _powers(terms: FloatArray, columns: list[int]) -> FloatArray:
@@ -310,4 +310,4 @@ def hard_points(
     kind = np.where(rng.integers(0, 8, points) == 0, near, kind)
     kind = np.where(rng.integers(0, 30, points) == 0, 1.0, kind)
     theta = np.minimum(limit * kind, limit) * rng.choice([-1.0, 1.0], points)
-    return d, theta
+    return np.asarray(d), np.asarray(theta)
