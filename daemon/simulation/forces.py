@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.simulation import layout
-from daemon.simulation.tip import evaluate_tip, nearest_face
+from daemon.simulation.tip import evaluate_tip
 from kinematics.kernels import kernel
 
 FloatArray = NDArray[np.float64]
@@ -44,10 +44,34 @@ def current_reference(memory: FloatArray, joint: int, q: float, rate: float) -> 
 
 
 @kernel
-def stop_stiffness(memory: FloatArray, joint: int, q: float) -> float:
-    """Stiffness [N·m/rad] of the end stop that the joint is on, 0 between them."""
+def current_slopes(memory: FloatArray, joint: int, g: float) -> tuple[float, float]:
+    """How steeply the reference falls with angle [A/rad] and with velocity [A·s/rad].
+
+    For the integrator's matrix, and only where a step of ``g`` makes them stiff. They are then
+    upper bounds, since whether the reference is limited may change within the step.
+    """
+    if memory[layout.TORQUE_ON + joint] == 0.0:
+        return 0.0, 0.0
+    by_q = 0.0
+    by_rate = memory[layout.STALL_CURRENT] / memory[layout.NO_LOAD_SPEED]
+    if memory[layout.MODE + joint] != layout.CURRENT_MODE:
+        by_q = memory[layout.POSITION_GAIN]
+        by_rate = max(by_rate, memory[layout.RATE_GAIN])
+    torque = g * memory[layout.TORQUE_CONSTANT] * (by_rate + g * by_q)
+    if torque < 0.1 * memory[layout.JOINT_INERTIA]:
+        return 0.0, 0.0
+    return by_q, by_rate
+
+
+@kernel
+def stop_stiffness(memory: FloatArray, joint: int) -> float:
+    """Stiffness [N·m/rad] of the end stop that the joint is on or will be within a step, else 0."""
     stiffness: float = 0.0
-    if q < memory[layout.STOP_LOW + joint] or q > memory[layout.STOP_HIGH + joint]:
+    q = memory[layout.POSITION + joint]
+    ahead = q + memory[layout.STEP] * memory[layout.VELOCITY + joint]
+    low = memory[layout.STOP_LOW + joint]
+    high = memory[layout.STOP_HIGH + joint]
+    if min(q, ahead) < low or max(q, ahead) > high:
         stiffness = memory[layout.STOP_STIFFNESS]
     return stiffness
 
@@ -121,17 +145,6 @@ def evaluate_hand(
             side = 1.0 - 2.0 * finger
             rx = side * (inward - memory[layout.HALF_SEPARATION]) - memory[position + 2]
             ry = ahead - memory[position + 3]
-            face = nearest_face(
-                rx * nx + ry * ny,
-                ry * nx - rx * ny,
-                memory[layout.HALF_WIDTH],
-                memory[layout.HALF_HEIGHT],
-            )
-            shear = shear1 if finger == 0 else shear2
-            if face != memory[layout.FACE + finger]:
-                # Only past an edge, where the window has closed and no shear is stored.
-                memory[layout.FACE + finger] = face
-                shear = 0.0
             evaluate_tip(
                 memory,
                 data,
@@ -146,8 +159,7 @@ def evaluate_hand(
                 ry,
                 nx,
                 ny,
-                face,
-                shear,
+                shear1 if finger == 0 else shear2,
             )
             joint_torque += memory[out + layout.Q]
             force_x += memory[out + layout.Q + 1]

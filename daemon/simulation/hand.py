@@ -108,6 +108,10 @@ class SimulatedHand:
             self._run(count)
             behind -= count
 
+    def refresh(self) -> None:
+        """Bring the tips' truth up to a state that was written by hand; time stays."""
+        self._run(0)
+
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:

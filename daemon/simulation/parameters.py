@@ -29,7 +29,7 @@ JOINT_SPEED = 0.002  # rad/s, below it joint friction is viscous
 TABLE_SPEED = 0.0005  # m/s, likewise for the object on the table
 STOP_CLEARANCE = 0.05  # rad between the commanded range and the mechanical end stops
 STOP_STIFFNESS = 500.0  # N·m/rad
-RIM_RATIO = 50.0  # stiffness of the backing plate's rim over πEa
+RIM_STIFFNESS = 1e6  # N/m, backing plate on the object
 COMPRESSION_DEPTH = 0.4  # of the tip's radius, how far the scripted compression presses
 
 
@@ -73,7 +73,8 @@ def set_parameters(p: FloatArray, settings: Settings, table: ContactTable, step:
     p[layout.SCALE] = simulation.modulus_scale
     p[layout.FRICTION] = simulation.tip_friction
     p[layout.LOSS] = simulation.tip_loss
-    p[layout.RIM_STIFFNESS] = RIM_RATIO * math.pi * modulus * simulation.modulus_scale * radius
+    p[layout.MODULUS] = modulus * simulation.modulus_scale
+    p[layout.RIM_STIFFNESS] = RIM_STIFFNESS
     p[layout.D_MAX] = table.data[4] * radius * (1.0 - 1e-12)
 
     p[layout.STEP] = step

@@ -7,9 +7,9 @@ each motor are advanced by fixed sub-steps of a two-stage Rosenbrock method (ROS
 
 It is of second order whatever matrix A is, and L-stable where A is the Jacobian; A here holds what
 is stiff: the tips' normal, turning and shear stiffness with their losses, end stops, friction at
-its secant, the motors' lag. Of the unknowns only the five accelerations are coupled, and the joints
-only through the object, so that a step costs two evaluations of the tips and one 3 × 3
-factorisation. Coulomb slip is a return of d_t into its limits at the start of a step.
+its secant, the motors' lag and the servos' loops. Of the unknowns only the five accelerations are
+coupled, and the joints only through the object, so that a step costs two evaluations of the tips
+and one 3 × 3 factorisation. Coulomb slip is a return of d_t into its limits at the start of a step.
 
 Only kernels live here; forces are in forces.py and tip.py, places in the memory in layout.py.
 """
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from daemon.simulation import layout
 from daemon.simulation.forces import (
     current_reference,
+    current_slopes,
     evaluate_hand,
     script_place,
     stop_stiffness,
@@ -51,35 +52,41 @@ def factorise(memory: FloatArray, g: float) -> None:
     f = memory[layout.INERTIA] + g * memory[layout.DRAG + 4]
     for finger in range(2):
         row = layout.TIP + finger * layout.TIP_ROW
-        side = 1.0 - 2.0 * finger
         w_d = g * (memory[row + layout.C_D] + g * memory[row + layout.K_D])
-        w_theta = g * (memory[row + layout.C_THETA] + g * memory[row + layout.K_THETA])
+        w_r = g * (memory[row + layout.C_THETA] + g * memory[row + layout.K_THETA])
         w_t = g * (memory[row + layout.C_T] + g * memory[row + layout.K_T])
         d0 = memory[row + layout.JD]
         d1 = memory[row + layout.JD + 1]
         d2 = memory[row + layout.JD + 2]
         d3 = memory[row + layout.JD + 3]
+        r0 = memory[row + layout.JTHETA]
+        r1 = memory[row + layout.JTHETA + 1]
+        r2 = memory[row + layout.JTHETA + 2]
+        r3 = memory[row + layout.JTHETA + 3]
         t0 = memory[row + layout.JT]
         t1 = memory[row + layout.JT + 1]
         t2 = memory[row + layout.JT + 2]
         t3 = memory[row + layout.JT + 3]
-        stop = stop_stiffness(memory, finger, memory[layout.POSITION + finger])
-        pivot = memory[layout.JOINT_INERTIA] + g * (memory[layout.DRAG + finger] + g * stop)
-        pivot += w_d * d0 * d0 + w_theta + w_t * t0 * t0
+        stop = stop_stiffness(memory, finger)
+        motor = memory[layout.MOTOR + 2 + finger] + g * memory[layout.MOTOR + finger]
+        pivot = memory[layout.JOINT_INERTIA] + g * (
+            memory[layout.DRAG + finger] + g * (stop + motor)
+        )
+        pivot += w_d * d0 * d0 + w_r * r0 * r0 + w_t * t0 * t0
         inverse = 0.0 if memory[layout.JOINTS_HELD] != 0.0 else 1.0 / pivot
-        u0 = w_d * d0 * d1 + w_t * t0 * t1
-        u1 = w_d * d0 * d2 + w_t * t0 * t2
-        u2 = w_d * d0 * d3 + w_theta * side + w_t * t0 * t3
+        u0 = w_d * d0 * d1 + w_r * r0 * r1 + w_t * t0 * t1
+        u1 = w_d * d0 * d2 + w_r * r0 * r2 + w_t * t0 * t2
+        u2 = w_d * d0 * d3 + w_r * r0 * r3 + w_t * t0 * t3
         memory[layout.MATRIX + finger] = inverse
         memory[layout.MATRIX + 2 + 3 * finger] = u0
         memory[layout.MATRIX + 3 + 3 * finger] = u1
         memory[layout.MATRIX + 4 + 3 * finger] = u2
-        a += w_d * d1 * d1 + w_t * t1 * t1 - u0 * u0 * inverse
-        b += w_d * d1 * d2 + w_t * t1 * t2 - u0 * u1 * inverse
-        c += w_d * d2 * d2 + w_t * t2 * t2 - u1 * u1 * inverse
-        d += w_d * d1 * d3 + w_t * t1 * t3 - u0 * u2 * inverse
-        e += w_d * d2 * d3 + w_t * t2 * t3 - u1 * u2 * inverse
-        f += w_d * d3 * d3 + w_theta + w_t * t3 * t3 - u2 * u2 * inverse
+        a += w_d * d1 * d1 + w_r * r1 * r1 + w_t * t1 * t1 - u0 * u0 * inverse
+        b += w_d * d1 * d2 + w_r * r1 * r2 + w_t * t1 * t2 - u0 * u1 * inverse
+        c += w_d * d2 * d2 + w_r * r2 * r2 + w_t * t2 * t2 - u1 * u1 * inverse
+        d += w_d * d1 * d3 + w_r * r1 * r3 + w_t * t1 * t3 - u0 * u2 * inverse
+        e += w_d * d2 * d3 + w_r * r2 * r3 + w_t * t2 * t3 - u1 * u2 * inverse
+        f += w_d * d3 * d3 + w_r * r3 * r3 + w_t * t3 * t3 - u2 * u2 * inverse
     free = 0.0 if memory[layout.OBJECT_HELD] != 0.0 else 1.0
     first = 1.0 / a
     l10 = b * first
@@ -119,31 +126,8 @@ def solve(memory: FloatArray, out: int) -> None:
 
 
 @kernel
-def take_stiffness(memory: FloatArray, along: int, shear1: float, shear2: float, g: float) -> None:
-    """Take g K r from the load, K of stage 1; r stands from ``along`` on, then both shears."""
-    for finger in range(2):
-        row = layout.TIP + finger * layout.TIP_ROW
-        side = 1.0 - 2.0 * finger
-        turn = memory[along + 4]
-        d0 = memory[row + layout.JD]
-        d1 = memory[row + layout.JD + 1]
-        d2 = memory[row + layout.JD + 2]
-        d3 = memory[row + layout.JD + 3]
-        rate_q = memory[along + finger]
-        rate_d = d0 * rate_q + d1 * memory[along + 2] + d2 * memory[along + 3] + d3 * turn
-        by_d = g * memory[row + layout.K_D] * rate_d
-        by_theta = g * memory[row + layout.K_THETA] * (side * rate_q + turn)
-        by_t = g * memory[row + layout.K_T] * (shear1 if finger == 0 else shear2)
-        memory[layout.LOAD + finger] -= d0 * by_d + side * by_theta + memory[row + layout.JT] * by_t
-        memory[layout.LOAD + 2] -= d1 * by_d + memory[row + layout.JT + 1] * by_t
-        memory[layout.LOAD + 3] -= d2 * by_d + memory[row + layout.JT + 2] * by_t
-        memory[layout.LOAD + 4] -= d3 * by_d + by_theta + memory[row + layout.JT + 3] * by_t
-
-
-@kernel
-def shear_along(memory: FloatArray, finger: int, along: int) -> float:
-    """Rate of a tip's d_t by stage 1's row for the coordinates' rates from ``along`` on."""
-    row = layout.TIP + finger * layout.TIP_ROW + layout.JT
+def row_along(memory: FloatArray, row: int, finger: int, along: int) -> float:
+    """A tip's row over (q, x, y, φ) times the coordinates' rates from ``along`` on."""
     rate: float = (
         memory[row] * memory[along + finger]
         + memory[row + 1] * memory[along + 2]
@@ -151,6 +135,33 @@ def shear_along(memory: FloatArray, finger: int, along: int) -> float:
         + memory[row + 3] * memory[along + 4]
     )
     return rate
+
+
+@kernel
+def take_stiffness(memory: FloatArray, along: int, shear1: float, shear2: float, g: float) -> None:
+    """Take g K r from the load, K of stage 1; r stands from ``along`` on, then both shears."""
+    for finger in range(2):
+        row = layout.TIP + finger * layout.TIP_ROW
+        at_d = row + layout.JD
+        at_r = row + layout.JTHETA
+        at_t = row + layout.JT
+        by_d = g * memory[row + layout.K_D] * row_along(memory, at_d, finger, along)
+        by_r = g * memory[row + layout.K_THETA] * row_along(memory, at_r, finger, along)
+        by_t = g * memory[row + layout.K_T] * (shear1 if finger == 0 else shear2)
+        memory[layout.LOAD + finger] -= (
+            memory[at_d] * by_d + memory[at_r] * by_r + memory[at_t] * by_t
+        )
+        for j in range(1, 4):
+            memory[layout.LOAD + 1 + j] -= (
+                memory[at_d + j] * by_d + memory[at_r + j] * by_r + memory[at_t + j] * by_t
+            )
+
+
+@kernel
+def shear_along(memory: FloatArray, finger: int, along: int) -> float:
+    """Rate of a tip's d_t by stage 1's row for the coordinates' rates from ``along`` on."""
+    row = layout.TIP + finger * layout.TIP_ROW + layout.JT
+    return row_along(memory, row, finger, along)
 
 
 @kernel
@@ -197,28 +208,65 @@ def settle(memory: FloatArray, ring: FloatArray) -> None:
 
 
 @kernel
+def load_motors(
+    memory: FloatArray, stage: int, position: int, velocity: int, h: float, g: float
+) -> None:
+    """Add the motors' part to the load; the part of the currents' k that doesn't need the solution.
+
+    A current follows its reference with a lag: i' = (r(q, ω) − i)/τ. Its k falls by
+    (r_q g + r_ω) g/(τ + g) for each unit of acceleration, which stands in the matrix; stage 1's
+    slopes, times the torque constant and over (τ + g), are kept in MOTOR for both.
+    """
+    lag = memory[layout.ELECTRIC_TIME]
+    constant = memory[layout.TORQUE_CONSTANT]
+    for j in range(2):
+        q = memory[position + j]
+        rate = memory[velocity + j]
+        reference = current_reference(memory, j, q, rate)
+        current = memory[layout.CURRENT + j]
+        before = 0.0
+        way = rate
+        if stage == 1:
+            by_q, by_rate = current_slopes(memory, j, g)
+            memory[layout.MOTOR + j] = constant * by_q / (lag + g)
+            memory[layout.MOTOR + 2 + j] = constant * by_rate / (lag + g)
+        else:
+            before = memory[layout.FIRST_X + 5 + j]
+            way = rate - 2.0 * memory[layout.FIRST_X + j]
+            current += h * before
+        fall = g * memory[layout.MOTOR + j] * way / constant
+        change = (reference - current - 2.0 * lag * before) / (lag + g) - fall
+        memory[layout.CHANGE + j] = change
+        stop = stop_stiffness(memory, j)
+        memory[layout.LOAD + j] += constant * (current + g * change) - g * stop * way
+
+
+@kernel
+def current_change(memory: FloatArray, joint: int, acceleration: float, g: float) -> float:
+    """k of a current, for the joint's k of velocity."""
+    slope = memory[layout.MOTOR + 2 + joint] + g * memory[layout.MOTOR + joint]
+    change: float = (
+        memory[layout.CHANGE + joint] - g * slope / memory[layout.TORQUE_CONSTANT] * acceleration
+    )
+    return change
+
+
+@kernel
 def first_stage(memory: FloatArray, g: float) -> tuple[float, float]:
     """k1 of the coordinates, velocities and currents into FIRST_X, FIRST_V; that of the shears."""
-    factorise(memory, g)
     for j in range(5):
         memory[layout.LOAD + j] = memory[layout.FORCES + j]
-    for j in range(2):
-        q = memory[layout.POSITION + j]
-        rate = memory[layout.VELOCITY + j]
-        current = memory[layout.CURRENT + j]
-        reference = current_reference(memory, j, q, rate)
-        change = (reference - current) / (memory[layout.ELECTRIC_TIME] + g)
-        memory[layout.FIRST_X + 5 + j] = change
-        memory[layout.LOAD + j] += (
-            memory[layout.TORQUE_CONSTANT] * (current + g * change)
-            - g * stop_stiffness(memory, j, q) * rate
-        )
+    load_motors(memory, 1, layout.POSITION, layout.VELOCITY, 0.0, g)
+    factorise(memory, g)
     rate1 = memory[layout.TIP + layout.SHEAR_RATE]
     rate2 = memory[layout.TIP + layout.TIP_ROW + layout.SHEAR_RATE]
     take_stiffness(memory, layout.VELOCITY, rate1, rate2, g)
     solve(memory, layout.FIRST_V)
     for j in range(5):
         memory[layout.FIRST_X + j] = memory[layout.VELOCITY + j] + g * memory[layout.FIRST_V + j]
+    for j in range(2):
+        acceleration = memory[layout.FIRST_V + j]
+        memory[layout.FIRST_X + 5 + j] = current_change(memory, j, acceleration, g)
     return (
         rate1 + g * shear_along(memory, 0, layout.FIRST_V),
         rate2 + g * shear_along(memory, 1, layout.FIRST_V),
@@ -228,7 +276,6 @@ def first_stage(memory: FloatArray, g: float) -> tuple[float, float]:
 @kernel
 def second_stage(memory: FloatArray, shear1: float, shear2: float, h: float, g: float) -> None:
     """k2 and the step itself, from stage 2's forces; ``shear1``, ``shear2`` are the shears' k1."""
-    lag = memory[layout.ELECTRIC_TIME]
     for j in range(5):
         inertia = memory[layout.MASS]
         if j < 2:
@@ -238,17 +285,7 @@ def second_stage(memory: FloatArray, shear1: float, shear2: float, h: float, g: 
         memory[layout.LOAD + j] = (
             memory[layout.FORCES + j] - 2.0 * inertia * memory[layout.FIRST_V + j]
         )
-    for j in range(2):
-        before = memory[layout.FIRST_X + 5 + j]
-        current = memory[layout.CURRENT + j] + h * before
-        rate = memory[layout.SECOND_V + j]
-        reference = current_reference(memory, j, memory[layout.SECOND_X + j], rate)
-        change = (reference - current - 2.0 * lag * before) / (lag + g)
-        memory[layout.CURRENT + j] += h * (1.5 * before + 0.5 * change)
-        stop = stop_stiffness(memory, j, memory[layout.POSITION + j])
-        memory[layout.LOAD + j] += memory[layout.TORQUE_CONSTANT] * (
-            current + g * change
-        ) - g * stop * (rate - 2.0 * memory[layout.FIRST_X + j])
+    load_motors(memory, 2, layout.SECOND_X, layout.SECOND_V, h, g)
     for j in range(5):
         memory[layout.SECOND_X + j] = memory[layout.SECOND_V + j] - 2.0 * memory[layout.FIRST_X + j]
     later1 = memory[_LATER + layout.SHEAR_RATE] - 2.0 * shear1
@@ -259,6 +296,10 @@ def second_stage(memory: FloatArray, shear1: float, shear2: float, h: float, g: 
     later2 += g * shear_along(memory, 1, layout.SECOND_V)
     memory[layout.SHEAR] += h * (1.5 * shear1 + 0.5 * later1)
     memory[layout.SHEAR + 1] += h * (1.5 * shear2 + 0.5 * later2)
+    for j in range(2):
+        before = memory[layout.FIRST_X + 5 + j]
+        change = current_change(memory, j, memory[layout.SECOND_V + j], g)
+        memory[layout.CURRENT + j] += h * (1.5 * before + 0.5 * change)
     first = 2 if memory[layout.JOINTS_HELD] != 0.0 else 0
     last = 2 if memory[layout.OBJECT_HELD] != 0.0 else 5
     for j in range(first, last):
