@@ -106,7 +106,8 @@ def is_spike(
 ) -> bool:
     """Whether the cell stands alone as no contact can: a hot cell.
 
-    ``confined`` is what a contact no wider than a cell could press at most.
+    ``confined`` is what a contact about as wide as a cell could press at most: a wider one never
+    has a cell that stands at twice its neighbours.
     """
     rows, cols = frame.shape
     total = 0.0
@@ -119,7 +120,7 @@ def is_spike(
         return False
     return bool(
         frame[i, j] > 10.0 * noise + confined
-        and frame[i, j] > 4.0 * (max(total, 0.0) / number + 3.0 * noise)
+        and frame[i, j] > 2.0 * max(total, 0.0) / number + 12.0 * noise
     )
 
 

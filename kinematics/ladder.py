@@ -125,6 +125,46 @@ def _start(
 
 
 @kernel
+def _moments(
+    frame: FloatArray,
+    cells: FloatArray,
+    ratios: FloatArray,
+    plan: FloatArray,
+    scale: float,
+    noise: float,
+    state: FloatArray,
+    covariance: FloatArray,
+) -> bool:
+    """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
+    geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
+    a = plan[0]
+    fixed = 0.0 if plan[FREE_GAIN] > 0.0 else plan[FIXED_GAIN]
+    near = 0.25 * min(plan[3], plan[4])
+    for _ in range(8):
+        d, n_x, n_y, gain = refine(
+            frame,
+            cells,
+            geometry,
+            ratios,
+            plan[MODULUS] / scale,
+            fixed,
+            noise,
+            state[D],
+            state[N_X],
+            state[N_Y],
+            covariance,
+        )
+        grown = math.sqrt(d * (2.0 * a - d)) - math.sqrt(state[D] * (2.0 * a - state[D]))
+        moved = a * math.hypot(n_x - state[N_X], n_y - state[N_Y])
+        state[D], state[N_X], state[N_Y], state[GAIN] = d, n_x, n_y, gain
+        if not gain > 0.0:
+            return False
+        if abs(grown) + moved < near:
+            return True
+    return False
+
+
+@kernel
 def _likelihood(
     frame: FloatArray,
     scale: float,
@@ -187,8 +227,6 @@ def _likelihood(
             state[EXPLAINED] = 1.0 - misfit / max(energy, variance)
             if state[EXPLAINED] < plan[EXPLAINED_MIN]:
                 continue
-            if not (GAIN_MIN < state[GAIN] < GAIN_MAX and state[D] < D_MAX * geometry[0]):
-                continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
             if misfit > 8.0 * variance * math.sqrt(2.0 * number) + 0.003 * energy:
                 level = max(5.0 * noise, 0.15 * state[PEAK] / scale)
@@ -249,7 +287,6 @@ def estimate_frame(
     law = tables[3 * RATIO_POINTS :].reshape((tables.size - 3 * RATIO_POINTS) // 4, 4)
     runs = integers[: 2 * rows].reshape(rows, 2)
     owners = integers[2 * rows :].reshape(2, OWNERS)
-    geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
     variance = plan[NOISE] ** 2 + step * step / 12.0
     noise = math.sqrt(variance) / scale
     state[CONTACT:STATE] = 0.0
@@ -286,22 +323,7 @@ def estimate_frame(
         covariance = np.zeros(16)
         if plan[MOMENTS_ONLY] > 0.0:
             if state[WARM] > 0.0:
-                fixed = 0.0 if plan[FREE_GAIN] > 0.0 else plan[FIXED_GAIN]
-                d, n_x, n_y, gain = refine(
-                    frame,
-                    cells,
-                    geometry,
-                    ratios,
-                    plan[MODULUS] / scale,
-                    fixed,
-                    noise,
-                    state[D],
-                    state[N_X],
-                    state[N_Y],
-                    covariance,
-                )
-                state[D], state[N_X], state[N_Y], state[GAIN] = d, n_x, n_y, gain
-                done = gain > 0.0
+                done = _moments(frame, cells, ratios, plan, scale, noise, state, covariance)
             if not done:
                 _start(frame, cells, runs, ratios, plan, scale, noise, row, col, state, covariance)
                 done = True
@@ -323,6 +345,8 @@ def estimate_frame(
                 owners,
                 step > 0.0,
             )
+        if not (GAIN_MIN < state[GAIN] < GAIN_MAX and state[D] < D_MAX * plan[0]):
+            done = False
         _tell(plan, state, covariance)
         valid = valid and done
     else:

@@ -254,8 +254,9 @@ def refine(
     if fixed_gain <= 0.0:
         cosine = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
         gain = force * cosine / (math.pi * modulus * d * d * _ratio(ratios, a, d, 0))
-        # Over a disc of radius ρ: mean of (r² − trace)².
-        spread = rho**4 / 3.0 - trace * rho * rho + trace * trace
+        # Over a disc of that many cells: mean of (r² − trace)².
+        square = number * geometry[3] * geometry[4] / math.pi
+        spread = square * square / 3.0 - trace * square + trace * trace
         slope = (4.0 * a - 2.0 * d) / 6.0
         covariance[0] = relative * spread / (slope * slope)
         covariance[15] = gain * gain * (relative + 4.0 * covariance[0] / (d * d))

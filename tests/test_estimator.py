@@ -1,0 +1,651 @@
+"""The estimator: at the Cramér-Rao bound, honest about it, and never a silent number."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from kinematics.activity import activity
+from kinematics.contact import Fingertip
+from kinematics.cut_cells import PLANES
+from kinematics.estimator import ContactEstimate, ContactEstimator
+from kinematics.likelihood import SUMS, accumulate, cubic_law
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+
+A = 0.020
+E = 0.304e6
+TIP = Fingertip(A)
+LINEAR = Material.constant(E)
+MEASURED = Material.table_i()
+PITCH = 0.058 / 44
+GRID = SensorGrid(44, 44, PITCH)
+NOISE = 0.002 * E
+
+
+def tilts(theta, azimuth):
+    return (
+        math.asin(math.sin(theta) * math.cos(azimuth)),
+        math.asin(math.sin(theta) * math.sin(azimuth)),
+    )
+
+
+def fisher(grid, material, truth, noise, free_gain):
+    """Inverse Fisher information of (d, tilt_x, tilt_y[, gain]) by finite differences."""
+    steps = (1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]
+    columns = []
+    for k, step in enumerate(steps):
+        ends = []
+        for sign in (1.0, -1.0):
+            at = list(truth)
+            at[k] += sign * step
+            ends.append(grid.pressure(TIP, material, *at[:3], gain=at[3]))
+        columns.append(((ends[0] - ends[1]) / (2 * step)).ravel())
+    jacobian = np.stack(columns, axis=1)
+    return np.linalg.inv(jacobian.T @ jacobian) * noise**2
+
+
+def errors(estimate, truth):
+    return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)
+
+
+def test_the_public_face():
+    from kinematics import ContactEstimator as Estimator
+    from kinematics import SensorGrid as Grid
+
+    grid = Grid(rows=44, cols=44, pitch=0.058 / 44)
+    p = grid.pressure(TIP, LINEAR, 0.004, 0.2, -0.1)
+    e = Estimator(TIP, LINEAR, grid, noise=600.0)(p)
+    assert e.contact
+    assert e.valid
+    assert e.d == pytest.approx(0.004, rel=1e-5)
+    assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=1e-5)
+    assert e.gain == pytest.approx(1.0, abs=1e-4)
+    assert e.covariance.shape == (4, 4)
+    np.testing.assert_allclose(e.covariance, e.covariance.T, rtol=1e-9)
+
+
+@pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
+@pytest.mark.parametrize("free_gain", [True, False])
+def test_without_noise_the_bias_stays_far_below_the_noise_floor(material, free_gain):
+    # Any azimuth, any place of the tip between the cells; the floor is that of 0.2 % noise.
+    rng = np.random.default_rng(7)
+    noise = 0.002 * material.reference_modulus
+    for _ in range(60):
+        grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
+        d = 10 ** rng.uniform(math.log10(5e-4), math.log10(8e-3))
+        truth = (d, *tilts(rng.uniform(0.0, math.radians(30)), rng.uniform(0, 7)), 1.0)
+        estimator = ContactEstimator(
+            TIP, material, grid, noise, free_gain=free_gain, tolerance=1e-6
+        )
+        e = estimator(grid.pressure(TIP, material, *truth[:3]))
+        assert e.valid
+        n = 4 if free_gain else 3
+        sigma = np.sqrt(np.diag(e.covariance))[:n]
+        assert np.all(np.abs(errors(e, truth)[:n]) < 0.3 * sigma)
+        assert abs(e.d - d) < 2e-4 * d
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+@pytest.mark.parametrize(
+    ("material", "d", "degrees", "azimuth", "percent"),
+    [
+        (LINEAR, 0.0005, 0.0, 0.0, 0.1),
+        (LINEAR, 0.001, 20.0, 1.0, 0.2),
+        (LINEAR, 0.004, 30.0, 2.0, 0.2),
+        (LINEAR, 0.008, 10.0, -2.0, 2.0),
+        (MEASURED, 0.002, 15.0, 0.5, 0.5),
+        (MEASURED, 0.006, 30.0, -1.0, 0.2),
+    ],
+)
+def test_errors_are_at_the_cramer_rao_bound(material, d, degrees, azimuth, percent, free_gain):
+    grid = SensorGrid(44, 44, PITCH, centre=(2e-4, -5e-4))
+    noise = percent / 100 * material.reference_modulus
+    truth = (d, *tilts(math.radians(degrees), azimuth), 1.0)
+    bound = fisher(grid, material, truth, noise, free_gain)
+    clean = grid.pressure(TIP, material, *truth[:3])
+    estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
+    rng = np.random.default_rng(3)
+    n = 4 if free_gain else 3
+    frames = 400
+    miss = np.empty((frames, n))
+    nees = np.empty(frames)
+    for k in range(frames):
+        e = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
+        assert e.contact
+        assert e.valid
+        miss[k] = errors(e, truth)[:n]
+        nees[k] = miss[k] @ np.linalg.solve(e.covariance[:n, :n], miss[k])
+    ratio = np.sqrt((miss**2).mean(axis=0) / np.diag(bound))
+    # 400 frames scatter the ratio by 3.5 %: three of that over 1.0 leave no room beyond 1.10.
+    assert np.all(ratio < 1.12), ratio
+    assert np.all(ratio > 0.85), ratio
+    assert np.all(np.abs(miss.mean(axis=0)) < 4.0 * np.sqrt(np.diag(bound) / frames) + 1e-9)
+    # χ² with 400 n degrees of freedom, four standard deviations, and 5 % of model error.
+    assert abs(nees.mean() / n - 1.0) < 4.0 * math.sqrt(2.0 / (frames * n)) + 0.05
+    # The reported covariance is the bound's.
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(e.covariance))[:n], np.sqrt(np.diag(bound)), rtol=0.12
+    )
+
+
+def test_the_bound_is_the_known_one():
+    # Published figures of this model: 44 × 44 cells on 58 mm, 0.2 % of E, gain free.
+    for d, degrees, sigma_d, sigma_tilt in [
+        (0.0005, 0, 16.9e-6, 0.191),
+        (0.002, 30, 5.9e-6, 0.036),
+        (0.004, 0, 4.7e-6, 0.021),
+        (0.008, 30, 2.4e-6, 0.008),
+    ]:
+        p = GRID.pressure(TIP, LINEAR, d, math.radians(degrees))
+        e = ContactEstimator(TIP, LINEAR, GRID, 608.0)(p)
+        assert e.d_std == pytest.approx(sigma_d, rel=0.03)
+        assert math.degrees(e.tilt_y_std) == pytest.approx(
+            sigma_tilt / math.cos(0.0), rel=0.08, abs=5e-4
+        )
+
+
+def test_a_turned_and_oblong_sensor_estimates_in_the_fingers_axes():
+    grid = SensorGrid(30, 50, (0.0012, 0.0017), centre=(0.001, -0.002), rotation=0.7)
+    truth = (0.003, 0.25, -0.15, 1.0)
+    clean = grid.pressure(TIP, LINEAR, *truth[:3])
+    e = ContactEstimator(TIP, LINEAR, grid, 600.0)(clean)
+    np.testing.assert_allclose(errors(e, truth), 0.0, atol=2e-5)
+    bound = fisher(grid, LINEAR, truth, 600.0, True)
+    scale = np.sqrt(np.diag(bound))
+    np.testing.assert_allclose(
+        e.covariance / np.outer(scale, scale), bound / np.outer(scale, scale), atol=0.02
+    )
+
+
+def test_measured_over_modelled_pressure_is_the_gain():
+    p = GRID.pressure(TIP, LINEAR, 0.003, 0.2, gain=0.6)
+    e = ContactEstimator(TIP, LINEAR, GRID, NOISE)(p)
+    assert e.gain == pytest.approx(0.6, rel=1e-4)
+    assert e.d == pytest.approx(0.003, rel=1e-4)
+    known = ContactEstimator(TIP, LINEAR, GRID, NOISE, free_gain=False, gain=0.6)(p)
+    assert known.gain == 0.6
+    assert known.d == pytest.approx(0.003, rel=1e-5)
+    assert known.d_std < e.d_std
+    assert np.all(known.covariance[3] == 0.0)
+
+
+@pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
+@pytest.mark.parametrize("free_gain", [True, False])
+def test_moments_are_close_and_say_how_close(material, free_gain):
+    noise = 0.002 * material.reference_modulus
+    rng = np.random.default_rng(5)
+    estimator = ContactEstimator(TIP, material, GRID, noise, method="moments", free_gain=free_gain)
+    for d in (0.001, 0.002, 0.004, 0.008):
+        truth = (d, *tilts(0.3, 1.1), 1.0)
+        clean = GRID.pressure(TIP, material, *truth[:3])
+        e = estimator(clean)
+        # Discretisation and the ratios' weak dependence on tilt.
+        assert e.d == pytest.approx(d, rel=0.01)
+        assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:3], abs=0.004)
+        miss = np.array(
+            [
+                errors(estimator.update(clean + rng.normal(0.0, noise, GRID.shape)), truth)
+                for _ in range(100)
+            ]
+        )
+        sigma = np.sqrt(np.diag(e.covariance))
+        n = 4 if free_gain else 3
+        assert np.all(miss.std(axis=0)[:n] < 1.5 * sigma[:n])
+        assert np.all(miss.std(axis=0)[:n] > 0.4 * sigma[:n])
+
+
+def test_warm_and_cold_starts_agree_within_the_noise():
+    rng = np.random.default_rng(11)
+    estimator = ContactEstimator(TIP, MEASURED, GRID, 700.0)
+    truth = None
+    for k in range(60):
+        d = 0.004 + 0.003 * math.sin(0.5 * k)
+        truth = (d, 0.3 * math.sin(0.3 * k), 0.2 * math.cos(0.2 * k), 1.0)
+        frame = GRID.pressure(TIP, MEASURED, *truth[:3]) + rng.normal(0.0, 700.0, GRID.shape)
+        warm = estimator.update(frame)
+        assert warm.valid
+        sigma = np.sqrt(np.diag(warm.covariance))
+        cold = estimator(frame)
+        apart = errors(warm, (cold.d, cold.tilt_x, cold.tilt_y, cold.gain))
+        assert np.all(np.abs(apart) < 0.6 * sigma)
+        assert np.all(np.abs(errors(warm, truth)) < 6.0 * sigma)
+
+
+def test_a_jump_of_the_contact_is_followed_at_once():
+    estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
+    for truth in [
+        (0.008, 0.5, 0.0),
+        (0.0006, -0.5, 0.3),
+        (0.006, 0.2, -0.4),
+        (0.001, 0.0, 0.5),
+        (0.008, -0.3, -0.3),
+    ]:
+        e = estimator.update(GRID.pressure(TIP, MEASURED, *truth))
+        assert e.valid
+        assert e.d == pytest.approx(truth[0], rel=2e-3)
+        assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:], abs=2e-3)
+
+
+def test_update_reuses_one_result_and_skips_a_frame_seen():
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
+    first = estimator.update(GRID.pressure(TIP, LINEAR, 0.003), seq=4)
+    assert isinstance(first, ContactEstimate)
+    d = first.d
+    again = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=4)
+    assert again is first
+    assert again.d == d
+    newer = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=5)
+    assert newer is first
+    assert newer.d == pytest.approx(0.005, rel=1e-4)
+    # A call on its own neither sees nor changes what update keeps.
+    covariance = newer.covariance.copy()
+    alone = estimator(GRID.pressure(TIP, LINEAR, 0.002))
+    assert alone.d == pytest.approx(0.002, rel=1e-4)
+    assert newer.d == pytest.approx(0.005, rel=1e-4)
+    np.testing.assert_array_equal(newer.covariance, covariance)
+    estimator.reset()
+    assert estimator.update(GRID.pressure(TIP, LINEAR, 0.002), seq=5).d == alone.d
+
+
+def test_the_frame_path_allocates_next_to_nothing():
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
+    counts = np.round(GRID.pressure(TIP, LINEAR, 0.004, 0.2) / 4.0).astype(np.uint16)
+    for _ in range(3):
+        estimator.update(counts, 4.0)
+    tracemalloc.start()
+    try:
+        estimator.update(counts, 4.0)
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        for _ in range(50):
+            estimator.update(counts, 4.0)
+        now, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert now - before < 1024
+    assert peak - before < 8192  # a frame is 15 kB
+
+
+def test_every_frame_type_and_layout_gives_the_same_estimate():
+    scale = 500.0
+    counts = np.round(GRID.pressure(TIP, LINEAR, 0.004, 0.2, 0.1) / scale)
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
+    reference = estimator(counts.astype(np.uint16), scale)
+    frozen = counts.astype(np.uint8)
+    frozen.flags.writeable = False
+    wide = np.zeros((44, 88), np.uint16)
+    wide[:, ::2] = counts
+    for frame in (
+        counts.astype(np.uint8),
+        frozen,
+        np.asfortranarray(counts.astype(np.uint16)),
+        wide[:, ::2],
+    ):
+        assert estimator(frame, scale).d == reference.d
+    # Float frames can go below zero and have no quantum, so they are treated a little otherwise.
+    for kind in (np.float32, np.float64):
+        e = estimator(counts.astype(kind), scale)
+        assert e.d == pytest.approx(reference.d, rel=1e-4)
+        assert e.d_std < reference.d_std
+
+
+def test_quantisation_widens_the_covariance():
+    clean = GRID.pressure(TIP, LINEAR, 0.004, 0.2)
+    estimator = ContactEstimator(TIP, LINEAR, GRID, 100.0)
+    fine = estimator(np.round(clean / 4.0).astype(np.uint16), 4.0)
+    coarse = estimator(np.round(clean / 1000.0).astype(np.uint8), 1000.0)
+    expected = math.sqrt((100.0**2 + 1000.0**2 / 12) / (100.0**2 + 4.0**2 / 12))
+    assert coarse.d_std / fine.d_std == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("noise", [200.0, 1520.0])
+@pytest.mark.parametrize("pitch", [0.058 / 32, 0.00125])
+def test_eight_bits_of_500_pa_give_d_within_a_percent(noise, pitch):
+    grid = SensorGrid(32, 32, pitch)
+    estimator = ContactEstimator(TIP, MEASURED, grid, noise, free_gain=False)
+    rng = np.random.default_rng(2)
+    for d in (0.001, 0.0015, 0.003, 0.008):
+        ratios = []
+        for _ in range(25):
+            at = tilts(rng.uniform(0.0, 0.45), rng.uniform(0, 7))
+            p = grid.pressure(TIP, MEASURED, d, *at)
+            e = estimator(np.minimum(np.round(p / 500.0), 255).astype(np.uint8), 500.0)
+            assert e.valid
+            ratios.append(e.d / d - 1.0)
+        assert abs(np.mean(ratios)) < 0.004
+        assert np.max(np.abs(ratios)) < (0.015 if d == 0.001 else 0.006)
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+def test_counts_that_end_at_zero_bias_nothing(free_gain):
+    # The negative half of the noise is gone, so that the weak cells at the outline read too much.
+    noise = 1520.0
+    rng = np.random.default_rng(9)
+    estimator = ContactEstimator(TIP, MEASURED, GRID, noise, free_gain=free_gain)
+    truth = (0.002, 0.2, -0.1, 1.0)
+    clean = GRID.pressure(TIP, MEASURED, *truth[:3])
+    score = []
+    for _ in range(300):
+        noisy = np.clip(np.round((clean + rng.normal(0.0, noise, GRID.shape)) / 4.0), 0, 65535)
+        e = estimator.update(noisy.astype(np.uint16), 4.0)
+        assert e.valid
+        score.append(errors(e, truth)[:3] / np.sqrt(np.diag(e.covariance))[:3])
+    assert np.all(np.abs(np.mean(score, axis=0)) < 4.0 / math.sqrt(300))
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.12)
+
+
+def test_saturated_cells_are_left_out():
+    rng = np.random.default_rng(4)
+    clean = GRID.pressure(TIP, LINEAR, 0.006, 0.1)
+    noisy = clean + rng.normal(0.0, NOISE, GRID.shape)
+    full = 0.75 * clean.max()
+    plain = ContactEstimator(TIP, LINEAR, GRID, NOISE)(noisy)
+    aware = ContactEstimator(TIP, LINEAR, GRID, NOISE, saturation=full)(np.minimum(noisy, full))
+    assert aware.valid
+    assert abs(aware.d - 0.006) < 4.0 * aware.d_std
+    assert aware.d_std > plain.d_std
+    assert aware.cells < plain.cells
+    # An 8-bit board's end is known from its type.
+    counts = np.minimum(np.round(clean / 300.0), 255).astype(np.uint8)
+    assert counts.max() == 255
+    board = ContactEstimator(TIP, LINEAR, GRID, 100.0)(counts, 300.0)
+    assert board.d == pytest.approx(0.006, rel=2e-3)
+
+
+def test_dead_cells_are_masked_whatever_they_hold():
+    rng = np.random.default_rng(6)
+    live = rng.random(GRID.shape) > 0.01
+    truth = (0.003, 0.2, -0.2, 1.0)
+    clean = GRID.pressure(TIP, LINEAR, *truth[:3])
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, live=live)
+    score = []
+    for _ in range(150):
+        frame = clean + rng.normal(0.0, NOISE, GRID.shape)
+        frame[~live] = rng.choice([np.nan, np.inf, -np.inf, 1e9, 0.0], (~live).sum())
+        e = estimator.update(frame)
+        assert e.valid
+        score.append(errors(e, truth) / np.sqrt(np.diag(e.covariance)))
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)
+
+
+def test_a_light_touch_is_found_and_noise_is_not():
+    rng = np.random.default_rng(8)
+    missed = 0
+    for k in range(3000):
+        if k % 30 == 0:
+            grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
+            estimator = ContactEstimator(TIP, LINEAR, grid, NOISE)
+            at = tilts(rng.uniform(0.0, 0.5), rng.uniform(0, 7))
+            clean = grid.pressure(TIP, LINEAR, 0.0002, *at)
+        missed += not estimator(clean + rng.normal(0.0, NOISE, grid.shape)).contact
+    assert missed <= 3
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
+    alarms = 0
+    buffer = np.empty(GRID.shape)
+    for _ in range(20_000):
+        rng.standard_normal(out=buffer)
+        buffer *= NOISE
+        e = estimator.update(buffer)
+        alarms += e.contact
+        assert e.contact or (e.valid and e.d == 0.0 and e.tilt_x == 0.0)
+    assert alarms == 0
+
+
+def test_activity_matches_its_plain_twin():
+    rng = np.random.default_rng(12)
+    weights = np.outer([1, 2, 2, 2, 1], [1, 2, 2, 2, 1]).astype(float)
+    weights[2, 2] = 0.0
+    cells = np.ones((20, 10, 24))
+    runs = np.tile(np.array([2, 22]), (20, 1))
+    seen = set()
+    for k in range(200):
+        frame = rng.normal(0.0, 1.0, (20, 24))
+        i, j = rng.integers(4, 16), rng.integers(4, 20)
+        frame[i - 1 : i + 2, j - 1 : j + 2] += 0.02 * k
+        expected = False
+        for r in range(20):
+            for c in range(2, 22):
+                if frame[r, c] > 3.0:
+                    total = squares = 0.0
+                    for y in range(-2, 3):
+                        for x in range(-2, 3):
+                            if 0 <= r + y < 20 and 0 <= c + x < 24:
+                                w = weights[y + 2, x + 2]
+                                total += w * frame[r + y, c + x]
+                                squares += w * w
+                    expected |= total / math.sqrt(squares) > 4.0
+        contact, row, col, peak, mean, finite = activity(frame, cells, runs, 1.0, 3.0, 4.0)
+        assert contact == expected
+        assert finite
+        inner = frame[:, 2:22]
+        assert mean == pytest.approx(inner.mean())
+        if inner.max() > 3.0:
+            assert peak == inner.max() == frame[row, col]
+        seen.add(expected)
+    assert seen == {True, False}
+
+
+def test_normal_equations_match_their_plain_twin():
+    rng = np.random.default_rng(13)
+    n = 37
+    packed = np.zeros((PLANES, n))
+    packed[0] = rng.uniform(0.2, 1.0, n)
+    u, v, w, gain = 0.017, 0.2, -0.1, 1.3
+    g = rng.uniform(35.0, 50.0, n) * packed[0]
+    packed[1], packed[2], packed[3] = g, g * rng.uniform(-0.01, 0.01, n), g * 0.004
+    packed[4] = rng.uniform(0.0, 1e-3, n)
+    packed[5] = rng.uniform(0.0, 5e4, n)
+    packed[6] = rng.random(n) > 0.1
+    sums = np.zeros(SUMS)
+    saturation = 2e4
+    accumulate(packed, n, u, v, w, gain, saturation, 0.0, cubic_law(MEASURED.law), sums)
+    strain = 1.0 - (u * packed[1] - v * packed[2] - w * packed[3]) / packed[0]
+    step = 1e-4
+    stress = MEASURED.stress(strain)
+    slope = (MEASURED.stress(strain + step) - MEASURED.stress(strain - step)) / (2 * step)
+    bend = (MEASURED.stress(strain + step) - 2 * stress + MEASURED.stress(strain - step)) / step**2
+    mean = packed[0] * (stress + 0.5 * bend * packed[4])
+    free = (packed[5] < saturation) | (gain * mean < saturation)
+    weight = packed[6] * free
+    jacobian = np.stack([mean, slope * packed[1], slope * packed[2], slope * packed[3]])
+    residual = packed[5] - gain * mean
+    normal = (jacobian * weight) @ jacobian.T
+    np.testing.assert_allclose(sums[:10], normal[np.triu_indices(4)], rtol=1e-4)
+    np.testing.assert_allclose(sums[10:14], (jacobian * weight) @ residual, rtol=1e-3)
+    assert sums[14] == pytest.approx((weight * residual**2).sum(), rel=1e-5)
+    assert sums[15] == pytest.approx((packed[6] * packed[5] ** 2).sum(), rel=1e-12)
+    assert sums[16] == weight.sum()
+    assert 0 < (~free).sum() < n
+
+
+def test_the_estimators_law_follows_any_material():
+    points = Material.from_points(
+        np.linspace(0.0, 1.0, 12),
+        1e5 * np.linspace(0.0, 1.0, 12) ** 1.3 + 5e4 * np.linspace(0, 1, 12),
+    )
+    for material in (LINEAR, MEASURED, points):
+        law = cubic_law(material.law)
+        strain = np.linspace(0.0, 0.999999, 3001)
+        t = strain * (len(law) - 1)
+        k = t.astype(int)
+        c = law[k].T
+        t = t - k
+        value = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+        np.testing.assert_allclose(
+            value, material.stress(strain), atol=1e-7 * material.reference_modulus
+        )
+
+
+# What is wrong with a sensor must show.
+
+EMPTY = np.zeros((44, 44))
+
+
+@pytest.mark.parametrize("method", ["ml", "moments"])
+@pytest.mark.parametrize("free_gain", [True, False])
+class TestBadFrames:
+    def estimator(self, method, free_gain, grid=GRID):
+        return ContactEstimator(TIP, MEASURED, grid, 600.0, method=method, free_gain=free_gain)
+
+    def test_all_zero_is_no_contact_and_valid(self, method, free_gain):
+        for kind in (np.uint8, np.uint16, np.float32, np.float64):
+            e = self.estimator(method, free_gain)(EMPTY.astype(kind))
+            assert (e.contact, e.valid, e.d, e.d_std) == (False, True, 0.0, 0.0)
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+    def test_one_cell_that_is_no_number_invalidates(self, method, free_gain, bad):
+        estimator = self.estimator(method, free_gain)
+        for frame in (EMPTY.copy(), GRID.pressure(TIP, MEASURED, 0.003, 0.1)):
+            frame[22, 20] = bad
+            e = estimator.update(frame)
+            assert not e.valid
+            assert not e.contact
+            assert (e.d, e.tilt_x) == (0.0, 0.0)
+        # And leaves no trace.
+        assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
+
+    def test_a_number_outside_the_disc_is_not_looked_at(self, method, free_gain):
+        frame = GRID.pressure(TIP, MEASURED, 0.003, 0.1)
+        frame[0, 0] = math.nan
+        assert self.estimator(method, free_gain)(frame).valid
+
+    def test_all_saturated_is_not_valid(self, method, free_gain):
+        estimator = self.estimator(method, free_gain)
+        for frame, scale in (
+            (np.full((44, 44), 65535, np.uint16), 4.0),
+            (np.full((44, 44), 255, np.uint8), 500.0),
+            (np.full((44, 44), 1e5), 1.0),
+        ):
+            e = estimator(frame, scale)
+            assert e.contact
+            assert not e.valid
+
+    def test_a_baseline_far_below_zero_is_not_valid(self, method, free_gain):
+        estimator = self.estimator(method, free_gain)
+        assert not estimator(EMPTY - 5000.0).valid
+        assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
+
+    def test_one_hot_cell_is_no_contact(self, method, free_gain):
+        rng = np.random.default_rng(1)
+        frame = rng.normal(0.0, 600.0, (44, 44))
+        frame[25, 20] = 1e5
+        e = self.estimator(method, free_gain)(frame)
+        assert (e.contact, e.d, e.rejected) == (False, 0.0, 1)
+
+    def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(self, method, free_gain):
+        rng = np.random.default_rng(2)
+        for d in (0.001, 0.004):
+            clean = GRID.pressure(TIP, MEASURED, d, 0.2, 0.1)
+            clean += rng.normal(0.0, 600.0, (44, 44))
+            estimator = self.estimator(method, free_gain)
+            without = estimator(clean)
+            for cell in ((12, 30), (24, 24)):
+                frame = clean.copy()
+                frame[cell] = 1.2e5
+                e = estimator(frame)
+                assert e.valid
+                assert e.rejected == 1
+                if method == "ml":
+                    assert abs(e.d - without.d) < 1.5 * without.d_std
+
+    @pytest.mark.parametrize(
+        "frame",
+        [np.zeros((44, 43)), np.zeros((44, 44, 1)), np.zeros(44), np.zeros((0, 0))],
+    )
+    def test_a_wrong_shape_is_refused(self, method, free_gain, frame):
+        with pytest.raises(ValueError, match=r"shape \(44, 44\)"):
+            self.estimator(method, free_gain).update(frame)
+
+    @pytest.mark.parametrize("kind", [np.int32, np.int64, bool, np.complex128, ">u2", object])
+    def test_a_wrong_type_is_refused(self, method, free_gain, kind):
+        with pytest.raises(ValueError, match="uint8, uint16, float32 or float64"):
+            self.estimator(method, free_gain).update(EMPTY.astype(kind))
+        with pytest.raises(ValueError, match="list"):
+            self.estimator(method, free_gain).update(EMPTY.tolist())
+
+    @pytest.mark.parametrize("scale", [0.0, -4.0, math.nan, math.inf])
+    def test_a_wrong_scale_is_refused(self, method, free_gain, scale):
+        with pytest.raises(ValueError, match="pascal_per_count"):
+            self.estimator(method, free_gain).update(EMPTY, scale)
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+def test_what_is_not_one_contact_is_not_valid(free_gain):
+    estimator = ContactEstimator(TIP, MEASURED, GRID, 600.0, free_gain=free_gain)
+    rng = np.random.default_rng(3)
+    press = [GRID.pressure(TIP, MEASURED, 0.002, side * 0.5) for side in (1.0, -1.0)]
+    small = GRID.pressure(TIP, MEASURED, 0.001, -0.5)
+    large = GRID.pressure(TIP, MEASURED, 0.003, 0.4)
+    for frame in (
+        press[0] + press[1],
+        large + small,
+        rng.uniform(0.0, 1e5, (44, 44)),
+        1e4 * (np.indices((44, 44)).sum(axis=0) % 2),
+        np.tile(np.linspace(0.0, 1e5, 44), (44, 1)),
+        EMPTY + 5000.0,
+    ):
+        e = estimator(frame)
+        assert e.contact
+        assert not e.valid
+    assert estimator(large + small).second
+    assert not estimator(large).second
+
+
+def test_a_footprint_cut_by_the_sensors_edge_still_fits():
+    grid = SensorGrid(44, 44, PITCH, centre=(0.021, 0.0))
+    rng = np.random.default_rng(5)
+    truth = (0.004, 0.35, 0.1, 1.0)
+    clean = grid.pressure(TIP, LINEAR, *truth[:3])
+    assert clean[:, -1].max() > 0.05 * clean.max()
+    estimator = ContactEstimator(TIP, LINEAR, grid, NOISE)
+    whole = ContactEstimator(TIP, LINEAR, GRID, NOISE)(GRID.pressure(TIP, LINEAR, *truth[:3]))
+    for _ in range(20):
+        e = estimator(clean + rng.normal(0.0, NOISE, grid.shape))
+        assert e.valid
+        sigma = np.sqrt(np.diag(e.covariance))
+        assert np.all(np.abs(errors(e, truth)) < 4.5 * sigma)
+        assert e.d_std > 1.5 * whole.d_std
+
+
+@pytest.mark.parametrize("degrees", [36.0, 40.0, 50.0])
+def test_at_and_beyond_the_limit_the_tilt_is_still_seen(degrees):
+    # At d = 8 mm the limit is 36.87°: what is beyond must be told as beyond.
+    estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
+    e = estimator(GRID.pressure(TIP, MEASURED, 0.008, math.radians(degrees)))
+    assert e.valid
+    assert math.degrees(e.tilt_x) == pytest.approx(degrees, abs=0.3)
+    assert e.d == pytest.approx(0.008, rel=0.01)
+
+
+def test_a_model_that_does_not_fit_shows_in_chi2_and_widens_the_covariance():
+    p = GRID.pressure(TIP, MEASURED, 0.005, 0.2)
+    right = ContactEstimator(TIP, MEASURED, GRID, 50.0)(p)
+    wrong = ContactEstimator(TIP, LINEAR, GRID, 50.0)(p)
+    assert right.chi2 < 0.01
+    assert wrong.chi2 > 2.0
+    twice = ContactEstimator(TIP, Material.constant(2 * E), GRID, 200.0, free_gain=False)(p)
+    assert twice.chi2 > 50.0
+    ideal = ContactEstimator(TIP, Material.constant(2 * E), GRID, 200.0, free_gain=False)(
+        GRID.pressure(TIP, Material.constant(2 * E), twice.d, twice.tilt_x, twice.tilt_y)
+    )
+    assert twice.d_std > 5.0 * ideal.d_std
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"noise": 0.0}, "noise"),
+        ({"noise": math.nan}, "noise"),
+        ({"method": "best"}, "method"),
+        ({"gain": -1.0}, "gain"),
+        ({"saturation": 0.0}, "saturation"),
+        ({"live": np.ones((4, 4), bool)}, "live"),
+    ],
+)
+def test_wrong_arguments_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
