@@ -1,0 +1,189 @@
+"""Wrong frames and arguments: a flagged estimate or a clear error, never a silent number."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kinematics.contact import Fingertip
+from kinematics.estimator import ContactEstimator
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+
+A = 0.020
+E = 0.304e6
+TIP = Fingertip(A)
+LINEAR = Material.constant(E)
+MEASURED = Material.table_i()
+PITCH = 0.058 / 44
+GRID = SensorGrid(44, 44, PITCH)
+NOISE = 0.002 * E
+
+
+def errors(estimate, truth):
+    return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)
+
+
+def test_saturated_cells_are_left_out():
+    rng = np.random.default_rng(4)
+    clean = GRID.pressure(TIP, LINEAR, 0.006, 0.1)
+    noisy = clean + rng.normal(0.0, NOISE, GRID.shape)
+    full = 0.75 * clean.max()
+    plain = ContactEstimator(TIP, LINEAR, GRID, NOISE)(noisy)
+    aware = ContactEstimator(TIP, LINEAR, GRID, NOISE, saturation=full)(np.minimum(noisy, full))
+    assert aware.valid
+    assert abs(aware.d - 0.006) < 4.0 * aware.d_std
+    assert aware.d_std > plain.d_std
+    assert aware.cells < plain.cells
+    # An 8-bit board's end is known from its type.
+    counts = np.minimum(np.round(clean / 300.0), 255).astype(np.uint8)
+    assert counts.max() == 255
+    board = ContactEstimator(TIP, LINEAR, GRID, 100.0)(counts, 300.0)
+    assert board.d == pytest.approx(0.006, rel=2e-3)
+
+
+def test_dead_cells_are_masked_whatever_they_hold():
+    rng = np.random.default_rng(6)
+    live = rng.random(GRID.shape) > 0.01
+    truth = (0.003, 0.2, -0.2, 1.0)
+    clean = GRID.pressure(TIP, LINEAR, *truth[:3])
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, live=live)
+    score = []
+    for _ in range(150):
+        frame = clean + rng.normal(0.0, NOISE, GRID.shape)
+        frame[~live] = rng.choice([np.nan, np.inf, -np.inf, 1e9, 0.0], (~live).sum())
+        e = estimator.update(frame)
+        assert e.valid
+        score.append(errors(e, truth) / np.sqrt(np.diag(e.covariance)))
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)
+
+
+EMPTY = np.zeros((44, 44))
+
+
+@pytest.mark.parametrize("method", ["ml", "moments"])
+@pytest.mark.parametrize("free_gain", [True, False])
+class TestBadFrames:
+    def estimator(self, method, free_gain, grid=GRID):
+        return ContactEstimator(TIP, MEASURED, grid, 600.0, method=method, free_gain=free_gain)
+
+    def test_all_zero_is_no_contact_and_valid(self, method, free_gain):
+        for kind in (np.uint8, np.uint16, np.float32, np.float64):
+            e = self.estimator(method, free_gain)(EMPTY.astype(kind))
+            assert (e.contact, e.valid, e.d, e.d_std) == (False, True, 0.0, 0.0)
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+    def test_one_cell_that_is_no_number_invalidates(self, method, free_gain, bad):
+        estimator = self.estimator(method, free_gain)
+        for frame in (EMPTY.copy(), GRID.pressure(TIP, MEASURED, 0.003, 0.1)):
+            frame[22, 20] = bad
+            e = estimator.update(frame)
+            assert not e.valid
+            assert not e.contact
+            assert (e.d, e.tilt_x) == (0.0, 0.0)
+        # And leaves no trace.
+        assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
+
+    def test_a_number_outside_the_disc_is_not_looked_at(self, method, free_gain):
+        frame = GRID.pressure(TIP, MEASURED, 0.003, 0.1)
+        frame[0, 0] = math.nan
+        assert self.estimator(method, free_gain)(frame).valid
+
+    def test_all_saturated_is_not_valid(self, method, free_gain):
+        estimator = self.estimator(method, free_gain)
+        for frame, scale in (
+            (np.full((44, 44), 65535, np.uint16), 4.0),
+            (np.full((44, 44), 255, np.uint8), 500.0),
+            (np.full((44, 44), 1e5), 1.0),
+        ):
+            e = estimator(frame, scale)
+            assert e.contact
+            assert not e.valid
+
+    def test_a_baseline_far_below_zero_is_not_valid(self, method, free_gain):
+        estimator = self.estimator(method, free_gain)
+        assert not estimator(EMPTY - 5000.0).valid
+        assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
+
+    def test_one_hot_cell_is_no_contact(self, method, free_gain):
+        rng = np.random.default_rng(1)
+        frame = rng.normal(0.0, 600.0, (44, 44))
+        frame[25, 20] = 1e5
+        e = self.estimator(method, free_gain)(frame)
+        assert (e.contact, e.d, e.rejected) == (False, 0.0, 1)
+
+    def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(self, method, free_gain):
+        rng = np.random.default_rng(2)
+        for d in (0.001, 0.004):
+            clean = GRID.pressure(TIP, MEASURED, d, 0.2, 0.1)
+            clean += rng.normal(0.0, 600.0, (44, 44))
+            estimator = self.estimator(method, free_gain)
+            without = estimator(clean)
+            for cell in ((12, 30), (24, 24)):
+                frame = clean.copy()
+                frame[cell] = 1.2e5
+                e = estimator(frame)
+                assert e.valid
+                assert e.rejected == 1
+                if method == "ml":
+                    assert abs(e.d - without.d) < 1.5 * without.d_std
+
+    @pytest.mark.parametrize(
+        "frame",
+        [np.zeros((44, 43)), np.zeros((44, 44, 1)), np.zeros(44), np.zeros((0, 0))],
+    )
+    def test_a_wrong_shape_is_refused(self, method, free_gain, frame):
+        with pytest.raises(ValueError, match=r"shape \(44, 44\)"):
+            self.estimator(method, free_gain).update(frame)
+
+    @pytest.mark.parametrize("kind", [np.int32, np.int64, bool, np.complex128, ">u2", object])
+    def test_a_wrong_type_is_refused(self, method, free_gain, kind):
+        with pytest.raises(ValueError, match="uint8, uint16, float32 or float64"):
+            self.estimator(method, free_gain).update(EMPTY.astype(kind))
+        with pytest.raises(ValueError, match="list"):
+            self.estimator(method, free_gain).update(EMPTY.tolist())
+
+    @pytest.mark.parametrize("scale", [0.0, -4.0, math.nan, math.inf])
+    def test_a_wrong_scale_is_refused(self, method, free_gain, scale):
+        with pytest.raises(ValueError, match="pascal_per_count"):
+            self.estimator(method, free_gain).update(EMPTY, scale)
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+def test_what_is_not_one_contact_is_not_valid(free_gain):
+    estimator = ContactEstimator(TIP, MEASURED, GRID, 600.0, free_gain=free_gain)
+    rng = np.random.default_rng(3)
+    press = [GRID.pressure(TIP, MEASURED, 0.002, side * 0.5) for side in (1.0, -1.0)]
+    small = GRID.pressure(TIP, MEASURED, 0.001, -0.5)
+    large = GRID.pressure(TIP, MEASURED, 0.003, 0.4)
+    for frame in (
+        press[0] + press[1],
+        large + small,
+        rng.uniform(0.0, 1e5, (44, 44)),
+        1e4 * (np.indices((44, 44)).sum(axis=0) % 2),
+        np.tile(np.linspace(0.0, 1e5, 44), (44, 1)),
+        EMPTY + 5000.0,
+    ):
+        e = estimator(frame)
+        assert e.contact
+        assert not e.valid
+    assert estimator(large + small).second
+    assert not estimator(large).second
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"noise": 0.0}, "noise"),
+        ({"noise": math.nan}, "noise"),
+        ({"method": "best"}, "method"),
+        ({"gain": -1.0}, "gain"),
+        ({"saturation": 0.0}, "saturation"),
+        ({"live": np.ones((4, 4), bool)}, "live"),
+    ],
+)
+def test_wrong_arguments_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
