@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from daemon.sockets import AddressError
     from daemon.tactile.base import TactileError
 
-    log = _Log(quiet=arguments.monitor)
+    log = _Log()
     log.line("info", "start", f"softfinger: {_scene(settings)}; compiling kernels if they are new")
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=cache_folder())
@@ -60,6 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         settle()
         _on_signals(daemon.loop)
         log.line("info", "start", _ready(settings, daemon))
+        log.quiet = arguments.monitor  # from here on the page owns the terminal
         with _page(settings, daemon.loop) if arguments.monitor else nullcontext():
             daemon.loop.run(arguments.duration)
     state = daemon.loop.state
@@ -110,11 +111,12 @@ def cache_folder() -> Path:
 
 
 class _Log:
-    """Events as lines on standard error; silent while a page owns the terminal."""
+    """Events as lines on standard error, unless ``quiet``."""
 
-    def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
+    def __init__(self) -> None:
+        self.quiet = False
 
     def line(self, level: str, kind: str, text: str) -> None:
-        if not self._quiet:
+        """Print one event."""
+        if not self.quiet:
             print(f"{level:7} {kind:8} {text}", file=sys.stderr, flush=True)
