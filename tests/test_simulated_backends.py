@@ -1,0 +1,325 @@
+"""The in-process servos and tactile sensors of the simulated hand, on a virtual clock."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daemon.clock import VirtualClock
+from daemon.model import make_estimator, make_material
+from daemon.records import Goal, Reading
+from daemon.servos import make_servos
+from daemon.servos.base import ServoError
+from daemon.servos.simulated import SimulatedServos
+from daemon.settings import Settings
+from daemon.simulation.hand import SimulatedHand
+from daemon.tactile import make_sensor
+from daemon.tactile.simulated import SimulatedTactile
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+from kinematics.table import ContactTable
+
+COUNT = 2 * math.pi / 4096
+CURRENT_UNIT = 2.69e-3
+SPEED_UNIT = 0.229 * 2 * math.pi / 60
+TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
+
+
+class Bench:
+    """A hand, its servos and its sensors on one virtual clock."""
+
+    def __init__(self, **sections) -> None:
+        sections.setdefault("material", {"law": "constant"})
+        self.settings = Settings.model_validate(sections)
+        self.clock = VirtualClock()
+        self.hand = SimulatedHand(self.settings, table=TABLE)
+        self.servos = SimulatedServos(self.settings, self.hand, self.clock)
+        self.sensors = [
+            SimulatedTactile(self.settings, self.hand, self.clock, finger) for finger in (0, 1)
+        ]
+        self.reading = Reading()
+        self.goal = Goal()
+
+    def run(self, seconds: float, period: float = 0.002) -> None:
+        """Tick as the loop does: read, then write the goal."""
+        end = self.clock.now() + seconds
+        while self.clock.now() < end - 1e-9:
+            self.clock.sleep_until(self.clock.now() + period)
+            self.servos.read(self.reading)
+            self.servos.write(self.goal)
+
+    def grasp(self, current: float = 0.5, seconds: float = 1.0) -> None:
+        self.servos.connect()
+        self.servos.set_torque(True)
+        self.goal.q = [0.6] * 2
+        self.goal.current = [current] * 2
+        self.run(seconds)
+
+
+# Servos.
+
+
+def test_readings_are_whole_counts_of_the_configured_model():
+    bench = Bench()
+    bench.grasp(0.5, 0.1)
+    reading, hand = bench.reading, bench.hand
+    assert reading.valid
+    assert reading.t == bench.clock.now()
+    for value, true, unit in [
+        (reading.q, hand.q, COUNT),
+        (reading.dq, hand.dq, SPEED_UNIT),
+        (reading.current, hand.current, CURRENT_UNIT),
+    ]:
+        counts = np.array(value) / unit
+        np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+        # The hand has not moved since it was read, so rounding is the only difference.
+        np.testing.assert_allclose(value, true, atol=0.5 * unit * (1 + 1e-9))
+    assert np.abs(hand.q - np.array(reading.q)).max() > 0
+
+
+def test_goals_are_whole_counts_too():
+    bench = Bench()
+    bench.servos.connect()
+    bench.servos.set_torque(True)
+    bench.goal.q = [0.1003] * 2
+    bench.goal.current = [0.3] * 2
+    bench.run(1.0)
+    from daemon.simulation import layout
+
+    goal_q = bench.hand.memory[layout.GOAL_Q : layout.GOAL_Q + 2]
+    bound = bench.hand.memory[layout.GOAL_CURRENT : layout.GOAL_CURRENT + 2]
+    np.testing.assert_allclose(goal_q / COUNT, np.round(0.1003 / COUNT), rtol=1e-12)
+    # A bound is rounded down, so that it stays one.
+    np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
+
+
+def test_connect_and_torque_on_move_nothing():
+    bench = Bench(hand={"open_angle": (0.0031, -0.0123)})
+    before = bench.hand.q.copy()
+    bench.servos.connect()
+    bench.clock.sleep_until(0.5)
+    bench.servos.read(bench.reading)
+    np.testing.assert_array_equal(bench.hand.q, before)
+    bench.servos.set_torque(True)
+    bench.clock.sleep_until(0.59)
+    bench.servos.read(bench.reading)
+    np.testing.assert_array_equal(bench.hand.q, before)
+    # With current allowed it holds within half a count of where it was.
+    bench.goal.q = list(bench.reading.q)
+    bench.goal.current = [0.5] * 2
+    bench.run(0.5)
+    np.testing.assert_allclose(bench.hand.q, before, atol=0.6 * COUNT)
+
+
+def test_watchdog_takes_torque_off_in_silence_only():
+    bench = Bench(servos={"watchdog": 0.1})
+    bench.grasp(0.5, 1.0)
+    assert bench.hand.force.min() > 5
+    # Exchanges every 90 ms keep it on.
+    bench.run(1.8, period=0.09)
+    assert bench.hand.force.min() > 5
+    assert bench.servos.counters()["watchdog"] == 0
+    # Silence: the hand opens by itself, whoever moves its time.
+    bench.hand.advance(bench.clock.now() + 0.099)
+    assert np.abs(bench.hand.current).min() > 0.4
+    bench.hand.advance(bench.clock.now() + 0.120)
+    assert np.abs(bench.hand.current).max() < 1e-3
+    bench.clock.sleep_until(bench.clock.now() + 0.5)
+    bench.servos.read(bench.reading)
+    assert bench.servos.counters()["watchdog"] == 1
+    bench.run(0.3)
+    assert np.abs(bench.hand.current).max() == pytest.approx(0, abs=1e-6)
+    bench.servos.set_torque(True)
+    bench.run(1.0)
+    assert bench.hand.force.min() > 5
+
+
+def test_watchdog_can_be_left_off():
+    bench = Bench(servos={"watchdog": 0.0})
+    bench.grasp(0.5, 1.0)
+    bench.clock.sleep_until(bench.clock.now() + 5.0)
+    bench.servos.read(bench.reading)
+    assert bench.hand.force.min() > 5
+
+
+def test_close_takes_torque_off_and_reads_fail_after_it():
+    bench = Bench()
+    bench.grasp(0.5, 0.5)
+    q = list(bench.reading.q)
+    bench.servos.close()
+    bench.servos.close()
+    bench.hand.advance(bench.clock.now() + 0.05)
+    assert np.abs(bench.hand.current).max() < 1e-3
+    bench.servos.read(bench.reading)
+    assert not bench.reading.valid
+    assert bench.reading.q == q
+    with pytest.raises(ServoError, match="not connected"):
+        bench.servos.set_torque(True)
+
+
+def test_a_missing_finger_stays_zero():
+    bench = Bench(scene={"fingers": ("left",)})
+    bench.grasp(0.5, 1.0)
+    assert bench.reading.valid
+    assert bench.reading.q[0] > 0.1
+    assert bench.reading.q[1] == 0.0
+    assert bench.hand.q[1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("model", "message"), [("XL430-W250", "no current-based"), ("XY1", "unknown servo")]
+)
+def test_a_model_that_cannot_do_it_is_refused_at_connect(model, message):
+    bench = Bench()
+    settings = bench.settings.model_copy(
+        update={"servos": bench.settings.servos.model_copy(update={"model": model})}
+    )
+    with pytest.raises(ServoError, match=message):
+        SimulatedServos(settings, bench.hand, bench.clock).connect()
+
+
+# Tactile.
+
+
+def test_frames_come_at_their_time_and_show_their_instant():
+    bench = Bench(simulation={"tactile_delay": 0.013, "tactile_noise": 0.0})
+    sensor = bench.sensors[0]
+    assert sensor.latest() is None
+    sensor.open()
+    assert bench.clock.now() == pytest.approx(0.013)
+    first = sensor.latest()
+    assert first is not None
+    assert (first.seq, first.t_sample, first.t_arrival) == (1, 0.0, 0.013)
+    assert first.data.shape == (44, 44)
+    assert first.data.dtype == np.uint16
+    bench.grasp(0.5, 0.2)
+    settings = bench.settings
+    estimator = make_estimator(settings, make_material(settings.material))
+    truth = {}
+    seen = first.seq
+    frames = 0
+    for _ in range(200):
+        bench.run(0.001, period=0.001)
+        truth[round(bench.clock.now(), 6)] = (bench.hand.d[0], bench.hand.theta[0])
+        frame = sensor.latest()
+        assert frame is sensor.latest()
+        age = bench.clock.now() - frame.t_sample
+        assert 0.013 - 1e-6 <= age < 0.013 + 0.010 + 1e-6
+        if frame.seq == seen:
+            continue
+        seen = frame.seq
+        assert frame.t_sample == pytest.approx((frame.seq - 1) * 0.010)
+        instant = min(truth, key=lambda t: abs(t - frame.t_sample))
+        if abs(instant - frame.t_sample) > 0.0006:
+            continue
+        frames += 1
+        estimate = estimator(frame.data * settings.tactile.pascal_per_count)
+        d, theta = truth[instant]
+        assert estimate.d == pytest.approx(d, abs=3e-5)
+        assert estimate.tilt_x == pytest.approx(theta, abs=3e-3)
+    assert frames > 10
+    assert bench.hand.d[0] > 0.003
+
+
+def test_frames_nobody_asked_for_are_counted():
+    bench = Bench()
+    sensor = bench.sensors[1]
+    sensor.open()
+    bench.clock.sleep_until(0.5101)
+    frame = sensor.latest()
+    assert frame.seq == 51
+    assert frame.t_sample == pytest.approx(0.50)
+    assert sensor.counters()["frames"] == 51
+    sensor.close()
+    bench.clock.sleep_until(1.0)
+    assert sensor.latest() is frame
+
+
+def test_a_frame_is_never_written_after_it_was_handed_over():
+    bench = Bench()
+    sensor = bench.sensors[0]
+    sensor.open()
+    frame = sensor.latest()
+    before = frame.data.copy()
+    bench.grasp(0.5, 0.5)
+    assert sensor.latest() is not frame
+    np.testing.assert_array_equal(frame.data, before)
+
+
+def test_noise_is_as_set_and_equal_for_one_seed():
+    def frames(seed: int) -> np.ndarray:
+        bench = Bench(
+            simulation={"seed": seed, "tactile_noise": 400.0},
+            tactile={"pascal_per_count": 4.0},
+        )
+        for sensor in bench.sensors:
+            sensor.open()
+        bench.grasp(0.6, 1.0)
+        return np.stack([sensor.latest().data for sensor in bench.sensors])
+
+    first, again, other = frames(3), frames(3), frames(4)
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+    assert (first[0] != first[1]).any()
+    # Cells well inside the footprint: the difference of two seeds has √2 of the noise.
+    pressed = first[0].astype(float) > 4000
+    difference = (first[0].astype(float) - other[0].astype(float))[pressed]
+    assert pressed.sum() > 100
+    assert difference.std() == pytest.approx(math.sqrt(2) * 100, rel=0.25)
+
+
+def test_a_softer_tip_than_the_settings_reads_less_pressure():
+    sums = []
+    for scale in (1.0, 0.7):
+        bench = Bench(
+            simulation={
+                "modulus_scale": scale,
+                "compression_speed": 0.02,
+                "tactile_noise": 0.0,
+            },
+            servos={"backend": "none"},
+        )
+        sensor = bench.sensors[0]
+        sensor.open()
+        # Onto the left tip: 18 mm of way at 20 mm/s.
+        bench.clock.sleep_until(0.8)
+        frame = sensor.latest()
+        sums.append(float(frame.data.sum()) * 4.0 * bench.settings.tactile.pitch**2)
+        d = 0.02 * frame.t_sample - 0.010
+        assert sums[-1] == pytest.approx(scale * math.pi * 0.304e6 * d * d, rel=5e-3)
+    assert sums[1] == pytest.approx(0.7 * sums[0], rel=1e-2)
+
+
+def test_a_long_delay_still_finds_its_sample():
+    bench = Bench(simulation={"tactile_delay": 0.5})
+    sensor = bench.sensors[0]
+    sensor.open()
+    for _ in range(100):
+        bench.clock.sleep_until(bench.clock.now() + 0.0137)
+        frame = sensor.latest()
+        assert 0.5 - 1e-6 <= bench.clock.now() - frame.t_sample < 0.51 + 1e-6
+
+
+def test_registries_make_them_and_two_runs_are_bit_identical():
+    def run() -> tuple[bytes, bytes]:
+        settings = Settings()
+        clock = VirtualClock()
+        hand = SimulatedHand(settings, clock.now(), table=TABLE)
+        servos = make_servos(settings, clock, hand)
+        sensor = make_sensor(settings, clock, hand, 0)
+        servos.connect()
+        sensor.open()
+        servos.set_torque(True)
+        goal, reading = Goal(), Reading()
+        goal.q, goal.current = [0.6, 0.6], [0.4, 0.4]
+        data = b""
+        for _ in range(250):
+            clock.sleep_until(clock.now() + 0.002)
+            servos.read(reading)
+            data += repr((reading.q, reading.current)).encode() + sensor.latest().data.tobytes()
+            servos.write(goal)
+        return data, hand.memory.tobytes()
+
+    assert run() == run()
