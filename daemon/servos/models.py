@@ -90,7 +90,7 @@ def _x330(
     return ServoModel(
         name=name,
         number=number,
-        firmware=52,
+        firmware=53,
         highest_baud=6,
         current_unit=1e-3,
         current_limit=current_limit,
