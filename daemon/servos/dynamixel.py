@@ -22,6 +22,7 @@ from daemon.records import FINGERS, Goal, Reading
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
 from daemon.servos.checks import MEND, check_latency, check_servo
+from daemon.servos.line import ServoLine
 from daemon.servos.models import ServoModel, by_name
 from daemon.servos.packets import GroupRead, PacketHandler
 from daemon.servos.port import PortGone, SerialPort
@@ -40,7 +41,6 @@ _GOAL_BYTES = (
     reg.GOAL_POSITION + 2,
     reg.GOAL_POSITION + 3,
 )
-_TRIES = 3  # for exchanges outside the tick
 _CHECKED = reg.BACKUP_READY  # registers 0 … 146 are looked at
 
 
@@ -59,7 +59,7 @@ class DynamixelServos:
         self._fingers = [FINGERS.index(finger) for finger in settings.scene.fingers]
         self._ids = {finger: servos.ids[finger] for finger in self._fingers}
         self._handler = PacketHandler()
-        self._port: SerialPort | None = None
+        self._line: ServoLine | None = None
         self._fast = False
         self._torque = False
         self._last_sent = 0.0  # time.monotonic() of the last packet the servos must have heard
@@ -84,26 +84,27 @@ class DynamixelServos:
             raise ServoError(f"servos.model: {error.args[0]}") from None
         port = SerialPort(self._settings.port, self._settings.baud, self._settings.reply_timeout)
         port.openPort()
-        self._port = port
+        line = ServoLine(port, self._handler)
         try:
-            self._check(port, model)
+            self._check(line, model)
         except BaseException:
             port.closePort()
-            self._port = None
             raise
+        self._line = line
         self._prepare(port, model)
 
-    def _check(self, port: SerialPort, model: ServoModel) -> None:
+    def _check(self, line: ServoLine, model: ServoModel) -> None:
+        port = line.port
         latency = check_latency(port.port_name, port.latency_timer(), port.reply_timeout)
         errors, notices = list(latency.errors), list(latency.notices)
         silent: list[int] = []
         self._fast = True
         for finger, servo_id in self._ids.items():
-            name = f"servo {servo_id} ({FINGERS[finger]})"
-            if not self._ping(port, servo_id):
+            name = self._name(finger)
+            if line.ping(servo_id) is None:
                 silent.append(finger)
                 continue
-            table = self._read_span(port, servo_id, 0, _CHECKED)
+            table = line.read(servo_id, 0, _CHECKED)
             if table is None:
                 errors.append(
                     f"{name}: answers a ping but no read (status return level 0, or a bad line): "
@@ -124,8 +125,8 @@ class DynamixelServos:
             )
         for finger in silent:
             errors.append(
-                f"servo {self._ids[finger]} ({FINGERS[finger]}): no answer at {port.baudrate} "
-                "baud: check its cable and ID; `softfinger doctor` looks for it at every rate"
+                f"{self._name(finger)}: no answer at {port.baudrate} baud: check its cable and ID; "
+                "`softfinger doctor` looks for it at every rate"
             )
         if errors:
             raise ServoError("\n".join(errors))
@@ -140,8 +141,6 @@ class DynamixelServos:
         span = reg.PRESENT_POSITION + 4 - reg.PRESENT_CURRENT
         ids = list(self._ids.values())
         self._present = GroupRead(port, self._handler, reg.PRESENT_CURRENT, span, ids)
-        # Every block of indirect data begins behind its addresses; the first serves all firmwares
-        # of a model but X330, where it moved.
         self._goals = None
         self._torque = False
 
@@ -161,7 +160,7 @@ class DynamixelServos:
         result = present.exchange(self._fast)
         if result == COMM_RX_CORRUPT:
             # Once more, with what is left of the first exchange's deadline.
-            port = self._open_port()
+            port = self._open_line().port
             port.not_after = port.deadline
             if time.monotonic() < port.deadline:
                 self._retries += 1
@@ -213,27 +212,27 @@ class DynamixelServos:
         Raises:
             ServoError: it could not be done or not be verified; on → off then is tried.
         """
-        port = self._open_port()
+        line = self._open_line()
         if not on:
             self._torque = False
             self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(self._ids, 0), "torque off")
             self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(self._ids, 0), "watchdog off")
             return
-        self._refuse_hardware_errors(port)
+        self._refuse_hardware_errors(line)
         try:
-            self._switch_on(port)
+            self._switch_on(line)
         except ServoError:
             with contextlib.suppress(ServoError):
                 self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(self._ids, 0), "torque off")
             raise
 
-    def _switch_on(self, port: SerialPort) -> None:
+    def _switch_on(self, line: ServoLine) -> None:
         each = self._ids
         # Writing 0 ends a watchdog's stop, in which goals are read-only.
         self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, 0), "watchdog cleared")
-        self._map_goals(port)
+        self._map_goals(line)
         self._store(reg.GOAL_CURRENT, "<h", dict.fromkeys(each, 0), "goal current")
-        self._store(reg.GOAL_POSITION, "<i", self._positions(port), "goal position")
+        self._store(reg.GOAL_POSITION, "<i", self._positions(line), "goal position")
         self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(each, 1), "torque on")
         watchdog = self._settings.watchdog
         if watchdog > 0.0:
@@ -242,14 +241,14 @@ class DynamixelServos:
         self._last_sent = time.monotonic()
         self._torque = True
 
-    def _map_goals(self, port: SerialPort) -> None:
+    def _map_goals(self, line: ServoLine) -> None:
         """Put goal current and goal position side by side in the indirect data."""
         model = by_name(self._settings.model)
         starts = set()
         for finger, servo_id in self._ids.items():
-            firmware = self._read_span(port, servo_id, reg.FIRMWARE_VERSION, 1)
+            firmware = line.read(servo_id, reg.FIRMWARE_VERSION, 1)
             if firmware is None:
-                raise ServoError(f"servo {servo_id} ({FINGERS[finger]}): no answer")
+                raise ServoError(f"{self._name(finger)}: no answer")
             address, data, _ = model.indirect_blocks(firmware[0])[0]
             starts.add((address, data))
         if len(starts) > 1:
@@ -260,24 +259,24 @@ class DynamixelServos:
         address, data = starts.pop()
         pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
         self._store_bytes(address, dict.fromkeys(self._ids, pointers), "indirect addresses")
-        self._goals = GroupSyncWrite(port, self._handler, data, _GOAL.size)
+        self._goals = GroupSyncWrite(line.port, self._handler, data, _GOAL.size)
         for servo_id in self._ids.values():
             self._goals.addParam(servo_id, bytes(_GOAL.size))
 
-    def _positions(self, port: SerialPort) -> dict[int, int]:
+    def _positions(self, line: ServoLine) -> dict[int, int]:
         positions = {}
         for finger, servo_id in self._ids.items():
-            raw = self._read_span(port, servo_id, reg.PRESENT_POSITION, 4)
+            raw = line.read(servo_id, reg.PRESENT_POSITION, 4)
             if raw is None:
-                raise ServoError(f"servo {servo_id} ({FINGERS[finger]}): position not read")
+                raise ServoError(f"{self._name(finger)}: position not read")
             positions[finger] = int.from_bytes(raw, "little", signed=True)
         return positions
 
-    def _refuse_hardware_errors(self, port: SerialPort) -> None:
+    def _refuse_hardware_errors(self, line: ServoLine) -> None:
         lines = []
         for finger, servo_id in self._ids.items():
-            name = f"servo {servo_id} ({FINGERS[finger]})"
-            raw = self._read_span(port, servo_id, reg.HARDWARE_ERROR_STATUS, 1)
+            name = self._name(finger)
+            raw = line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
                 lines.append(f"{name}: no answer: check its cable and power")
             elif raw[0]:
@@ -289,56 +288,38 @@ class DynamixelServos:
             raise ServoError("\n".join(lines))
 
     def _check_watchdog(self) -> None:
-        port = self._open_port()
+        line = self._open_line()
         for finger, servo_id in self._ids.items():
-            raw = self._read_span(port, servo_id, reg.BUS_WATCHDOG, 1)
+            raw = line.read(servo_id, reg.BUS_WATCHDOG, 1)
             if raw is not None and raw[0] == reg.WATCHDOG_ERROR:
                 raise ServoError(
-                    f"servo {servo_id} ({FINGERS[finger]}): its bus watchdog stopped it, since no "
-                    "packet came in time: disarm, then arm"
+                    f"{self._name(finger)}: its bus watchdog stopped it, since no packet "
+                    "came in time: disarm, then arm"
                 )
         self._last_sent = time.monotonic()
 
     # --- exchanges outside the tick ----------------------------------------------------------
 
-    def _open_port(self) -> SerialPort:
-        if self._port is None:
+    def _open_line(self) -> ServoLine:
+        if self._line is None:
             raise ServoError("servos: not connected")
-        return self._port
+        return self._line
 
-    def _ping(self, port: SerialPort, servo_id: int) -> bool:
-        return any(self._handler.ping(port, servo_id)[1] == COMM_SUCCESS for _ in range(_TRIES))
-
-    def _read_span(
-        self, port: SerialPort, servo_id: int, address: int, length: int
-    ) -> bytes | None:
-        for _ in range(_TRIES):
-            data, result, error = self._handler.readTxRx(port, servo_id, address, length)
-            if result == COMM_SUCCESS:
-                return None if error & 0x7F else bytes(data)
-        return None
+    def _name(self, finger: int) -> str:
+        return f"servo {self._ids[finger]} ({FINGERS[finger]})"
 
     def _store(self, address: int, form: str, values: dict[int, int], what: str) -> None:
         packed = {finger: struct.pack(form, value) for finger, value in values.items()}
         self._store_bytes(address, packed, what)
 
     def _store_bytes(self, address: int, values: dict[int, bytes], what: str) -> None:
-        """Write each finger's servo and read back, which works at any status return level."""
-        port = self._open_port()
-        waiting = dict(values)
-        for _ in range(_TRIES):
-            length = len(next(iter(waiting.values())))
-            group = GroupSyncWrite(port, self._handler, address, length)
-            for finger, data in waiting.items():
-                group.addParam(self._ids[finger], data)
-            group.txPacket()
-            for finger, data in list(waiting.items()):
-                if self._read_span(port, self._ids[finger], address, length) == data:
-                    del waiting[finger]
-            if not waiting:
-                return
-        names = ", ".join(f"servo {self._ids[finger]} ({FINGERS[finger]})" for finger in waiting)
-        raise ServoError(f"{names}: {what} could not be set or not be verified")
+        by_id = {self._ids[finger]: data for finger, data in values.items()}
+        failed = self._open_line().store(address, by_id)
+        if failed:
+            names = ", ".join(
+                self._name(finger) for finger in values if self._ids[finger] in failed
+            )
+            raise ServoError(f"{names}: {what} could not be set or not be verified")
 
     # --- the end -----------------------------------------------------------------------------
 
@@ -359,8 +340,8 @@ class DynamixelServos:
 
         A servo whose torque another program switched on is left as it was found.
         """
-        port = self._port
-        if port is None:
+        line = self._line
+        if line is None:
             return
         try:
             if self._torque:
@@ -370,7 +351,7 @@ class DynamixelServos:
         except Exception as error:
             _log.error("servos: torque off is not certain: %s", error)
         self._torque = False
-        self._port = None
+        self._line = None
         self._present = None
         with contextlib.suppress(Exception):
-            port.closePort()
+            line.port.closePort()
