@@ -21,6 +21,7 @@ _DEGREES = range(11)  # of the modulus
 _GOOD = 1e-4  # of the greatest stress: a misfit that needs no higher degree
 _BAD = 0.05  # of the greatest stress: a misfit that no law is made of
 _FLOOR = 1e-3  # least modulus over the mean one
+_BEYOND = 0.02  # weight of the points that only continue the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences, against wiggles between points
 
 
@@ -73,11 +74,12 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float
     x, y = check_points(strain, stress)
     top = float(y[-1])
     points, values = _continued(x, y / top)
+    weights = np.where(np.arange(points.size) < x.size, 1.0, _BEYOND)
     best: tuple[float, FloatArray] | None = None
     for degree in _DEGREES:
         if degree > max(2 * x.size, 3):
             break
-        modulus = _positive_modulus(points, values, degree)
+        modulus = _positive_modulus(points, values, weights, degree)
         misfit = float(np.max(np.abs(_integrals(x, degree) @ modulus - y / top)))
         if best is None or misfit < 0.9 * best[0]:
             best = misfit, modulus
@@ -123,14 +125,16 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([x, more]), np.concatenate([y, y[-1] + slope * (more - x[-1])])
 
 
-def _positive_modulus(x: FloatArray, y: FloatArray, degree: int) -> FloatArray:
+def _positive_modulus(
+    x: FloatArray, y: FloatArray, weights: FloatArray, degree: int
+) -> FloatArray:
     """Bernstein coefficients ≥ _FLOOR of the modulus whose integral runs nearest to the points."""
-    matrix = _integrals(x, degree)
+    matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))
     for i in range(degree - 1):
         smooth[i, i : i + 3] = 1.0, -2.0, 1.0
     rows = np.concatenate([matrix, _SMOOTHING * smooth])
-    right = np.concatenate([y, np.zeros(len(smooth))])
+    right = np.concatenate([y * weights, np.zeros(len(smooth))])
     floor = _FLOOR * float(y[-1] / x[-1])
     return floor + nonnegative(rows, right - rows @ np.full(degree + 1, floor))
 

@@ -1,0 +1,236 @@
+"""Stress-strain laws: Table I, measured points, what is refused, and the kernels' tables."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kinematics import Material
+from kinematics.material import (
+    TABLE_I_MODULUS,
+    TABLE_I_STRAIN,
+    MaterialError,
+    energy_density_at,
+    stress_at,
+)
+from kinematics.material_fit import fit_modulus, nonnegative
+
+STRAIN = np.linspace(0.0, 1.0, 201)
+
+
+def laws() -> list[Material]:
+    """One of each kind, the last with several expansion pieces."""
+    x = np.linspace(0.0, 0.8, 30)
+    return [
+        Material.constant(0.304e6),
+        Material.table_i(),
+        Material.from_points([0, 0.2, 0.4, 0.6, 0.8, 1.0], [0, 28e3, 61e3, 99e3, 140e3, 186e3]),
+        Material.from_points(x, 1e5 * np.tanh(3 * x)),
+    ]
+
+
+def test_constant_modulus() -> None:
+    material = Material.constant(0.304e6)
+    np.testing.assert_allclose(material.stress(STRAIN), 0.304e6 * STRAIN, rtol=1e-15)
+    np.testing.assert_allclose(material.energy_density(STRAIN), 0.152e6 * STRAIN**2, rtol=1e-15)
+    np.testing.assert_array_equal(material.law, [[0.0, 0.304e6]])
+    assert material.is_linear
+    assert material == Material.paper()
+    for modulus in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(MaterialError, match="positive"):
+            Material.constant(modulus)
+
+
+def test_table_i_has_the_papers_slopes() -> None:
+    material = Material.table_i()
+    assert material.reference_modulus == 0.135e6
+    assert not material.is_linear
+    assert material.law.shape[0] == 1
+    step = 1e-6
+    for strain, modulus in zip(TABLE_I_STRAIN[1:-1], TABLE_I_MODULUS[1:-1], strict=True):
+        slope = (material.stress(strain + step) - material.stress(strain - step)) / (2 * step)
+        np.testing.assert_allclose(slope, modulus, rtol=1e-8)
+    slope = np.gradient(material.stress(STRAIN), STRAIN)
+    assert np.all(np.diff(slope) > -1e-6 * slope[0])  # the modulus never falls
+    assert 0.135e6 <= slope.min() * (1 + 1e-12)
+    assert slope.max() < 0.304e6
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_a_law_is_smooth_rising_and_consistent(index: int) -> None:
+    material = laws()[index]
+    stress, energy = material.stress(STRAIN), material.energy_density(STRAIN)
+    assert stress[0] == energy[0] == 0.0
+    assert np.all(np.diff(stress) > 0)
+    # Energy density is the stress's integral: Gauss on each step.
+    points, weights = np.polynomial.legendre.leggauss(8)
+    inner = STRAIN[:-1, None] + 0.5 * (points + 1) * np.diff(STRAIN)[:, None]
+    parts = 0.5 * np.diff(STRAIN) * (material.stress(inner) * weights).sum(axis=1)
+    np.testing.assert_allclose(energy[1:], np.cumsum(parts), rtol=1e-12)
+    # The exact polynomial, in plain arithmetic, is what the pieces hold.
+    powers = [float(c) for c in material.coefficients]
+    for strain in (1e-9, 0.124999, 0.125, 0.3, 0.75, 1.0 - 1e-12):
+        exact = math.fsum(c * strain**j for j, c in enumerate(powers, 1))
+        scale = math.fsum(abs(c) * strain**j for j, c in enumerate(powers, 1))
+        assert abs(stress_at(material.law, strain) - exact) <= 1e-15 * scale + 1e-15 * exact
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_outside_zero_to_one(index: int) -> None:
+    material = laws()[index]
+    for strain in (0.0, -0.0, -0.3, -math.inf):
+        assert stress_at(material.law, strain) == 0.0
+        assert energy_density_at(material.energy_law, strain) == 0.0
+    assert math.isnan(stress_at(material.law, math.nan))
+    assert math.isnan(energy_density_at(material.energy_law, math.nan))
+    end, slope = material.stress(1.0), material.stress(2.0) - material.stress(1.0)
+    np.testing.assert_allclose(material.stress([1.5, 3.0]), [end + slope / 2, end + 2 * slope])
+    np.testing.assert_allclose(
+        material.energy_density(2.0) - material.energy_density(1.0), end + slope / 2, rtol=1e-12
+    )
+    below = (material.stress(1.0) - material.stress(1.0 - 1e-6)) / 1e-6
+    np.testing.assert_allclose(slope, below, rtol=1e-4)
+    assert material.stress(np.empty((0, 3))).shape == (0, 3)
+    assert material.stress(np.float32(0.5)).shape == ()
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_expansions_are_the_secant_work_and_tangent(index: int) -> None:
+    material = laws()[index]
+    table = material.expansions()
+    pieces = table.shape[1]
+    modulus = material.reference_modulus
+    for strain in (0.03, 0.4, 0.77, 0.999):
+        k = int(strain * pieces)
+        u = strain * pieces - k
+        row = table[:, k] @ u ** np.arange(table.shape[2])
+        secant = material.stress(strain) / strain / modulus
+        work = 2 * material.energy_density(strain) / strain**2 / modulus
+        step = 1e-5
+        around = material.stress([strain - step, strain + step])
+        tangent = (around[1] - around[0]) / (2 * step) / modulus
+        np.testing.assert_allclose(1 + strain * row[0], secant, rtol=1e-11)
+        np.testing.assert_allclose(1 + strain * row[1], work, rtol=1e-11)
+        np.testing.assert_allclose(1 + strain * row[2], tangent, rtol=1e-7)
+        np.testing.assert_allclose(table[0, 0, 0] + strain * row[3], row[0], rtol=1e-9)
+        np.testing.assert_allclose(table[2, 0, 0] + strain * row[5], row[2], rtol=1e-9)
+
+
+def test_points_of_a_law_give_the_law_back() -> None:
+    original = Material.table_i()
+    for x in (np.linspace(0.0, 1.0, 12), np.linspace(0.04, 1.0, 25)):
+        again = Material.from_points(x, original.stress(x))
+        np.testing.assert_allclose(again.stress(STRAIN), original.stress(STRAIN), atol=2.0)
+        assert again.fit_error < 2.0
+    line = Material.from_points([0, 0.1, 0.2, 0.5], [0, 1e4, 2e4, 5e4])
+    assert line.is_linear
+    np.testing.assert_allclose(line.reference_modulus, 1e5, rtol=1e-12)
+
+
+def test_short_curves_go_on_with_their_last_slope() -> None:
+    x = np.linspace(0.0, 0.5, 20)
+    material = Material.from_points(x, 1e5 * (x + x**2))
+    np.testing.assert_allclose(material.stress(x[1:]), 1e5 * (x + x**2)[1:], rtol=5e-3)
+    slope = (material.stress(1.0) - material.stress(0.6)) / 0.4
+    assert 1.6e5 < slope < 2.1e5
+
+
+@given(
+    steps=st.lists(st.floats(0.2, 5.0), min_size=5, max_size=20),
+    scale=st.floats(1.0, 1e9),
+)
+@settings(max_examples=60, deadline=None)
+def test_any_rising_points_give_a_rising_law_or_a_reason(steps: list[float], scale: float) -> None:
+    x = np.linspace(0.0, 1.0, len(steps) + 1)
+    y = scale * np.concatenate([[0.0], np.cumsum(steps)])
+    try:
+        material = Material.from_points(x, y)
+    except MaterialError as error:
+        assert "no smooth monotone law" in str(error)  # noqa: PT017
+        return
+    assert np.all(np.diff(material.stress(STRAIN)) > 0)
+    assert np.max(np.abs(material.stress(x) - y)) <= material.fit_error * (1 + 1e-6) + 1e-9 * y[-1]
+    assert material.fit_error <= 0.05 * y[-1]
+
+
+@pytest.mark.parametrize(
+    ("strain", "stress", "words"),
+    [
+        ([0, 0.5, 1], [0, 1, 2], "too few points: 3"),
+        ([0, 0.2, 0.4, 0.6], [0, 2, 1, 3], "not monotone.*point 3 has 1 Pa after 2 Pa"),
+        ([0, 0.2, 0.4, 0.6], [0, 2, 2, 3], "not monotone"),
+        ([0, 0.4, 0.2, 0.6], [0, 1, 2, 3], "strain must rise: point 3"),
+        ([0, 0.2, 0.4, 0.6], [1, 2, 3, 4], "starts off zero: 1 Pa"),
+        ([0.1, 0.2, 0.4, 0.6], [-1, 2, 3, 4], "starts off zero"),
+        ([-0.1, 0.2, 0.4, 0.6], [-1, 2, 3, 4], "below zero"),
+        ([0, 0.2, math.nan, 0.6], [0, 2, 3, 4], "point 3 is not a number"),
+        ([0, 0.2, 0.4, 0.6], [0, 2, math.inf, 4], "point 3 is not a number"),
+        ([0, 20, 40, 100], [0, 2, 3, 4], "not per cent"),
+        ([0, 0.2, 0.4], [0, 2, 3, 4], "one length"),
+        ([0, 0.5, 1.2, 1.4], [0, 2, 3, 4], "too few points between"),
+        ([0, 0.1, 0.2, 0.3, 0.31, 0.9], [0, 1, 2, 3, 90, 91], "no smooth monotone law"),
+    ],
+)
+def test_refusals_say_what_is_wrong(strain: list[float], stress: list[float], words: str) -> None:
+    with pytest.raises(MaterialError, match=words):
+        Material.from_points(strain, stress)
+
+
+def test_all_that_is_wrong_comes_in_one_report() -> None:
+    with pytest.raises(MaterialError) as error:
+        Material.from_points([0, 0.4, 0.2], [5, 2, 1])
+    for words in ("too few", "strain must rise", "not monotone", "starts off zero"):
+        assert words in str(error.value)
+
+
+def test_csv_with_branches() -> None:
+    text = "strain, stress, branch\n# polyurethane\n0,0,load\n0.3,3e4,load\n0.6,7e4,load\n"
+    text += "1.0,1.3e5,load\n\n1.0,1.3e5,unload\n0.6,5e4,unload\n0.3,2e4,unload\n0,0,unload\n"
+    load, unload = Material.from_csv(text), Material.from_csv(text, branch="unload")
+    np.testing.assert_allclose(load.stress(0.6), 7e4, rtol=1e-3)
+    np.testing.assert_allclose(unload.stress(0.6), 5e4, rtol=1e-3)
+    assert Material.from_csv("0,0\n0.2,1e4\n0.5,3e4\n1,8e4\n").stress(0.2) == pytest.approx(
+        1e4, rel=1e-2
+    )
+    with pytest.raises(MaterialError, match="line 2 holds no strain and stress"):
+        Material.from_csv("0,0\nabc,1\n")
+    with pytest.raises(MaterialError, match="line 1: the branch"):
+        Material.from_csv("0,0,up\n")
+    with pytest.raises(MaterialError, match="load or unload"):
+        Material.from_csv(text, branch="both")
+
+
+def test_modulus_fitted_in_compression() -> None:
+    rng = np.random.default_rng(1)
+    d = np.linspace(1e-3, 8e-3, 40)
+    theta = np.radians(rng.uniform(-25, 25, 40))
+    force = math.pi * 0.2e6 * d**2 / np.cos(theta)
+    assert fit_modulus(d, theta, force) == pytest.approx(0.2e6, rel=1e-12)
+    noisy = fit_modulus(d, theta, force + rng.normal(0, 0.2, 40))
+    assert noisy == pytest.approx(0.2e6, rel=0.01)
+    for bad in ([0.0, 0.0], [math.nan, 1.0]):
+        with pytest.raises(MaterialError, match="compression data"):
+            fit_modulus(bad, 0.0, [1.0, 2.0])
+    with pytest.raises(MaterialError, match="modulus of"):
+        fit_modulus([1e-3, 2e-3], 0.0, [-1.0, -2.0])
+
+
+def test_nonnegative_least_squares_meets_its_optimality_conditions() -> None:
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        matrix, right = rng.normal(size=(12, 6)), rng.normal(size=12)
+        np.testing.assert_allclose(
+            nonnegative(matrix, right), nnls(matrix, right)[0], atol=1e-9, rtol=1e-9
+        )
+
+
+def test_materials_compare_by_their_law() -> None:
+    assert Material.table_i() == Material.table_i()
+    assert hash(Material.table_i()) == hash(Material.table_i())
+    assert Material.constant(1e5) != Material.constant(2e5)
