@@ -43,8 +43,10 @@ def run(arguments: argparse.Namespace) -> int:
         print(error, file=sys.stderr)
         return 2
     # What follows imports numpy, numba and zmq: wrong settings are told without waiting for them.
+    from daemon.realtime import hold_collector, settle
+
+    hold_collector()
     from daemon.assembly import Daemon
-    from daemon.realtime import settle
     from daemon.servos.base import ServoError
     from daemon.sockets import AddressError
     from daemon.tactile.base import TactileError
