@@ -37,7 +37,7 @@ def _row_scan(row: FloatArray, live: FloatArray, level: float) -> tuple[float, f
 
 
 @kernel
-def _neighbourhood(frame: FloatArray, cells: FloatArray, i: int, j: int) -> float:
+def neighbourhood(frame: FloatArray, cells: FloatArray, i: int, j: int) -> float:
     """How far the 5 × 5 cells round (i, j), without the middle one, stand above noise 1.
 
     Weights (1, 2, 2, 2, 1) both ways; the sum over its standard deviation.
@@ -95,7 +95,7 @@ def activity(
                         row = i
                         col = j
                     if not contact:
-                        contact = _neighbourhood(frame, cells, i, j) > patch_level * noise
+                        contact = neighbourhood(frame, cells, i, j) > patch_level * noise
     mean = total / max(number, 1.0)
     return contact, row, col, peak, mean, math.isfinite(total) and math.isfinite(peak)
 
@@ -157,6 +157,6 @@ def presses_outside(
             if (first <= j < last) or not cells[i, LIVE, j] > 0.0:
                 continue
             # Σ w = 60 and √Σ w² = 13.4 over a whole neighbourhood.
-            if frame[i, j] > level and _neighbourhood(frame, cells, i, j) > 1.5 * level:
+            if frame[i, j] > level and neighbourhood(frame, cells, i, j) > 1.5 * level:
                 return True
     return False

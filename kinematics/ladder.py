@@ -18,7 +18,7 @@ from kinematics.footprint import FloatArray, IntArray
 from kinematics.gauss_newton import RESULT, fit
 from kinematics.kernels import fast_kernel, kernel
 from kinematics.likelihood import SUMS
-from kinematics.moments import RATIO_POINTS, coarse, refine
+from kinematics.moments import RATIO_POINTS, coarse, coarse_weak, refine
 
 # Places in the state: what a frame leaves, and where the next one starts. The estimate in the
 # sensor's axes comes first, then what is told in the finger's.
@@ -62,6 +62,7 @@ STATE = COVARIANCE + 16
 ) = range(5, 17)
 OPTIONS = 17
 
+WEAK = 15.0  # noise: a largest cell below is looked for together with its neighbours
 SPIKES_MAX = 6  # hot cells left out of one frame
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
@@ -109,8 +110,14 @@ def _start(
 ) -> None:
     """First estimate from the frame alone, into ``state``."""
     geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
-    level = max(4.0 * noise, 0.15 * frame[row, col])
-    d, n_x, n_y = coarse(frame, cells, geometry, runs, level, row, col)
+    peak = frame[row, col]
+    if peak > WEAK * noise:
+        level = max(4.0 * noise, 0.15 * peak)
+        d, n_x, n_y = coarse(frame, cells, geometry, runs, level, row, col)
+    else:
+        level = 2.0 * noise
+        patch = plan[PATCH_LEVEL] * noise
+        d, n_x, n_y = coarse_weak(frame, cells, geometry, runs, level, patch, row, col)
     fixed = 0.0 if plan[FREE_GAIN] > 0.0 else plan[FIXED_GAIN]
     modulus = plan[MODULUS] / scale
     gain = 1.0
@@ -223,12 +230,14 @@ def _likelihood(
             covariance,
         ):
             # Share of the frame's squared pressure, noise apart, that the model accounts for.
+            scatter = variance * math.sqrt(2.0 * number)
             misfit = max(energy + state[RESIDUAL] - number * variance, 0.0)
-            state[EXPLAINED] = 1.0 - misfit / max(energy, variance)
+            signal = max(energy - number * variance, scatter)
+            state[EXPLAINED] = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / signal, 1.0)
             if state[EXPLAINED] < plan[EXPLAINED_MIN]:
                 continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
-            if misfit > 8.0 * variance * math.sqrt(2.0 * number) + 0.003 * energy:
+            if misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * noise, 0.15 * state[PEAK] / scale)
                 state[SECOND] = presses_outside(
                     frame, cells, geometry, runs, level, state[D], state[N_X], state[N_Y]

@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+from kinematics.activity import neighbourhood
 from kinematics.cells import LIVE
 from kinematics.contact import Fingertip
 from kinematics.footprint import (
@@ -180,7 +181,6 @@ def coarse(
     col: int,
 ) -> tuple[float, float, float]:
     """(d, n_x, n_y) from the cells above ``level`` in the tip's disc: their centroid and number."""
-    a, x_first, y_first, pitch_x, pitch_y = geometry
     total = sum_x = sum_y = number = 0.0
     for i in range(frame.shape[0]):
         s0, s1, _, n = row_moments(frame, cells, i, runs[i, 0], runs[i, 1], level)
@@ -190,8 +190,52 @@ def coarse(
         number += n
     if not total > 0.0:
         total, sum_x, sum_y, number = 1.0, float(col), float(row), 1.0
-    x = x_first + pitch_x * (sum_x / total + 0.5)
-    y = y_first + pitch_y * (sum_y / total + 0.5)
+    return _from_area(geometry, sum_x / total, sum_y / total, number)
+
+
+@kernel
+def coarse_weak(
+    frame: FloatArray,
+    cells: FloatArray,
+    geometry: Geometry,
+    runs: IntArray,
+    level: float,
+    patch_level: float,
+    row: int,
+    col: int,
+) -> tuple[float, float, float]:
+    """As :func:`coarse` for pressures of a few times the noise, where lone cells mislead.
+
+    Takes the cells above ``level`` whose neighbourhood stands above ``patch_level``, both in the
+    frame's unit.
+    """
+    total = sum_x = sum_y = number = 0.0
+    for i in range(frame.shape[0]):
+        for j in range(runs[i, 0], runs[i, 1]):
+            value = frame[i, j]
+            if (
+                value > level
+                and cells[i, LIVE, j] > 0.0
+                and neighbourhood(frame, cells, i, j) > patch_level
+            ):
+                total += value
+                sum_x += value * j
+                sum_y += value * i
+                number += 1.0
+    if not total > 0.0:
+        total, sum_x, sum_y, number = 1.0, float(col), float(row), 1.0
+    # Of a weak contact's cells about three quarters pass.
+    return _from_area(geometry, sum_x / total, sum_y / total, 1.3 * number)
+
+
+@kernel
+def _from_area(
+    geometry: Geometry, col: float, row: float, number: float
+) -> tuple[float, float, float]:
+    """(d, n_x, n_y) of a contact of so many cells round a place [cells]."""
+    a, x_first, y_first, pitch_x, pitch_y = geometry
+    x = x_first + pitch_x * (col + 0.5)
+    y = y_first + pitch_y * (row + 0.5)
     # The footprint's area is π ρ² cos θ with ρ² = 2 a d − d².
     rho2 = min(number * pitch_x * pitch_y / math.pi, 0.75 * a * a)
     d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
