@@ -9,8 +9,10 @@ import os
 import platform
 import sys
 from pathlib import Path
+from types import ModuleType
 
 MEASUREMENTS = {
+    "contact": "the contact model, run time against error",
     "tick": "one tick without serial",
     "hil": "one tick over the stand-in hand's ptys",
     "startup": "start to the first published state",
@@ -24,28 +26,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names", metavar="NAME", nargs="*", help=f"what to measure: {known}; all if none is named"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="draw what has a picture: contact (extra 'plot')"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the JSON file."""
-    from tools.benchmarks.report import table
+    from tools.benchmarks.report import Row, table
 
-    unknown = [name for name in arguments.names if name not in MEASUREMENTS]
+    names = arguments.names or list(MEASUREMENTS)
+    unknown = [name for name in names if name not in MEASUREMENTS]
     if unknown:
         known = ", ".join(MEASUREMENTS)
         print(f"bench: found {unknown[0]!r}, expected one of {known}", file=sys.stderr)
         return 2
-    rows = []
-    for name in arguments.names or MEASUREMENTS:
+    modules = {name: importlib.import_module(f"tools.benchmarks.{name}") for name in names}
+    if arguments.plot and (reason := _no_plot(modules)):
+        print(f"bench: {reason}", file=sys.stderr)
+        return 2
+    report, plain = [], []
+    for name, module in modules.items():
         print(f"measuring {MEASUREMENTS[name]} …", file=sys.stderr, flush=True)
-        rows += importlib.import_module(f"tools.benchmarks.{name}").measure()
-    print(table(rows))
+        rows = module.measure()
+        report += [{"measurement": name, **each.as_dict()} for each in rows]
+        plain += [each for each in rows if isinstance(each, Row)]
+        own = [each for each in rows if not isinstance(each, Row)]
+        if own:
+            print(module.table(own), end="\n\n")
+        if own and arguments.plot:
+            module.plot(own, arguments.plot)
+    print(table(plain))
     if arguments.json:
-        report = {
+        content = {
             "machine": platform.machine(),
             "cores": os.cpu_count(),
             "python": platform.python_version(),
-            "rows": [each.as_dict() for each in rows],
+            "rows": report,
         }
-        arguments.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        arguments.json.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return 0
+
+
+def _no_plot(modules: dict[str, ModuleType]) -> str:
+    """Why ``--plot`` can't be served, known before anything is measured; empty when it can."""
+    from tools.figure_pages.style import NoMatplotlib, settings
+
+    if not any(hasattr(module, "plot") for module in modules.values()):
+        return "--plot: none of the named measurements has a picture"
+    try:
+        settings()
+    except NoMatplotlib as error:
+        return f"--plot: {error}"
+    return ""

@@ -38,7 +38,12 @@ def table(rows: list[Row]) -> str:
     for each in rows:
         aim = "" if each.aim is None else f"≤ {each.aim:g}"
         lines.append(
-            f"{each.name:58} {each.median:9.3f} {each.p99:9.3f} {each.unit:>4} {aim:>7} "
+            f"{each.name:58} {_number(each.median)} {_number(each.p99)} {each.unit:>4} {aim:>7} "
             f"{each.count:7d}"
         )
     return "\n".join(lines)
+
+
+def _number(value: float) -> str:
+    """Three decimals, or an exponent where these would hide it."""
+    return f"{value:9.3f}" if value == 0.0 or abs(value) >= 0.01 else f"{value:9.1e}"
