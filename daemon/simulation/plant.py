@@ -208,6 +208,12 @@ def settle(memory: FloatArray, ring: FloatArray) -> None:
 
 
 @kernel
+def bounded(value: float, most: float) -> float:
+    """``value`` within ± ``most``."""
+    return min(max(value, -most), most)
+
+
+@kernel
 def load_motors(
     memory: FloatArray, stage: int, position: int, velocity: int, h: float, g: float
 ) -> None:
@@ -299,15 +305,23 @@ def second_stage(memory: FloatArray, shear1: float, shear2: float, h: float, g: 
     for j in range(2):
         before = memory[layout.FIRST_X + 5 + j]
         change = current_change(memory, j, memory[layout.SECOND_V + j], g)
-        memory[layout.CURRENT + j] += h * (1.5 * before + 0.5 * change)
+        current = memory[layout.CURRENT + j] + h * (1.5 * before + 0.5 * change)
+        memory[layout.CURRENT + j] = bounded(current, 2.0 * memory[layout.STALL_CURRENT])
     first = 2 if memory[layout.JOINTS_HELD] != 0.0 else 0
     last = 2 if memory[layout.OBJECT_HELD] != 0.0 else 5
     for j in range(first, last):
         later = memory[layout.SECOND_X + j] + g * memory[layout.SECOND_V + j]
-        memory[layout.POSITION + j] += h * (1.5 * memory[layout.FIRST_X + j] + 0.5 * later)
-        memory[layout.VELOCITY + j] += h * (
-            1.5 * memory[layout.FIRST_V + j] + 0.5 * memory[layout.SECOND_V + j]
-        )
+        way = h * (1.5 * memory[layout.FIRST_X + j] + 0.5 * later)
+        change = h * (1.5 * memory[layout.FIRST_V + j] + 0.5 * memory[layout.SECOND_V + j])
+        # A step that would carry a tip past a quarter of its radius is far too long for what it
+        # is asked: it goes that far, and what it loses by that is energy.
+        most = 0.25 * memory[layout.RADIUS]
+        if j < 2:
+            most /= memory[layout.LENGTH] + abs(memory[layout.OFFSET])
+        elif j == 4:
+            most /= memory[layout.HALF_WIDTH] + memory[layout.HALF_HEIGHT]
+        memory[layout.POSITION + j] += bounded(way, most)
+        memory[layout.VELOCITY + j] = bounded(memory[layout.VELOCITY + j] + change, most / h)
 
 
 @kernel
