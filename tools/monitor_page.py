@@ -61,7 +61,7 @@ _LEVELS = {"info": DIM, "warning": WARN, "error": BAD}
 # (label, field, factor, decimals, unit, field of the standard deviation); "" leaves a line
 _ROWS = (
     ("d", "d", 1e3, 2, "mm", "d_std"),
-    ("θ", "theta", math.degrees(1.0), 2, "°", "theta_std"),
+    ("θ", "theta", math.degrees(1.0), 1, "°", "theta_std"),
     ("force", "force", 1.0, 2, "N", "force_std"),
     ("energy", "energy", 1e3, 2, "mJ", "energy_std"),
     ("map age", "frame_age_s", 1e3, 1, "ms", ""),
