@@ -187,3 +187,47 @@ def test_what_is_not_one_contact_is_not_valid(free_gain):
 def test_wrong_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
+
+
+def _garbage(rng, grid):
+    kind = rng.integers(8)
+    shape = grid.shape
+    size = 10.0 ** rng.uniform(-3, 8)
+    if kind == 0:
+        return rng.normal(0.0, size, shape)
+    if kind == 1:
+        return rng.integers(0, 256, shape).astype(np.uint8)
+    if kind == 2:
+        return rng.integers(0, 65536, shape).astype(np.uint16)
+    if kind == 3:
+        return np.where(rng.random(shape) < 0.05, size, 0.0)
+    if kind == 4:
+        at = rng.uniform(0.0, 0.0199), rng.uniform(-0.9, 0.9), rng.uniform(-0.6, 0.6)
+        p = grid.pressure(TIP, MEASURED, *at, gain=10.0 ** rng.uniform(-2, 2))
+        return p + rng.normal(0.0, 600.0, shape)
+    if kind == 5:
+        return rng.standard_cauchy(shape) * size
+    if kind == 6:
+        return np.frombuffer(rng.bytes(8 * grid.rows * grid.cols)).reshape(shape)
+    return np.full(shape, rng.choice([1.0, -1.0]) * 10.0 ** rng.uniform(-300, 300))
+
+
+@pytest.mark.parametrize("method", ["ml", "moments"])
+@pytest.mark.parametrize("free_gain", [True, False])
+@pytest.mark.parametrize(
+    ("rows", "cols", "pitch"),
+    [(44, 44, PITCH), (4, 4, 0.012), (5, 64, 0.0008), (64, 5, 0.003), (1, 1, 0.04), (1, 30, PITCH)],
+)
+def test_garbage_gives_finite_numbers_or_none_that_are_valid(method, free_gain, rows, cols, pitch):
+    rng = np.random.default_rng(21)
+    grid = SensorGrid(rows, cols, pitch)
+    estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, method=method, free_gain=free_gain)
+    for _ in range(200):
+        e = estimator.update(_garbage(rng, grid), 10.0 ** rng.uniform(-2, 3))
+        numbers = [e.d, e.tilt_x, e.tilt_y, e.gain, e.chi2, e.explained]
+        assert np.all(np.isfinite(numbers))
+        if e.valid:
+            assert 0.0 <= e.d < 0.75 * A
+            assert np.all(np.isfinite(e.covariance))
+            assert np.all(np.linalg.eigvalsh(e.covariance) >= -1e-12 * np.trace(e.covariance))
+            assert e.contact == (e.d > 0.0)
