@@ -63,6 +63,7 @@ class DynamixelServos:
         self._fast = False
         self._torque = False
         self._last_sent = 0.0  # time.monotonic() of the last packet the servos must have heard
+        self._quiet_limit = math.inf  # s without a packet after which the watchdog is asked
         self._retries = 0
         self._alerts = 0
         self._present: GroupRead | None = None
@@ -73,11 +74,12 @@ class DynamixelServos:
     # --- connect -----------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the port and check every servo of the scene; changes nothing in them.
+        """Open the port, again if it is open, and check every servo; changes nothing in them.
 
         Raises:
             ServoError: all that is wrong, one line each. The port is closed again.
         """
+        self.close()
         try:
             model = by_name(self._settings.model)
         except KeyError as error:
@@ -193,8 +195,7 @@ class DynamixelServos:
         goals = self._goals
         if goals is None or not self._torque:
             return
-        watchdog = self._settings.watchdog
-        if watchdog > 0.0 and time.monotonic() - self._last_sent > watchdog - reg.WATCHDOG_UNIT:
+        if time.monotonic() - self._last_sent > self._quiet_limit:
             self._check_watchdog()
         for finger, servo_id in self._ids.items():
             scale = self._scales[finger]
@@ -234,9 +235,11 @@ class DynamixelServos:
         self._store(reg.GOAL_CURRENT, "<h", dict.fromkeys(each, 0), "goal current")
         self._store(reg.GOAL_POSITION, "<i", self._positions(line), "goal position")
         self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(each, 1), "torque on")
-        watchdog = self._settings.watchdog
-        if watchdog > 0.0:
-            ticks = min(max(math.ceil(watchdog / reg.WATCHDOG_UNIT), 1), reg.WATCHDOG_MAX)
+        self._quiet_limit = math.inf
+        if self._settings.watchdog > 0.0:
+            ticks = math.ceil(self._settings.watchdog / reg.WATCHDOG_UNIT - 1e-9)
+            ticks = min(max(ticks, 1), reg.WATCHDOG_MAX)
+            self._quiet_limit = 0.8 * ticks * reg.WATCHDOG_UNIT
             self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, ticks), "watchdog armed")
         self._last_sent = time.monotonic()
         self._torque = True
