@@ -1,0 +1,53 @@
+"""What the tests of the simulated hand share: making one, putting it somewhere, letting it run."""
+
+from __future__ import annotations
+
+from daemon.settings import Settings
+from daemon.simulation import layout
+from daemon.simulation.hand import SimulatedHand
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+from kinematics.table import ContactTable
+
+MODULUS = 0.304e6
+WIDTH = 0.040
+CONSTANT = 1.78  # N·m/A
+PAPER = ContactTable.build(Fingertip(radius=0.020), Material.constant(MODULUS))
+TABLE_I = ContactTable.build(Fingertip(radius=0.020), Material.table_i(), tolerance=1e-6)
+CURRENT, POSITION, BOUNDED = 0, 3, 5  # operating modes
+LOSSLESS = {
+    "tip_loss": 0.0,
+    "joint_damping": 0.0,
+    "joint_friction": 0.0,
+    "table_friction": 0.0,
+    "tip_friction": 50.0,
+}
+
+
+def make(table: ContactTable = PAPER, step: float | None = None, **simulation) -> SimulatedHand:
+    settings = Settings.model_validate({"simulation": simulation})
+    return SimulatedHand(settings, table=table, step=step)
+
+
+def place(hand: SimulatedHand, q, pose, dq=(0, 0), velocity=(0, 0, 0)) -> None:
+    hand.q[:], hand.object_pose[:] = q, pose
+    hand.dq[:], hand.object_velocity[:] = dq, velocity
+    hand.refresh()
+
+
+def hold_with(hand: SimulatedHand, currents) -> None:
+    """Constant currents from the start on, whatever the joints' speed."""
+    hand.memory[layout.NO_LOAD_SPEED] = 1e9
+    hand.current[:] = currents
+    for joint in range(2):
+        hand.drive(joint, CURRENT, True, 0.0, currents[joint])
+
+
+def run(hand: SimulatedHand, seconds: float) -> None:
+    hand.advance(hand.t + seconds)
+
+
+def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) -> None:
+    for joint in range(2):
+        hand.drive(joint, BOUNDED, True, goals[joint], current)
+    run(hand, seconds)
