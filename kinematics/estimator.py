@@ -83,7 +83,8 @@ class ContactEstimator:
     ``method`` is "ml" (maximum likelihood) or "moments". ``free_gain`` also estimates measured over
     modelled pressure; otherwise ``gain`` is taken. ``live`` [rows, cols] bool masks dead cells.
     ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; by
-    default an integer type's largest value. ``tolerance`` stops the iteration once the squared
+    default an integer type's largest value. ``threshold`` is the smallest count the board sends,
+    0 stands for all below; for integer frames. ``tolerance`` stops the iteration once the squared
     step, in units of the noise floor, is below it (below 1 where it started from the frame alone):
     a step leaves an error of its square's order, so one of 4 σ ends well inside the noise.
     ``peak_level`` and ``patch_level`` set the activity test, see
@@ -105,6 +106,7 @@ class ContactEstimator:
         gain: float = 1.0,
         live: NDArray[np.bool_] | None = None,
         saturation: float | None = None,
+        threshold: float = 0.0,
         tolerance: float = 16.0,
         iterations: int = 20,
         peak_level: float = 3.0,
@@ -119,6 +121,8 @@ class ContactEstimator:
             raise ValueError(f"gain must be positive, got {gain}")
         if saturation is not None and not saturation > 0.0:
             raise ValueError(f"saturation must be positive, got {saturation}")
+        if not 0.0 <= threshold < math.inf:
+            raise ValueError(f"threshold must not be negative, got {threshold}")
         if live is not None and np.shape(live) != grid.shape:
             raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
         self.grid = grid
@@ -148,6 +152,8 @@ class ContactEstimator:
         plan[ladder.EXPLAINED_MIN] = explained_min
         plan[ladder.MODULUS] = material.reference_modulus
         plan[ladder.ROTATION] = grid.rotation
+        # Counts are rounded, so the smallest one sent stands for half a count less and up.
+        plan[ladder.FLOOR] = max(threshold - 0.5, 0.0)
         self._plan = plan
         self._state = np.zeros(ladder.STATE)
         self._frame = np.zeros((rows, cols))

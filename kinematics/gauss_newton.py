@@ -126,6 +126,7 @@ def fit(
     law: FloatArray,
     free: bool,
     saturation: float,
+    floor: float,
     clipped: bool,
     energy: float,
     number: float,
@@ -142,6 +143,7 @@ def fit(
     """Gauss-Newton from the contact in ``result`` (D, N_X, N_Y, GAIN), the estimate left there.
 
     ``variance`` [Pa²] is a cell's, ``saturation`` [Pa] its end;
+    ``floor`` as for :func:`kinematics.likelihood.accumulate`;
     ``clipped``: cells can't read below 0. ``energy`` and ``number`` are Σ p² [Pa²] and the number
     of the live cells in the tip's disc. Stops when the promised decrement
     is below ``tolerance`` · variance, that is the step is that part of the noise floor, squared.
@@ -171,7 +173,7 @@ def fit(
             if number - inside_number >= 16.0:
                 free_square = max(energy - inside, 0.0) / (number - inside_number)
                 clip = min(clip, math.sqrt(2.0 * free_square))
-        accumulate(packed, count, u, v, w, gain, saturation, clip, law, sums)
+        accumulate(packed, count, u, v, w, gain, saturation, floor, clip, law, sums)
         now = sums[14] - sums[15]
         if solved and not now <= cost + variance and halvings < 5:
             # Too far: half way back.

@@ -59,8 +59,9 @@ STATE = COVARIANCE + 16
     EXPLAINED_MIN,
     MODULUS,
     ROTATION,
-) = range(5, 17)
-OPTIONS = 17
+    FLOOR,
+) = range(5, 18)
+OPTIONS = 18
 
 WEAK = 15.0  # noise: a largest cell below is looked for together with its neighbours
 SPIKES_MAX = 6  # hot cells left out of one frame
@@ -216,6 +217,7 @@ def _likelihood(
             law,
             free,
             plan[SATURATION] * scale,
+            plan[FLOOR] * scale if plan[FLOOR] > 0.0 else -math.inf,
             clipped,
             energy,
             number,

@@ -206,6 +206,7 @@ def accumulate(
     w: float,
     gain: float,
     saturation: float,
+    floor: float,
     clip: float,
     law: FloatArray,
     sums: FloatArray,
@@ -215,7 +216,9 @@ def accumulate(
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
     factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
     sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
-    below its end. ``clip`` > 0 is the noise of cells that can't read below 0 [Pa].
+    below its end. A cell that the model puts below ``floor`` [Pa] doesn't count, as the board
+    sends 0 for it, and no reading is less; −inf for none. ``clip`` > 0 is the noise of cells that
+    can't read below 0 [Pa].
     """
     pieces = law.shape[0] - 1
     clipped = 1.0 if clip > 0.0 else 0.0
@@ -245,9 +248,9 @@ def accumulate(
         above = 1.0 - z / CLIP_END
         base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
         rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
-        residual = reading - model - clip * above * above * base
+        residual = max(reading, floor) - model - clip * above * above * base
         response = 1.0 + clipped * above * (above * rise - 2.0 / CLIP_END * base)
-        full = reading >= saturation and model >= saturation
+        full = (reading >= saturation and model >= saturation) or model < floor
         squares = weight * reading * reading
         weight = 0.0 if full else weight
         stress *= response

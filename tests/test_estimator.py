@@ -396,3 +396,22 @@ def test_a_model_that_does_not_fit_shows_in_chi2_and_widens_the_covariance():
         GRID.pressure(TIP, Material.constant(2 * E), twice.d, twice.tilt_x, twice.tilt_y)
     )
     assert twice.d_std > 5.0 * ideal.d_std
+
+
+@pytest.mark.parametrize("noise", [0.0, 600.0])
+def test_a_board_that_sends_nothing_below_three_counts_biases_d_by_less_than_a_percent(noise):
+    rng = np.random.default_rng(17)
+    estimator = ContactEstimator(
+        TIP, MEASURED, GRID, max(noise, 100.0), free_gain=False, threshold=3
+    )
+    for d in (0.001, 0.002, 0.008):
+        ratios = []
+        for _ in range(40):
+            at = tilts(rng.uniform(0.0, 0.5), rng.uniform(0, 7))
+            p = GRID.pressure(TIP, MEASURED, d, *at) + noise * rng.normal(0.0, 1.0, GRID.shape)
+            counts = np.clip(np.round(p / 500.0), 0, 255)
+            counts[counts < 3] = 0
+            e = estimator(counts.astype(np.uint8), 500.0)
+            assert e.valid
+            ratios.append(e.d / d - 1.0)
+        assert abs(np.mean(ratios)) < 0.008

@@ -181,6 +181,7 @@ def test_what_is_not_one_contact_is_not_valid(free_gain):
         ({"method": "best"}, "method"),
         ({"gain": -1.0}, "gain"),
         ({"saturation": 0.0}, "saturation"),
+        ({"threshold": -1.0}, "threshold"),
         ({"live": np.ones((4, 4), bool)}, "live"),
     ],
 )

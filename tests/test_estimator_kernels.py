@@ -63,7 +63,8 @@ def test_normal_equations_match_their_plain_twin():
     packed[6] = rng.random(n) > 0.1
     sums = np.zeros(SUMS)
     saturation = 2e4
-    accumulate(packed, n, u, v, w, gain, saturation, 0.0, cubic_law(MEASURED.law), sums)
+    floor = 1.3e4
+    accumulate(packed, n, u, v, w, gain, saturation, floor, 0.0, cubic_law(MEASURED.law), sums)
     strain = 1.0 - (u * packed[1] - v * packed[2] - w * packed[3]) / packed[0]
     step = 1e-4
     stress = MEASURED.stress(strain)
@@ -71,9 +72,10 @@ def test_normal_equations_match_their_plain_twin():
     bend = (MEASURED.stress(strain + step) - 2 * stress + MEASURED.stress(strain - step)) / step**2
     mean = packed[0] * (stress + 0.5 * bend * packed[4])
     free = (packed[5] < saturation) | (gain * mean < saturation)
+    free &= gain * mean >= floor
     weight = packed[6] * free
     jacobian = np.stack([mean, slope * packed[1], slope * packed[2], slope * packed[3]])
-    residual = packed[5] - gain * mean
+    residual = np.maximum(packed[5], floor) - gain * mean
     normal = (jacobian * weight) @ jacobian.T
     np.testing.assert_allclose(sums[:10], normal[np.triu_indices(4)], rtol=1e-4)
     np.testing.assert_allclose(sums[10:14], (jacobian * weight) @ residual, rtol=1e-3)
@@ -81,6 +83,7 @@ def test_normal_equations_match_their_plain_twin():
     assert sums[15] == pytest.approx((packed[6] * packed[5] ** 2).sum(), rel=1e-12)
     assert sums[16] == weight.sum()
     assert 0 < (~free).sum() < n
+    assert 0 < (gain * mean < floor).sum() < (~free).sum()
 
 
 def test_the_estimators_law_follows_any_material():
