@@ -6,6 +6,7 @@ connected and warmed up before (`daemon.assembly`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,7 @@ from daemon.task import Task
 EventSink = Callable[[str, str, str], None]
 
 _REFRESH = 0.05  # s between two looks at who subscribes
+_RETRY = 0.5  # s between two tries to turn torque off
 
 
 class Loop:
@@ -63,6 +65,7 @@ class Loop:
         self._published = [0, 0]  # newest frame of each finger that went out
         self._ending = False
         self._stopping = False
+        self._next_try = -math.inf  # when torque off may be tried again after it failed
 
     # What may be asked from outside the tick, a signal handler included
 
@@ -84,7 +87,10 @@ class Loop:
         try:
             self.advance(duration)
         finally:
-            self._torque_off()
+            self._control.torque = False
+            self._next_try = -math.inf
+            if self.servos is not None and self.state.torque:
+                self._torque_off(self.servos)
             self.emit("info", "end", "ended, torque off")
 
     def advance(self, duration: float | None = None) -> None:
@@ -179,17 +185,41 @@ class Loop:
         if servos is None:
             return
         wanted = self._control.torque
-        try:
-            if wanted != state.torque:
-                servos.set_torque(wanted)
-                state.torque = wanted
-            if state.torque and state.goal.valid:
-                state.goal.seq = state.seq
-                state.goal.t = now
+        if wanted and not state.torque:
+            self._torque_on(servos)
+        elif state.torque and not wanted:
+            self._torque_off(servos)
+        elif wanted and state.goal.valid:
+            state.goal.seq = state.seq
+            state.goal.t = now
+            try:
                 servos.write(state.goal)
+            except ServoError as error:
+                self._fail(str(error))
+                self._torque_off(servos)
+
+    def _torque_on(self, servos: Servos) -> None:
+        self.state.torque = True  # from here on it may be on, whatever the servos answer
+        try:
+            servos.set_torque(True)
         except ServoError as error:
             self._fail(str(error))
-            self._torque_off()
+            self._torque_off(servos)
+
+    def _torque_off(self, servos: Servos) -> None:
+        """Turn torque off; when that fails, again every half second. The first failure is told."""
+        state = self.state
+        if state.t < self._next_try:
+            return
+        try:
+            servos.set_torque(False)
+        except ServoError as error:
+            if self._next_try < 0.0:
+                self.emit("error", "servos", f"torque could not be turned off: {error}")
+            self._next_try = state.t + _RETRY
+        else:
+            state.torque = False
+            self._next_try = -math.inf
 
     def _publish(self, publisher: Publisher) -> None:
         seq = self.state.seq
@@ -261,13 +291,4 @@ class Loop:
         if not self.state.fault:
             self.state.fault = reason
             self._control.fail(reason)
-
-    def _torque_off(self) -> None:
-        self._control.torque = False
-        if self.servos is None or not self.state.torque:
-            return
-        try:
-            self.servos.set_torque(False)
-            self.state.torque = False
-        except ServoError as error:
-            self.emit("error", "servos", f"torque could not be turned off: {error}")
+            self.state.mode = self._control.mode

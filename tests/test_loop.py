@@ -13,6 +13,7 @@ from numba.core.dispatcher import Dispatcher
 from daemon.assembly import Daemon
 from daemon.commands import Refused
 from daemon.messages import pack, state_message
+from daemon.servos.base import ServoError
 from daemon.settings import Settings
 
 Make = Callable[..., Daemon]
@@ -201,6 +202,54 @@ def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
     assert "no good reading" in daemon.loop.state.fault
     with pytest.raises(Refused, match="clear: servos: no good reading"):
         command(daemon, "clear")
+
+
+def test_torque_that_can_not_be_turned_off_is_told_once_and_tried_again(make: Make) -> None:
+    daemon = make()
+    events: list[tuple[str, str, str]] = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    servos = daemon.loop.servos
+    assert servos is not None
+    really, tries = servos.set_torque, []
+
+    def failing(on: bool) -> None:
+        tries.append(on)
+        if len(tries) < 4:
+            raise ServoError("no answer")
+        really(on)
+
+    servos.set_torque = failing  # type: ignore[method-assign]
+    command(daemon, "stop")
+    daemon.loop.advance(1.2)
+    assert daemon.loop.state.torque, "torque was not turned off, and the state says it was"
+    daemon.loop.advance(1.0)
+    assert not daemon.loop.state.torque
+    assert tries == [False] * 4
+    assert [text for _, kind, text in events if kind == "servos"] == [
+        "torque could not be turned off: no answer"
+    ]
+
+
+def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
+    daemon = make()
+    servos = daemon.loop.servos
+    assert servos is not None
+    really, tries = servos.set_torque, []
+
+    def failing(on: bool) -> None:
+        tries.append(on)
+        if on:
+            raise ServoError("overload")
+        really(on)
+
+    servos.set_torque = failing  # type: ignore[method-assign]
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("fault", "overload")
+    assert not daemon.loop.state.torque
+    assert tries == [True, False]
 
 
 def run_recorded(make: Make, seed: int) -> list[bytes]:
