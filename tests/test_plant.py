@@ -13,14 +13,13 @@ from daemon.simulation import layout
 from daemon.simulation.hand import SimulatedHand
 from daemon.simulation.tip import evaluate_tip
 from kinematics.fingers import HandGeometry
+from tests.fuzz_plant import abuse
 from tests.plant_harness import (
     BOUNDED,
     CONSTANT,
-    CURRENT,
     LOSSLESS,
     MODULUS,
     PAPER,
-    POSITION,
     TABLE_I,
     WIDTH,
     hold_with,
@@ -228,40 +227,10 @@ def test_agreement_with_an_adaptive_solver_and_order_two(loss, method):
 # Abuse.
 
 
-@pytest.mark.parametrize("trial", range(24))
-def test_random_commands_and_extreme_parameters_stay_finite(trial):
-    generator = np.random.default_rng(100 + trial)
-    hand = make(
-        TABLE_I if trial % 2 else PAPER,
-        step=(None, 2.5e-3)[trial % 3 == 0],
-        object_mass=float(10 ** generator.uniform(-3, 1)),
-        modulus_scale=float(10 ** generator.uniform(-1.5, 1.5)),
-        tip_friction=float(generator.uniform(0, 2)),
-        joint_inertia=float(10 ** generator.uniform(-4, -1)),
-        tip_loss=float(10 ** generator.uniform(-5, -1)),
-        gravity=(float(generator.normal()), float(generator.normal())),
-    )
-    for _ in range(400):
-        joint = int(generator.integers(2))
-        mode = int(generator.choice([CURRENT, POSITION, BOUNDED]))
-        hand.drive(
-            joint,
-            mode,
-            bool(generator.random() < 0.9),
-            float(generator.uniform(-2, 2)),
-            float(generator.uniform(-4, 4)),
-        )
-        if generator.random() < 0.2:
-            hand.push(*generator.normal(size=2), float(generator.normal() * 0.05))
-        if generator.random() < 0.01:
-            place(hand, (0.0, 0.0), (0.0, 0.08, 0.0))  # open, the object back between the fingers
-        run(hand, float(generator.uniform(0, 0.02)))
-        assert np.isfinite(hand.memory).all()
-        # Past the tip's limit only with the rim pressed in, which is told.
-        limit = 0.020 * (1 - np.abs(np.sin(hand.theta)))
-        past = (hand.d > limit + 1e-9) & (hand.force > 0)
-        assert (hand.rim[past] > 0).all()
-        assert np.abs(hand.q).max() < 1.6
+@pytest.mark.parametrize("seed", range(24))
+def test_random_commands_and_extreme_parameters_stay_finite(seed):
+    # With default-sized steps and, one time in three, steps ten times too long.
+    assert abuse(seed, 400) == ""
 
 
 def test_simulation_is_two_hundred_times_faster_than_real_time():
