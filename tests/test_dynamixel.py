@@ -297,6 +297,20 @@ def test_torque_on_starts_where_the_joint_is(bus: RunningBus) -> None:
     backend.close()
 
 
+def test_torque_is_refused_where_the_joint_can_not_be(bus: RunningBus) -> None:
+    def turn() -> None:
+        bus.bus.plant.q[1] = 4.0
+
+    bus.call(turn)
+    backend = connected(bus)
+    assert [n for n in backend.notices if "servo 2 (right): the joint is at 229°" in n]
+    with pytest.raises(ServoError, match=r"servo 2 \(right\): the joint is at 229°, not in -29°"):
+        backend.set_torque(True)
+    assert not bus.servo(0).torque_on
+    assert not bus.servo(1).torque_on
+    backend.close()
+
+
 @pytest.mark.parametrize(
     ("model", "level"), [("XM430-W350", 2), ("XL330-M288", 1), ("XC330-T288", 2)]
 )

@@ -6,6 +6,7 @@ Pure functions over what was read; they send nothing. The reading itself belongs
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from daemon.servos import registers as reg
@@ -15,6 +16,9 @@ from daemon.servos.models import ServoModel, by_number
 RETURN_DELAY_MAX = 25
 MEND = "`softfinger doctor --fix`"
 WATCHDOG_FIRMWARE = 38
+# rad beyond the hand's limits at which a joint's angle is not believed: a wrong zero, or a servo
+# that forgot its turns when it was switched off.
+ANGLE_MARGIN = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +111,16 @@ def _notices(name: str, model: ServoModel, table: bytes, firmware: int) -> list[
     if table[reg.PRESENT_TEMPERATURE] >= hot:
         notices.append(f"{name}: {table[reg.PRESENT_TEMPERATURE]} °C, near its limit")
     return notices
+
+
+def check_angle(name: str, q: float, q_min: float, q_max: float) -> str:
+    """What is wrong with a joint's angle [rad]; empty when it lies near the hand's limits."""
+    if q_min - ANGLE_MARGIN <= q <= q_max + ANGLE_MARGIN:
+        return ""
+    return (
+        f"{name}: the joint is at {math.degrees(q):.0f}°, not in {math.degrees(q_min):.0f}° … "
+        f"{math.degrees(q_max):.0f}°: turn it there by hand, or correct servos.zero"
+    )
 
 
 def check_latency(path: str, latency: float, reply_timeout: float) -> Findings:

@@ -21,7 +21,7 @@ from daemon.clock import Clock
 from daemon.records import FINGERS, Goal, Reading
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
-from daemon.servos.checks import MEND, check_latency, check_servo
+from daemon.servos.checks import MEND, check_angle, check_latency, check_servo
 from daemon.servos.line import ServoLine
 from daemon.servos.models import ServoModel, by_name
 from daemon.servos.packets import GroupRead, PacketHandler
@@ -56,6 +56,7 @@ class DynamixelServos:
         self._clock = clock
         self._settings = servos
         self._current_max = settings.safety.current_max
+        self._hand = settings.hand
         self._fingers = [FINGERS.index(finger) for finger in settings.scene.fingers]
         self._ids = {finger: servos.ids[finger] for finger in self._fingers}
         self._handler = PacketHandler()
@@ -87,19 +88,21 @@ class DynamixelServos:
         port = SerialPort(self._settings.port, self._settings.baud, self._settings.reply_timeout)
         port.openPort()
         line = ServoLine(port, self._handler)
+        self._prepare(port, model)
         try:
             self._check(line, model)
         except BaseException:
             port.closePort()
+            self._present = None
             raise
         self._line = line
-        self._prepare(port, model)
 
     def _check(self, line: ServoLine, model: ServoModel) -> None:
         port = line.port
         latency = check_latency(port.port_name, port.latency_timer(), port.reply_timeout)
         errors, notices = list(latency.errors), list(latency.notices)
         silent: list[int] = []
+        counts: dict[int, int] = {}
         self._fast = True
         for finger, servo_id in self._ids.items():
             name = self._name(finger)
@@ -117,6 +120,8 @@ class DynamixelServos:
             errors += found.errors
             notices += found.notices
             self._fast = self._fast and model.fast_read(table[reg.FIRMWARE_VERSION])
+            position = table[reg.PRESENT_POSITION : reg.PRESENT_POSITION + 4]
+            counts[finger] = int.from_bytes(position, "little", signed=True)
             limit = int.from_bytes(table[reg.CURRENT_LIMIT : reg.CURRENT_LIMIT + 2], "little")
             self._bounds[finger] = limit
         if silent and len(silent) == len(self._ids):
@@ -132,6 +137,7 @@ class DynamixelServos:
             )
         if errors:
             raise ServoError("\n".join(errors))
+        notices += [f"{text}; torque is refused there" for text in self._strayed(counts) if text]
         self.notices = tuple(notices)
         for notice in notices:
             _log.warning(notice)
@@ -233,7 +239,11 @@ class DynamixelServos:
         self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, 0), "watchdog cleared")
         self._map_goals(line)
         self._store(reg.GOAL_CURRENT, "<h", dict.fromkeys(each, 0), "goal current")
-        self._store(reg.GOAL_POSITION, "<i", self._positions(line), "goal position")
+        positions = self._positions(line)
+        strayed = [text for text in self._strayed(positions) if text]
+        if strayed:
+            raise ServoError("\n".join(strayed))
+        self._store(reg.GOAL_POSITION, "<i", positions, "goal position")
         self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(each, 1), "torque on")
         self._quiet_limit = math.inf
         if self._settings.watchdog > 0.0:
@@ -265,6 +275,19 @@ class DynamixelServos:
         self._goals = GroupSyncWrite(line.port, self._handler, data, _GOAL.size)
         for servo_id in self._ids.values():
             self._goals.addParam(servo_id, bytes(_GOAL.size))
+
+    def _strayed(self, positions: dict[int, int]) -> list[str]:
+        """What is wrong with the joints' angles; torque there would swing them back at once."""
+        hand = self._hand
+        return [
+            check_angle(
+                self._name(finger),
+                self._scales[finger].angle(counts),
+                hand.q_min[finger],
+                hand.q_max[finger],
+            )
+            for finger, counts in positions.items()
+        ]
 
     def _positions(self, line: ServoLine) -> dict[int, int]:
         positions = {}
