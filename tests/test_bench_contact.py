@@ -29,7 +29,7 @@ LAW = Material.table_i()
 @pytest.fixture(scope="module")
 def rows() -> list[ContactRow | Row]:
     """The short form of the bench."""
-    return contact.measure(contact.Effort(rounds=2, points=48, quick=True))
+    return contact.measure(contact.Effort(rounds=2, points=64, quick=True))
 
 
 def own(rows: Iterable[ContactRow | Row]) -> list[ContactRow]:
@@ -133,10 +133,11 @@ def test_compiled_loops_give_the_kernels_results(way: str, word: str, count: int
         ("closed", closed_form, LAW.reference_modulus),
         ("lookup", lookup, table.data),
     ):
-        out = np.full(6, np.nan)
-        getattr(contact_kernels, f"{name}_{way}_{word}")(2, first, d, theta, out)
-        np.testing.assert_allclose(out[:count], kernel(first, d[-1], theta[-1])[:count], rtol=1e-15)
-        assert np.all(np.isnan(out[count:]))
+        out = np.full((8, 6), np.nan)
+        getattr(contact_kernels, f"{name}_{way}_{word}")(1, first, d, theta, out)
+        expected = [kernel(first, d[i], theta[i])[:count] for i in range(8)]
+        np.testing.assert_allclose(out[:, :count], expected, rtol=1e-15)
+        assert np.all(np.isnan(out[:, count:]))
 
 
 @pytest.fixture(scope="module")

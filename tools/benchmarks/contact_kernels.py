@@ -1,9 +1,11 @@
 """Compiled loops that call the contact kernels one by one, as the control loop's kernels do.
 
-In a ``loop`` the calls are independent, so that the processor overlaps them. In a ``chain`` each
-call's arguments wait for the last call's result: what one call alone takes. The results are written
-to an array, which keeps the compiler from moving a call's work out of the loop or dropping it.
-``two`` writes force and energy alone, so that it may drop the partials.
+In a ``loop`` the calls are independent, so that the processor overlaps them; the order of the n
+points, n a power of two, jumps about so that the compiler can't merge calls into vector
+instructions, which a single call has none of. In a ``chain`` each call's arguments wait for the
+last call's result: what one call alone takes. The results go to the point's row of ``out`` [n, 6],
+which keeps the compiler from dropping a call's work or moving it out of the loop. ``two`` writes
+force and energy alone, so that the partials may be dropped.
 """
 
 from __future__ import annotations
@@ -20,21 +22,31 @@ FloatArray = NDArray[np.float64]
 
 
 @kernel
+def _next(i: int, count: int) -> int:
+    """The next of ``count`` places, a power of two: each once before any comes again."""
+    return (5 * i + 1) & (count - 1)
+
+
+@kernel
 def closed_loop_two(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
-    for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], _, _, _, _ = closed_form(modulus, d[k], theta[k])
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], _, _, _, _ = closed_form(modulus, d[i], theta[i])
 
 
 @kernel
 def closed_loop_six(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
-    for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], out[2], out[3], out[4], out[5] = closed_form(modulus, d[k], theta[k])
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = closed_form(
+            modulus, d[i], theta[i]
+        )
 
 
 @kernel
@@ -43,9 +55,9 @@ def closed_chain_two(
 ) -> None:
     wait = 0.0
     for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], last, _, _, _, _ = closed_form(modulus, d[k] + wait, theta[k] + wait)
-            out[1] = last
+        for i in range(d.shape[0]):
+            out[i, 0], last, _, _, _, _ = closed_form(modulus, d[i] + wait, theta[i] + wait)
+            out[i, 1] = last
             wait = 0.0 * last
 
 
@@ -55,11 +67,11 @@ def closed_chain_six(
 ) -> None:
     wait = 0.0
     for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], out[2], out[3], out[4], last = closed_form(
-                modulus, d[k] + wait, theta[k] + wait
+        for i in range(d.shape[0]):
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], last = closed_form(
+                modulus, d[i] + wait, theta[i] + wait
             )
-            out[5] = last
+            out[i, 5] = last
             wait = 0.0 * last
 
 
@@ -67,18 +79,22 @@ def closed_chain_six(
 def lookup_loop_two(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
-    for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], _, _, _, _, _ = lookup(data, d[k], theta[k])
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], _, _, _, _, _ = lookup(data, d[i], theta[i])
 
 
 @kernel
 def lookup_loop_six(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
-    for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], out[2], out[3], out[4], out[5], _ = lookup(data, d[k], theta[k])
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5], _ = lookup(
+            data, d[i], theta[i]
+        )
 
 
 @kernel
@@ -87,9 +103,9 @@ def lookup_chain_two(
 ) -> None:
     wait = 0.0
     for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], last, _, _, _, _, _ = lookup(data, d[k] + wait, theta[k] + wait)
-            out[1] = last
+        for i in range(d.shape[0]):
+            out[i, 0], last, _, _, _, _, _ = lookup(data, d[i] + wait, theta[i] + wait)
+            out[i, 1] = last
             wait = 0.0 * last
 
 
@@ -99,11 +115,11 @@ def lookup_chain_six(
 ) -> None:
     wait = 0.0
     for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], out[2], out[3], out[4], last, _ = lookup(
-                data, d[k] + wait, theta[k] + wait
+        for i in range(d.shape[0]):
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], last, _ = lookup(
+                data, d[i] + wait, theta[i] + wait
             )
-            out[5] = last
+            out[i, 5] = last
             wait = 0.0 * last
 
 
@@ -118,11 +134,12 @@ def exact_loop(
     out: FloatArray,
 ) -> None:
     gauss, circle, parts = rules
-    for _ in range(repeat):
-        for k in range(d.shape[0]):
-            out[0], out[1], out[2], out[3], out[4], out[5] = exact(
-                gauss, circle, parts, radius, modulus, d[k], theta[k]
-            )
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = exact(
+            gauss, circle, parts, radius, modulus, d[i], theta[i]
+        )
 
 
 @kernel

@@ -34,11 +34,12 @@ def row(name: str, unit: str, samples: ArrayLike, aim: float | None = None) -> R
 
 def table(rows: list[Row]) -> str:
     """The rows as an aligned table."""
-    lines = [f"{'':58} {'median':>9} {'p99':>9} {'unit':>4} {'aim':>7} {'n':>7}"]
+    width = max([58, *(len(each.name) for each in rows)])
+    lines = [f"{'':{width}} {'median':>9} {'p99':>9} {'unit':>4} {'aim':>7} {'n':>7}"]
     for each in rows:
         aim = "" if each.aim is None else f"≤ {each.aim:g}"
         lines.append(
-            f"{each.name:58} {_number(each.median)} {_number(each.p99)} {each.unit:>4} {aim:>7} "
+            f"{each.name:{width}} {_number(each.median)} {_number(each.p99)} {each.unit:>4} {aim:>7} "
             f"{each.count:7d}"
         )
     return "\n".join(lines)
