@@ -86,8 +86,8 @@ def ratios(
     first_t = parts[2, 0, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
-    # Poles lie at y = 0, unless y0 = 0, and at y² = −2 sin θ.
-    start = max(2.0 * y0, _DEEPEST * min(y1, math.sqrt(h)))
+    # Poles lie at y = 0, unless y0 = 0, and at y² = −2 sin θ; there are none when h = 0.
+    start = max(2.0 * y0, _DEEPEST * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0
     sum_fd = 0.0

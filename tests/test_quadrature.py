@@ -1,0 +1,226 @@
+"""The reference integrals, against plain NumPy in other coordinates and against each other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial.legendre import leggauss
+
+from kinematics import Fingertip, Material
+from kinematics.contact import closed_forms
+from kinematics.profile import TipProfile, compress
+from kinematics.quadrature import circle_rule, gauss_rule, integrate, ratios
+
+TIP = Fingertip(0.020)
+TABLE_I = Material.table_i()
+X = np.linspace(0.0, 0.8, 30)
+STIFFENING = Material.from_points(X, 2e4 * np.expm1(3 * X))
+SOFTENING = Material.from_points(X, 1e5 * np.tanh(2 * X))
+MATERIALS = [Material.constant(0.304e6), TABLE_I, STIFFENING, SOFTENING]
+
+
+def twin(
+    tip: Fingertip, material: Material, d: complex, theta: complex, nodes: int = 110
+) -> tuple[complex, complex]:
+    """F and U by Gauss quadrature on the base plane, x = h s + ρ c sin t, y = b sin τ.
+
+    Complex arguments give exact derivatives by the complex step.
+    """
+    a, s, c = tip.radius, np.sin(theta), np.cos(theta)
+    h = a - d
+    rho = np.sqrt(2 * a * d - d * d)
+    points, weights = leggauss(nodes)
+    t, tau = 0.5 * np.pi * points[:, None], 0.5 * np.pi * points[None, :]
+    x = h * s + rho * c * np.sin(t)
+    b = rho * np.cos(t)
+    z = np.sqrt(a * a - x * x - (b * np.sin(tau)) ** 2)
+    area = (0.5 * np.pi) ** 2 * weights[:, None] * weights * rho * c * np.cos(t) * b * np.cos(tau)
+    strain = 1 - (h - x * s) / (c * z)
+    stress = np.zeros_like(strain)
+    energy = np.zeros_like(strain)
+    for j, coefficient in reversed(list(enumerate(material.coefficients, 1))):
+        stress = (stress + float(coefficient)) * strain
+        energy = (energy + float(coefficient) / (j + 1)) * strain
+    return (area * stress).sum(), (area * z * energy * strain).sum()
+
+
+@pytest.mark.parametrize("material", MATERIALS, ids=["constant", "table_i", "stiff", "soft"])
+@pytest.mark.parametrize(
+    ("d", "share"), [(0.5e-3, 0.0), (2e-3, 0.7), (4e-3, -0.5), (8e-3, 0.8), (12e-3, 0.6)]
+)
+def test_values_and_partials_equal_the_twin(material: Material, d: float, share: float) -> None:
+    theta = float(TIP.theta_limit(d)) * share
+    c = integrate(TIP, material, d, theta)
+    force, energy = twin(TIP, material, d, theta)
+    np.testing.assert_allclose([c.force, c.energy], [force, energy], rtol=1e-12)
+    step = 1e-30
+    f_d, u_d = (value.imag / step for value in twin(TIP, material, d + 1j * step, theta))
+    f_t, u_t = (value.imag / step for value in twin(TIP, material, d, theta + 1j * step))
+    np.testing.assert_allclose([c.force_d, c.energy_d], [f_d, u_d], rtol=2e-12)
+    scale = 1e-13 * float(c.force)
+    np.testing.assert_allclose(c.force_theta, f_t, rtol=2e-12, atol=scale)
+    np.testing.assert_allclose(c.energy_theta, u_t, rtol=2e-12, atol=scale * d)
+
+
+def test_a_constant_modulus_gives_the_closed_form() -> None:
+    d = np.array([1e-11, 1e-6, 4e-3, 0.0199, 0.02])[:, None]
+    theta = TIP.theta_limit(d) * np.array([-1.0, -0.3, 0.0, 1 - 1e-9])
+    exact = closed_forms(0.304e6, d, theta)
+    for value, expected in zip(integrate(TIP, MATERIALS[0], d, theta), exact, strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-14)
+
+
+@given(
+    depth=st.one_of(
+        st.floats(5e-8, 0.999999),
+        st.floats(-12.0, -0.3).map(lambda e: 1 - 10**e),
+    ),
+    share=st.one_of(st.floats(0.0, 1.0), st.floats(-12.0, -0.1).map(lambda e: 1 - 10**e)),
+)
+@settings(max_examples=120, deadline=None)
+def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
+    h = 1.0 - depth
+    limit = math.atan2(h, math.sqrt(depth * (1 + h)))
+    s, c = math.sin(limit * share), math.cos(limit * share)
+    for material in (TABLE_I, STIFFENING):
+        parts = material.expansions()
+        usual = ratios(gauss_rule(), circle_rule(material.degree), parts, depth, h, s, c)
+        finer = ratios(gauss_rule(40), circle_rule(40), parts, depth, h, s, c)
+        np.testing.assert_allclose(usual, finer, rtol=2e-13)
+
+
+@given(
+    depth=st.floats(5e-8, 0.999),
+    share=st.floats(-0.99999, 0.99999),
+    scale=st.floats(5e-3, 50.0),
+    modulus=st.floats(1e-5, 1e4),
+)
+@settings(max_examples=100, deadline=None)
+def test_scaling_evenness_and_identities(
+    depth: float, share: float, scale: float, modulus: float
+) -> None:
+    d = depth * TIP.radius
+    theta = float(TIP.theta_limit(d)) * share
+    c = integrate(TIP, TABLE_I, d, theta)
+    large = Fingertip(scale * TIP.radius)
+    # Rounding of θ's limit at the other scale must not decide.
+    other = integrate(large, TABLE_I, scale * d, theta)
+    np.testing.assert_allclose(other.force, scale**2 * c.force, rtol=1e-11)
+    np.testing.assert_allclose(other.energy, scale**3 * c.energy, rtol=1e-11)
+    mirrored = integrate(TIP, TABLE_I, d, -theta)
+    assert (mirrored.force, mirrored.energy) == (c.force, c.energy)
+    assert mirrored.energy_theta == -c.energy_theta
+    np.testing.assert_allclose(c.energy_d, c.force / np.cos(theta), rtol=1e-14)
+    assert 0 < c.energy < c.energy_d * d  # the push rises with d
+    assert c.force_d > 0
+    assert c.energy_theta * theta >= 0
+    assert c.energy >= integrate(TIP, TABLE_I, d, 0.0).energy * (1 - 1e-14)
+    stiffer = Material(tuple(value * int(modulus * 1e6) for value in TABLE_I.coefficients))
+    np.testing.assert_allclose(
+        integrate(TIP, stiffer, d, theta).force, int(modulus * 1e6) * c.force, rtol=1e-13
+    )
+
+
+def test_small_displacements_tend_to_the_first_modulus() -> None:
+    d = TIP.radius * 10.0 ** np.arange(-12.0, -4.0)
+    ratio = integrate(TIP, TABLE_I, d, 0.3).force / closed_forms(0.135e6, d, 0.3).force
+    assert np.all(np.abs(ratio - 1) < 20 * (d / TIP.radius) ** 2 + 2e-15)
+
+
+def test_outside_the_domain() -> None:
+    assert integrate(TIP, TABLE_I, -1e-3, 0.1) == (0.0,) * 6
+    for pair in [(0.021, 0.0), (8e-3, 0.7), (8e-3, 3.2), (math.nan, 0), (1e-3, math.nan)]:
+        assert all(math.isnan(value) for value in integrate(TIP, TABLE_I, *pair))
+    assert integrate(TIP, TABLE_I, np.empty((0, 2)), 0.0).force.shape == (0, 2)
+    assert integrate(TIP, TABLE_I, [[1e-3], [2e-3]], [0.0, 0.1, 0.2]).energy.shape == (2, 3)
+
+
+# Past the limit of θ, where the face meets the base plate: d [mm], θ [°], F [N], U [mJ].
+CLIPPED = [
+    (8, 45, 81.266754123, 304.7619043),
+    (10, 35, 114.126873792, 465.5139860),
+    (12, 30, 153.849535079, 711.1873193),
+]
+SPHERE = TipProfile.sphere(TIP)
+
+
+@pytest.mark.parametrize(("d", "theta", "force", "energy"), CLIPPED)
+def test_clipped_force_and_energy(d: float, theta: float, force: float, energy: float) -> None:
+    depth, tilt = d * 1e-3, math.radians(theta)
+    c = compress(SPHERE, MATERIALS[0], depth, tilt)
+    np.testing.assert_allclose(c.force, force, atol=6e-10)
+    np.testing.assert_allclose(c.energy * 1e3, energy, atol=6e-8)
+    step = 2e-7
+    up, down = (compress(SPHERE, MATERIALS[0], depth + x, tilt).energy for x in (step, -step))
+    np.testing.assert_allclose(c.push, (up - down) / (2 * step), rtol=1e-7)
+    assert c.push > c.force / math.cos(tilt) * 0.8
+    assert abs(c.push * math.cos(tilt) / c.force - 1) > 1e-3  # here the two part
+
+
+@pytest.mark.parametrize("material", MATERIALS, ids=["constant", "table_i", "stiff", "soft"])
+def test_profile_of_a_sphere_is_the_sphere(material: Material) -> None:
+    d = np.array([1e-4, 4e-3, 8e-3, 19e-3])
+    theta = TIP.theta_limit(d) * np.array([0.4, 0.0, 0.99, 0.5])
+    c, exact = compress(SPHERE, material, d, theta), integrate(TIP, material, d, theta)
+    np.testing.assert_allclose(c.force, exact.force, rtol=1e-12)
+    np.testing.assert_allclose(c.energy, exact.energy, rtol=1e-12)
+    np.testing.assert_allclose(c.push, exact.energy_d, rtol=1e-12)
+
+
+def test_sphere_through_points_and_other_profiles() -> None:
+    x = np.linspace(0.0, 1.0, 9)
+    points = TipProfile(0.02 * x, 0.02 * np.sqrt(1 - x * x))
+    c, exact = compress(points, TABLE_I, 8e-3, 0.5), compress(SPHERE, TABLE_I, 8e-3, 0.5)
+    np.testing.assert_allclose(c.force, exact.force, rtol=1e-11)
+    # A tip of twice the base radius at equal height: an ellipsoid, whose contact is four times as
+    # wide at θ = 0, since base areas scale and strains stay.
+    wide = TipProfile(0.04 * x, 0.02 * np.sqrt(1 - x * x))
+    w, r = compress(wide, TABLE_I, 6e-3, 0.0), compress(SPHERE, TABLE_I, 6e-3, 0.0)
+    np.testing.assert_allclose([w.force, w.energy], [4 * r.force, 4 * r.energy], rtol=1e-11)
+    # Measured points between sphere and cylinder: against a plain midpoint sum.
+    blunt = TipProfile([0, 0.008, 0.014, 0.018, 0.02], [0.02, 0.0192, 0.0165, 0.0115, 0])
+    d, theta = 6e-3, 0.25
+    h = blunt.reach(theta) - d
+    grid = (np.arange(1600) + 0.5) / 1600 * 0.04 - 0.02
+    gx, gy = np.meshgrid(grid, grid)
+    z = blunt.height(np.hypot(gx, gy))
+    plane = np.maximum((h - gx * math.sin(theta)) / math.cos(theta), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        strain = np.where(z > plane, 1 - plane / z, 0.0)
+    area = (0.04 / 1600) ** 2
+    c = compress(blunt, TABLE_I, d, theta)
+    np.testing.assert_allclose(c.force, (TABLE_I.stress(strain) * area).sum(), rtol=1e-4)
+    energy = (z * TABLE_I.energy_density(strain) * area).sum()
+    np.testing.assert_allclose(c.energy, energy, rtol=1e-4)
+
+
+def test_compress_takes_any_input() -> None:
+    assert compress(SPHERE, TABLE_I, -1.0, 0.2) == (0.0, 0.0, 0.0)
+    assert all(math.isnan(value) for value in compress(SPHERE, TABLE_I, math.nan, 0.0))
+    assert compress(SPHERE, TABLE_I, np.empty(0), 0.0).force.shape == (0,)
+    with pytest.raises(ValueError, match="right angle"):
+        compress(SPHERE, TABLE_I, 1e-3, 2.0)
+    # Pressed flat altogether, the springs hold what they can.
+    flat = compress(SPHERE, TABLE_I, 1.0, 0.0)
+    np.testing.assert_allclose(flat.force, math.pi * 4e-4 * TABLE_I.stress(1.0), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("radius", "height", "words"),
+    [
+        ([0.0], [0.02], "at least two"),
+        ([0.0, 0.01], [0.02, 0.0, 0.0], "one length"),
+        ([0.001, 0.02], [0.02, 0.0], "apex"),
+        ([0.0, 0.02], [0.02, 0.001], "rim"),
+        ([0.0, 0.01, 0.01, 0.02], [0.02, 0.01, 0.005, 0.0], "radius must rise"),
+        ([0.0, 0.01, 0.02], [0.02, 0.021, 0.0], "height must fall"),
+        ([0.0, math.nan, 0.02], [0.02, 0.01, 0.0], "finite"),
+    ],
+)
+def test_profiles_that_are_none(radius: list[float], height: list[float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        TipProfile(radius, height)

@@ -1,0 +1,329 @@
+"""Contact tables: accuracy over the whole domain, the certificate, forms, files, odd input."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kinematics import ContactTable, Fingertip, Material
+from kinematics.contact import closed_forms
+from kinematics.kernels import kernel
+from kinematics.lookup import CENTRES, FORMS, H_PIECES, LOWEST
+from kinematics.quadrature import integrate
+from kinematics.table import TableError, aligned, lookup, table_key
+from kinematics.table_build import MEMORY_LIMIT, hard_points
+
+TIP = Fingertip(0.020)
+TABLE_I = Material.table_i()
+CONSTANT = Material.constant(0.304e6)
+X = np.linspace(0.0, 0.8, 30)
+STIFFENING = Material.from_points(X, 2e4 * np.expm1(3 * X))
+OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
+
+
+@pytest.fixture(scope="module")
+def table() -> ContactTable:
+    return ContactTable.build(TIP, TABLE_I, 1e-9)
+
+
+def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndarray) -> float:
+    """Largest relative error of any output; 0/0 counts as none."""
+    found = table(d, theta)
+    exact = integrate(table.tip, material, d, theta)
+    errors = []
+    for name in OUTPUTS:
+        value, truth = getattr(found, name), getattr(exact, name)
+        same = (value == 0.0) & (truth == 0.0)
+        errors.append(np.where(same, 0.0, np.abs(value / np.where(same, 1.0, truth) - 1.0)))
+    return float(np.max(errors))
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9, 1e-12])
+@pytest.mark.parametrize("material", [CONSTANT, TABLE_I], ids=["constant", "table_i"])
+def test_tolerance_holds_over_the_whole_domain(material: Material, tolerance: float) -> None:
+    table = ContactTable.build(TIP, material, tolerance)
+    d, theta = hard_points(TIP.radius, 4000, np.random.default_rng(99))
+    assert worst(table, material, d, theta) <= tolerance
+    assert 0 <= table.max_error <= tolerance
+    assert table.data.nbytes <= MEMORY_LIMIT
+    assert np.all(table(d, theta).inside)
+
+
+def test_tolerance_holds_for_a_law_from_points() -> None:
+    test_tolerance_holds_over_the_whole_domain(STIFFENING, 1e-9)
+
+
+@pytest.mark.parametrize("form", [form.name for form in FORMS[1:]])
+def test_every_form_meets_its_certificate(form: str) -> None:
+    table = ContactTable.build(TIP, TABLE_I, 0.02, form)
+    assert table.form.name == form
+    d, theta = hard_points(TIP.radius, 3000, np.random.default_rng(5))
+    error = worst(table, TABLE_I, d, theta)
+    assert error <= 1.5 * table.max_error  # the certificate's sample found the worst, nearly
+    certificate = table.certificate
+    at = worst(table, TABLE_I, np.array([certificate.d]), np.array([certificate.theta]))
+    assert at == pytest.approx(table.max_error, rel=1e-6)
+
+
+def test_forms_of_higher_degree_err_less() -> None:
+    errors = {
+        form.name: ContactTable.build(TIP, TABLE_I, 0.02, form.name).max_error for form in FORMS[1:]
+    }
+    assert errors["bilinear"] > errors["bicubic"] > errors["quintic"] > errors["slab 7-18"]
+    assert errors["slab 7-18"] < 1e-9
+    assert errors["slab 10-21"] < 1e-12
+
+
+def test_constant_modulus_is_the_closed_form() -> None:
+    table = ContactTable.build(TIP, CONSTANT, 4e-15)
+    assert table.form.name == "closed"
+    d, theta = hard_points(TIP.radius, 4000, np.random.default_rng(1))
+    inner = np.abs(theta) < 0.999 * TIP.theta_limit(d)
+    found, exact = table(d[inner], theta[inner]), closed_forms(0.304e6, d[inner], theta[inner])
+    for name in OUTPUTS:
+        np.testing.assert_allclose(getattr(found, name), getattr(exact, name), rtol=4e-15)
+    force = [3.8201766667652, 70.578560861082]
+    np.testing.assert_allclose(table([2e-3, 8e-3], np.radians([0, 30])).force, force, rtol=1e-13)
+
+
+def twin(data: np.ndarray, d: float, theta: float) -> float:
+    """The force of a slab, from the array in plain NumPy: piece by hand, powers summed."""
+    radius = data[2]
+    h = (radius - d) / radius
+    centres = data[CENTRES : CENTRES + 2 * int(data[H_PIECES])].reshape(-1, 2)
+    inside = np.abs((h - centres[:, 0]) * centres[:, 1]) <= 1.0
+    i = int(np.flatnonzero(inside)[-1])
+    x = (h - centres[i, 0]) * centres[i, 1]
+    u2 = 1.0 - (1.0 - h * h) / math.cos(theta) ** 2
+    y = 2.0 * math.sqrt(u2) / h - 1.0
+    at = CENTRES + centres.size + i * int(data[10])
+    total = 0.0
+    nx, ny = FORMS[int(data[1])].nx, FORMS[int(data[1])].ny
+    for j in range(ny + 1):
+        terms = math.floor((nx + 0.5) * (1 - j / (ny + 0.5))) + 1
+        for k in range(terms - 1, -1, -1):
+            total += data[at] * x**k * y**j
+            at += 8
+    return math.pi * data[3] * d * d / math.cos(theta) * total
+
+
+def test_the_kernel_reads_what_the_layout_says(table: ContactTable) -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        d = TIP.radius * rng.uniform(1e-6, 0.87)
+        theta = float(TIP.theta_limit(d)) * rng.uniform(-0.99, 0.99)
+        np.testing.assert_allclose(
+            lookup(table.data, d, theta)[0], twin(table.data, d, theta), rtol=1e-12
+        )
+
+
+def test_lookup_is_callable_from_kernels(table: ContactTable) -> None:
+    @kernel
+    def push(data: np.ndarray, d: float, theta: float) -> float:
+        return lookup(data, d, theta)[4]
+
+    assert push(table.data, 0.004, 0.2) == table(0.004, 0.2).energy_d
+
+
+@given(depth=st.floats(5e-8, 0.9999), share=st.floats(-1.0, 1.0))
+@settings(max_examples=200, deadline=None)
+def test_properties(table: ContactTable, depth: float, share: float) -> None:
+    d = depth * TIP.radius
+    theta = float(TIP.theta_limit(d)) * share
+    c = table(d, theta)
+    assert c.inside
+    np.testing.assert_allclose(c.energy_d, c.force / math.cos(theta), rtol=1e-14)
+    mirrored = table(d, -theta)
+    assert (mirrored.force, mirrored.energy) == (c.force, c.energy)
+    assert (mirrored.force_theta, mirrored.energy_theta) == (-c.force_theta, -c.energy_theta)
+    assert c.energy > 0
+    assert c.force_d > 0
+    assert table(d, 0.0).energy <= c.energy * (1 + 1e-9)
+    assert c.energy_theta * theta >= 0
+
+
+@pytest.mark.parametrize("scale", [5e-3, 50.0])
+def test_other_radii_and_moduli_scale(scale: float) -> None:
+    hard = Material(tuple(value * 5000 for value in TABLE_I.coefficients))
+    large = ContactTable.build(Fingertip(scale * 0.02), hard, 1e-9)
+    small = ContactTable.build(TIP, TABLE_I, 1e-9)
+    d, theta = np.meshgrid([1e-5, 4e-3, 8e-3, 0.015], [-0.2, 0.0, 0.1])
+    a, b = large(scale * d, theta), small(d, theta)
+    np.testing.assert_allclose(a.force, 5000 * scale**2 * b.force, rtol=2e-12)
+    np.testing.assert_allclose(a.energy, 5000 * scale**3 * b.energy, rtol=2e-12)
+
+
+def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
+    edges = [*(0.125 * 2.0 ** (np.arange(13) / 4)), 0.15625, 0.1875, 0.25, 0.5, 0.75]
+    for h in edges:
+        d = TIP.radius * (1 - h * (1 + np.array([-1e-12, 0.0, 1e-12])))
+        theta = 0.7 * TIP.theta_limit(d)
+        keep = (d > 0) & (d <= TIP.radius)
+        assert worst(table, TABLE_I, d[keep], theta[keep]) < 1e-9
+
+
+def test_outside_the_domain_is_clamped_and_flagged(table: ContactTable) -> None:
+    limit = float(TIP.theta_limit(0.008))
+    edge = table(0.008, limit)
+    assert edge.inside
+    for theta in (limit + 1e-9, 0.7, 1.5, math.pi / 2, 2.0, math.pi, 1e9, math.inf):
+        for sign in (1, -1):
+            c = table(0.008, sign * theta)
+            assert not c.inside
+            assert c.force == edge.force
+            assert c.energy_theta == sign * edge.energy_theta
+    full = table(0.02, 0.0)
+    assert full.inside
+    for d in (0.02 * (1 + 1e-15), 0.021, 1.0, 1e300, math.inf):
+        for theta in (0.0, 0.3, -5.0):
+            c = table(d, theta)
+            assert not c.inside
+            assert c.force == full.force
+    for d in (0.0, -0.0, -1e-3, -math.inf):
+        c = table(d, 0.3)
+        assert c.inside
+        assert all(getattr(c, name) == 0.0 for name in OUTPUTS)
+    for pair in [(math.nan, 0.1), (0.004, math.nan), (-1.0, math.nan), (math.nan, math.nan)]:
+        c = table(*pair)
+        assert not c.inside
+        assert all(math.isnan(getattr(c, name)) for name in OUTPUTS)
+
+
+@given(
+    d=st.floats(allow_nan=True, allow_infinity=True),
+    theta=st.floats(allow_nan=True, allow_infinity=True),
+    number=st.integers(0, 3),
+)
+@settings(max_examples=300, deadline=None)
+def test_any_numbers_are_answered(
+    forms: list[ContactTable], d: float, theta: float, number: int
+) -> None:
+    c = forms[number](d, theta)
+    values = [getattr(c, name) for name in OUTPUTS]
+    if math.isnan(d) or math.isnan(theta):
+        assert all(math.isnan(value) for value in values)
+    elif d <= 0:
+        assert values == [0.0] * 6
+    else:
+        assert all(math.isfinite(value) for value in values)
+
+
+@pytest.fixture(scope="module")
+def forms() -> list[ContactTable]:
+    """The closed form, a slab, and two local forms."""
+    return [
+        ContactTable.build(TIP, CONSTANT),
+        ContactTable.build(TIP, TABLE_I),
+        ContactTable.build(TIP, TABLE_I, 0.02, "bilinear"),
+        ContactTable.build(TIP, TABLE_I, 0.02, "quintic"),
+    ]
+
+
+def test_lookup_never_reads_outside_its_array(table: ContactTable) -> None:
+    # Fences of NaN on both sides: a read beyond either end would show in the result.
+    fenced = np.full(table.data.size + 2048, math.nan)
+    fenced[1024:-1024] = table.data
+    inner = fenced[1024:-1024]
+    d, theta = hard_points(TIP.radius, 3000, np.random.default_rng(8))
+    d = np.concatenate([d, TIP.radius * (1 - 0.125 * (1 + np.array([-1e-16, 0, 1e-16])))])
+    theta = np.concatenate([theta, np.zeros(3)])
+    for one, tilt in zip(d, theta, strict=True):
+        assert all(math.isfinite(value) for value in lookup(inner, one, tilt)[:6])
+    assert inner[LOWEST] == 0.125
+
+
+def test_shapes_and_types(table: ContactTable) -> None:
+    assert table(0.004, 0.1).force.shape == ()
+    assert table(np.empty(0), 0.0).force.shape == (0,)
+    assert table(np.full((3, 1), 0.004), np.zeros(4)).inside.shape == (3, 4)
+    c = table(np.float32(0.004), np.float32(0.25))
+    assert c.force.dtype == np.float64
+    np.testing.assert_allclose(c.force, table(0.004, 0.25).force, rtol=1e-6)
+    assert table([0.001, 0.002], 0).force.shape == (2,)
+    assert table.data.ctypes.data % 64 == 0
+
+
+def test_refusals() -> None:
+    with pytest.raises(TableError, match=r"reaches 1e-17 .* the best reached"):
+        ContactTable.build(TIP, TABLE_I, 1e-17)
+    with pytest.raises(TableError, match="reaches 1e-17"):
+        ContactTable.build(TIP, CONSTANT, 1e-17)
+    with pytest.raises(TableError, match="the best reached"):
+        ContactTable.build(TIP, TABLE_I, 1e-9, "bilinear")
+    for tolerance in (0.0, -1.0, 1.0, math.nan):
+        with pytest.raises(TableError, match="between 0 and 1"):
+            ContactTable.build(TIP, TABLE_I, tolerance)
+    with pytest.raises(TableError, match=r"no form is called 'linear'.*bilinear"):
+        ContactTable.build(TIP, TABLE_I, 1e-3, "linear")
+
+
+def test_saved_and_loaded(table: ContactTable, tmp_path: Path) -> None:
+    file = tmp_path / "tip.table"
+    table.save(file, TIP, TABLE_I)
+    again = ContactTable.load(file, TIP, TABLE_I)
+    np.testing.assert_array_equal(again.data, table.data)
+    assert again.data.ctypes.data % 64 == 0
+    assert again.certificate == table.certificate
+    assert [path.name for path in tmp_path.iterdir()] == ["tip.table"]
+    for tip, material, tolerance in [
+        (Fingertip(0.021), TABLE_I, 1e-9),
+        (TIP, STIFFENING, 1e-9),
+        (TIP, TABLE_I, 1e-10),
+    ]:
+        with pytest.raises(TableError, match="belongs to another"):
+            ContactTable.load(file, tip, material, tolerance)
+
+
+@pytest.mark.parametrize("position", [0, 8, 40, 72, 80, 1000, -1])
+def test_a_damaged_file_is_rejected_and_rebuilt(
+    table: ContactTable, tmp_path: Path, position: int
+) -> None:
+    file = tmp_path / "tip.table"
+    table.save(file, TIP, TABLE_I)
+    content = bytearray(file.read_bytes())
+    content[position] ^= 0x10
+    file.write_bytes(content)
+    with pytest.raises(TableError, match=r"damaged|holds no"):
+        ContactTable.load(file, TIP, TABLE_I)
+    rebuilt = ContactTable.load_or_build(file, TIP, TABLE_I)
+    assert rebuilt.max_error <= 1e-9
+    np.testing.assert_array_equal(ContactTable.load(file, TIP, TABLE_I).data, rebuilt.data)
+
+
+@pytest.mark.parametrize("length", [0, 5, 41, 81, 200])
+def test_a_cut_file_is_rejected(table: ContactTable, tmp_path: Path, length: int) -> None:
+    file = tmp_path / "tip.table"
+    table.save(file, TIP, TABLE_I)
+    file.write_bytes(file.read_bytes()[:length])
+    with pytest.raises(TableError, match=r"damaged|holds no"):
+        ContactTable.load(file, TIP, TABLE_I)
+
+
+def test_a_folder_keeps_a_file_for_each_table(tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    first = ContactTable.load_or_build(folder, TIP, CONSTANT)
+    ContactTable.load_or_build(folder, TIP, CONSTANT, 1e-8)
+    assert len(list(folder.iterdir())) == 2
+    kept = folder / f"contact-{table_key(TIP, CONSTANT, 1e-9).hex()[:16]}.table"
+    before = kept.stat().st_mtime_ns
+    again = ContactTable.load_or_build(folder, TIP, CONSTANT)
+    assert kept.stat().st_mtime_ns == before
+    np.testing.assert_array_equal(first.data, again.data)
+    # Where nothing can be kept the table is built all the same.
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    unkept = ContactTable.load_or_build(blocked / "cache", TIP, CONSTANT)
+    assert unkept.form.name == "closed"
+
+
+def test_aligned_arrays_are_zero_and_contiguous() -> None:
+    for size in (0, 1, 7, 100):
+        array = aligned(size)
+        assert array.size == size
+        assert array.ctypes.data % 64 == 0 or size == 0
+        assert not array.any()
