@@ -18,6 +18,7 @@ from daemon.simulation import protocol
 from daemon.simulation.control_table import ControlTable, Item
 from daemon.simulation.joint_plant import JointPlant
 from daemon.simulation.servo_joint import STEP, ServoJoint
+from daemon.simulation.servo_rules import refusal, shut_down
 
 REBOOT_TIME = 0.34  # s without an answer
 OVERLOAD_TIME = 2.0  # s at the current limit
@@ -29,7 +30,6 @@ _CLEAR_FIRMWARE = 42
 _BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
 _CLEAR_KEY = b"\x01DXL\x22"
 _BACKUP_KEY = b"CTRL"
-_GOALS = (reg.GOAL_PWM, reg.GOAL_CURRENT, reg.GOAL_VELOCITY, reg.GOAL_POSITION)
 
 
 class EmulatedServo:
@@ -265,7 +265,7 @@ class EmulatedServo:
         """A hardware error: told by the alert bit, and a shutdown if the mask has its bit."""
         status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
         self.table.set(reg.HARDWARE_ERROR_STATUS, status)
-        if self._shut_down() and self.torque_on:
+        if shut_down(self.table) and self.torque_on:
             self.table.set(reg.TORQUE_ENABLE, 0)
             self._joint.drive()
 
@@ -281,51 +281,10 @@ class EmulatedServo:
         if error:
             return error, []
         for item, value in plan:
-            error = self._refusal(item, value)
+            error = refusal(self.table, self.model, item, value)
             if error:
                 return error, []
         return protocol.OK, plan
-
-    def _refusal(self, item: Item, value: int) -> int:
-        table, address = self.table, item.address
-        if item.saved and self.torque_on:
-            return protocol.ACCESS
-        if address in _GOALS:
-            if table.memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
-                return protocol.DATA_RANGE
-            return protocol.OK if self._within_limit(address, value) else protocol.DATA_LIMIT
-        if address == reg.OPERATING_MODE and value not in self.model.modes:
-            return protocol.DATA_RANGE
-        if address == reg.BUS_WATCHDOG and value and table.memory[address] == reg.WATCHDOG_ERROR:
-            return protocol.DATA_RANGE
-        if address == reg.TORQUE_ENABLE and value and self._shut_down():
-            return protocol.RESULT_FAIL
-        pairs = {
-            reg.MIN_POSITION_LIMIT: lambda: value <= table.get(reg.MAX_POSITION_LIMIT),
-            reg.MAX_POSITION_LIMIT: lambda: value >= table.get(reg.MIN_POSITION_LIMIT),
-            reg.MIN_VOLTAGE_LIMIT: lambda: value <= table.get(reg.MAX_VOLTAGE_LIMIT),
-            reg.MAX_VOLTAGE_LIMIT: lambda: value >= table.get(reg.MIN_VOLTAGE_LIMIT),
-        }
-        holds = pairs.get(address)
-        return protocol.DATA_LIMIT if holds is not None and not holds() else protocol.OK
-
-    def _within_limit(self, address: int, value: int) -> bool:
-        table = self.table
-        if address == reg.GOAL_POSITION:
-            if self.mode != reg.POSITION_MODE:
-                return True
-            low, high = table.get(reg.MIN_POSITION_LIMIT), table.get(reg.MAX_POSITION_LIMIT)
-            return low <= value <= high
-        limit = {
-            reg.GOAL_PWM: reg.PWM_LIMIT,
-            reg.GOAL_CURRENT: reg.CURRENT_LIMIT,
-            reg.GOAL_VELOCITY: reg.VELOCITY_LIMIT,
-        }[address]
-        return abs(value) <= table.get(limit)
-
-    def _shut_down(self) -> bool:
-        memory = self.table.memory
-        return bool(memory[reg.HARDWARE_ERROR_STATUS] & memory[reg.SHUTDOWN])
 
     def _effect(self, address: int, value: int, t: float) -> None:
         if address == reg.TORQUE_ENABLE:
