@@ -57,4 +57,5 @@ def make_estimator(settings: Settings, material: Material) -> ContactEstimator:
         noise=settings.tactile.noise,
         method=settings.estimator.method,
         free_gain=settings.estimator.free_gain,
+        saturation=settings.tactile.full_count,
     )

@@ -101,6 +101,7 @@ class TactileSettings(Section):
     pitch: Positive = 0.058 / 44
     centre: tuple[Finite, Finite] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
     pascal_per_count: Positive = 4.0
+    full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
     rate: Positive = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
     latency: NonNegative = 0.005  # s from the middle of a scan to the first byte on the wire
@@ -189,6 +190,7 @@ class Simulation(Section):
     modulus_scale: Positive = 1.0  # the real tip over the settings' material
     tactile_noise: NonNegative = 1520.0  # Pa a cell
     tactile_delay: NonNegative = 0.010  # s from the middle of a scan to its arrival
+    palm: Finite = 0.0  # m, the palm's place along y; the pivots are at 0
     tip_loss: NonNegative = 0.002  # s, the tip's damping over its stiffness
     joint_inertia: Positive = 0.010  # kg·m² at the joint: finger and reflected rotor
     joint_damping: NonNegative = 0.02  # N·m·s/rad

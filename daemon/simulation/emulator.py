@@ -35,6 +35,7 @@ DEFAULT_BOARD = {
     "cols": 32,
     "pitch": 0.0018125,
     "pascal_per_count": 500.0,
+    "full_count": 255,
 }
 
 
