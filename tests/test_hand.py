@@ -90,7 +90,35 @@ def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
     slippery = make(gravity=(0.0, -9.80665), object_mass=0.3, tip_friction=0.05)
     place(slippery, start.q, start.pose)
     settled(slippery, (0.9, 0.9), 0.7, 1.0)
-    assert slippery.object_pose[1] < 0.0
+    assert slippery.object_pose[1] == pytest.approx(0.03, abs=1e-3)  # on the palm
+
+
+def test_a_dropped_object_comes_to_rest_on_the_palm():
+    for angle in (0.0, 0.4):
+        hand = make(gravity=(0.0, -9.80665), object_angle=angle, palm=0.01)
+        energy = hand.energy()
+        highest = 0.0
+        for _ in range(2000):
+            run(hand, 0.001)
+            later = hand.energy()
+            assert later <= energy + 1e-12
+            energy = later
+            if hand.t > 0.2:
+                highest = max(highest, np.abs(hand.object_velocity[1]))
+        # Flat on a face, the weight on two corners' springs of 1e5 N/m.
+        half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
+        sunk = 0.1 * 9.80665 / 2e5
+        assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=1e-7)
+        assert np.abs(hand.object_velocity[1:]).max() < 1e-6
+    assert highest > 0.01  # the tilted one rocked before it lay still
+
+
+def test_a_push_onto_the_palm_is_borne_by_it():
+    hand = make(palm=0.045, object_mass=0.02)
+    hand.push(0.0, -20.0)
+    run(hand, 0.5)
+    assert hand.object_pose[1] == pytest.approx(0.045 + 0.03 - 20.0 / 2e5, rel=1e-6)
+    assert hand.object_pose[2] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_collision_keeps_momentum_and_energy():

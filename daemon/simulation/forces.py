@@ -1,4 +1,4 @@
-"""All forces on the simulated hand: tips, stops, friction, gravity; and the currents asked for.
+"""All forces on the simulated hand: tips, stops, palm, friction; and the currents asked for.
 
 The servo's own position loop (proportional and derivative, in its current limit) is here too, since
 it runs inside the plant's sub-steps as it runs inside a real servo. Only kernels live here.
@@ -16,6 +16,9 @@ from daemon.simulation.tip import evaluate_tip
 from kinematics.kernels import kernel
 
 FloatArray = NDArray[np.float64]
+
+PALM_STIFFNESS = 1e5  # N/m, each corner of the object on the palm
+PALM_LOSS = 1e-3  # s, its damping over its stiffness
 
 
 @kernel
@@ -92,6 +95,51 @@ def script_place(memory: FloatArray, t: float) -> float:
 
 
 @kernel
+def evaluate_palm(memory: FloatArray, position: int, velocity: int) -> tuple[float, float]:
+    """Force along y and torque of the palm on the object's corners; a spring with loss each.
+
+    Writes its energy and, in stage 1, its stiffness as it will be at the step's end.
+    """
+    height = memory[position + 3] - memory[layout.PALM]
+    half_width = memory[layout.HALF_WIDTH]
+    half_height = memory[layout.HALF_HEIGHT]
+    force = 0.0
+    torque = 0.0
+    energy = 0.0
+    stiff_y = 0.0
+    stiff_both = 0.0
+    stiff_turn = 0.0
+    y_rate = memory[velocity + 3]
+    h = memory[layout.STEP]
+    if height - half_width - half_height < h * abs(y_rate):
+        nx = math.cos(memory[position + 4])
+        ny = math.sin(memory[position + 4])
+        for corner in range(4):
+            u = half_width if corner % 2 else -half_width
+            v = half_height if corner < 2 else -half_height
+            # Height of the corner and its derivative by φ, its place along x.
+            depth = -(height + u * ny + v * nx)
+            lever = u * nx - v * ny
+            rate = -(y_rate + lever * memory[velocity + 4])
+            if max(depth, depth + h * rate) <= 0.0:
+                continue
+            stiff_y += PALM_STIFFNESS
+            stiff_both += PALM_STIFFNESS * lever
+            stiff_turn += PALM_STIFFNESS * lever * lever
+            if depth > 0.0:
+                push = max(PALM_STIFFNESS * (depth + PALM_LOSS * rate), 0.0)
+                energy += 0.5 * PALM_STIFFNESS * depth * depth
+                force += push
+                torque += push * lever
+    memory[layout.PALM_ENERGY] = energy
+    if position == layout.POSITION:
+        memory[layout.PALM_STIFFNESS] = stiff_y
+        memory[layout.PALM_STIFFNESS + 1] = stiff_both
+        memory[layout.PALM_STIFFNESS + 2] = stiff_turn
+    return force, torque
+
+
+@kernel
 def evaluate_hand(
     memory: FloatArray,
     data: FloatArray,
@@ -118,6 +166,9 @@ def evaluate_hand(
     force_x = memory[layout.MASS] * memory[layout.GRAVITY] + memory[layout.PUSH] - drag * vx
     force_y = memory[layout.MASS] * memory[layout.GRAVITY + 1] + memory[layout.PUSH + 1] - drag * vy
     torque = memory[layout.PUSH + 2] - spin_drag * spin
+    palm_force, palm_torque = evaluate_palm(memory, position, velocity)
+    force_y += palm_force
+    torque += palm_torque
     memory[layout.DRAG + 2] = drag
     memory[layout.DRAG + 3] = drag
     memory[layout.DRAG + 4] = spin_drag

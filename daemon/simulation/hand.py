@@ -166,6 +166,7 @@ class SimulatedHand:
             - mass * self._pair(layout.GRAVITY) @ self.object_pose[:2]
             + 0.5 * m[layout.STOP_STIFFNESS] * beyond @ beyond
             + self._pair(layout.CONTACT_ENERGY).sum()
+            + m[layout.PALM_ENERGY]
         )
 
     def _pair(self, place: int) -> FloatArray:

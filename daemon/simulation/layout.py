@@ -21,7 +21,8 @@ CONTACT_NORMAL = 24
 CONTACT_TANGENTIAL = 26
 CONTACT_RIM = 28
 CONTACT_ENERGY = 30
-STATE = 32  # length of the state
+PALM_ENERGY = 32
+STATE = 33  # length of the state
 
 # Parameters of the tips.
 MODULUS = 33  # of the real tip at zero strain [Pa]
@@ -88,7 +89,9 @@ SECOND_X = 259
 SECOND_V = 264
 MOTOR = 269  # slopes of both currents by angle, then by velocity
 CHANGE = 273  # of both currents
-MEMORY = 275  # length of the block
+PALM_STIFFNESS = 275  # over (y, φ): yy, yφ, φφ
+PALM = 278  # y of the palm [m], a parameter
+MEMORY = 279  # length of the block
 
 # Places in a tip's row.
 D = 0  # normal displacement [m], negative is a gap

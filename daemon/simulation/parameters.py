@@ -96,6 +96,7 @@ def _object(p: FloatArray, settings: Settings) -> None:
         simulation.object_height,
         simulation.object_mass,
     )
+    p[layout.PALM] = simulation.palm
     p[layout.HALF_WIDTH] = 0.5 * width
     p[layout.HALF_HEIGHT] = 0.5 * height
     p[layout.MASS] = mass

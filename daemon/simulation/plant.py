@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from daemon.simulation import layout
 from daemon.simulation.forces import (
+    PALM_LOSS,
     current_reference,
     current_slopes,
     evaluate_hand,
@@ -45,11 +46,14 @@ def factorise(memory: FloatArray, g: float) -> None:
     object's 3 × 3 Schur complement as L D Lᵀ (inverse d0, l10, l20, inverse d1, l21, inverse d2).
     """
     a = memory[layout.MASS] + g * memory[layout.DRAG + 2]
+    palm = g * (PALM_LOSS + g)
     b = 0.0
     c = memory[layout.MASS] + g * memory[layout.DRAG + 3]
+    c += palm * memory[layout.PALM_STIFFNESS]
     d = 0.0
-    e = 0.0
+    e = palm * memory[layout.PALM_STIFFNESS + 1]
     f = memory[layout.INERTIA] + g * memory[layout.DRAG + 4]
+    f += palm * memory[layout.PALM_STIFFNESS + 2]
     for finger in range(2):
         row = layout.TIP + finger * layout.TIP_ROW
         w_d = g * (memory[row + layout.C_D] + g * memory[row + layout.K_D])
@@ -140,6 +144,12 @@ def row_along(memory: FloatArray, row: int, finger: int, along: int) -> float:
 @kernel
 def take_stiffness(memory: FloatArray, along: int, shear1: float, shear2: float, g: float) -> None:
     """Take g K r from the load, K of stage 1; r stands from ``along`` on, then both shears."""
+    by_y = memory[layout.PALM_STIFFNESS + 1] * memory[along + 4]
+    by_turn = memory[layout.PALM_STIFFNESS + 2] * memory[along + 4]
+    by_y += memory[layout.PALM_STIFFNESS] * memory[along + 3]
+    by_turn += memory[layout.PALM_STIFFNESS + 1] * memory[along + 3]
+    memory[layout.LOAD + 3] -= g * by_y
+    memory[layout.LOAD + 4] -= g * by_turn
     for finger in range(2):
         row = layout.TIP + finger * layout.TIP_ROW
         at_d = row + layout.JD
