@@ -47,14 +47,19 @@ def aligned_table(rows: list[ContactRow]) -> str:
     lines = []
     for material in dict.fromkeys(each.material for each in rows):
         lines.append(f"contact model, material: {material}")
-        heads = "".join(f"{head:>16}" for head in MODES.values())
-        lines.append(f"{'ns a call (× the closed form)':48} out {'error':>8}{'KiB':>5}{heads}")
+        heads = "".join(f"{head:>15}" for head in MODES.values())
+        lines.append(
+            f"{'ns a call (× the closed form)':48} out {'error':>8}{'KiB':>5}{'build ms':>9}{heads}"
+        )
         for each in rows:
             if each.material != material:
                 continue
             memory = "" if each.nbytes is None else f"{each.nbytes / 1024:.0f}"
-            cells = "".join(f"{_cell(each.timings.get(mode)):>16}" for mode in MODES)
-            lines.append(f"{each.name:48} {each.outputs:3} {each.max_error:8.1e}{memory:>5}{cells}")
+            build = "" if each.build_s is None else f"{each.build_s * 1e3:.0f}"
+            cells = "".join(f"{_cell(each.timings.get(mode)):>15}" for mode in MODES)
+            lines.append(
+                f"{each.name:48} {each.outputs:3} {each.max_error:8.1e}{memory:>5}{build:>9}{cells}"
+            )
         lines.append("")
     lines += [
         "in a loop: calls of a compiled loop, which overlap; chained: each waits for the last;",
@@ -67,10 +72,10 @@ def aligned_table(rows: list[ContactRow]) -> str:
 def _cell(timing: Timing | None) -> str:
     if timing is None:
         return "–"
-    return f"{_short(timing.median_ns)} ({_short(timing.over_closed)})"
+    return f"{_digits(timing.median_ns)} ({_digits(timing.over_closed)})"
 
 
-def _short(value: float) -> str:
+def _digits(value: float) -> str:
     if value >= 1e5:
         return f"{value:.1e}".replace("e+0", "e")
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

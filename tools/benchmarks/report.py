@@ -39,8 +39,8 @@ def table(rows: list[Row]) -> str:
     for each in rows:
         aim = "" if each.aim is None else f"≤ {each.aim:g}"
         lines.append(
-            f"{each.name:{width}} {_number(each.median)} {_number(each.p99)} {each.unit:>4} {aim:>7} "
-            f"{each.count:7d}"
+            f"{each.name:{width}} {_number(each.median)} {_number(each.p99)} {each.unit:>4} "
+            f"{aim:>7} {each.count:7d}"
         )
     return "\n".join(lines)
 
