@@ -161,6 +161,8 @@ def test_path_of_tilt_and_roll(folder: Path) -> None:
             assert theta[np.argmin(curve)] == 0.0
         # A modulus that rises with strain deepens the minimum.
         assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
+        # Springs that point at the tip's centre have none.
+        assert np.ptp(rolling[f"F of radial springs at d = {d} mm [N]"]) == 0.0
         # The rotation ends where the rolling starts.
         last = rotation[f"F, d up to {d} mm [N]"][-1]
         assert last == pytest.approx(rolling[f"F at d = {d} mm [N]"][0], rel=1e-12)

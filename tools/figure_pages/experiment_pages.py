@@ -12,6 +12,7 @@ import numpy as np
 
 from kinematics.contact import closed_forms
 from kinematics.material import Material
+from kinematics.models import RadialModel
 from kinematics.pressure import SensorGrid
 from kinematics.quadrature import integrate
 from tools.figure_pages.model_pages import DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
@@ -116,11 +117,13 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             (f"F at d = {deepest} mm", "N", _force(d, tilting)),
         ]
         force, law = _force(d, rolling), _force_table_i(d, rolling)
+        radial = np.full(rolling.shape, RadialModel(TIP, MODULUS).force(d * MILLI))
         second += [
             (f"F at d = {deepest} mm", "N", force),
             (f"F/F(0) at d = {deepest} mm", "1", force / force[rolling == 0.0]),
             (f"F of Table I's law at d = {deepest} mm", "N", law),
             (f"F/F(0) of Table I's law at d = {deepest} mm", "1", law / law[rolling == 0.0]),
+            (f"F of radial springs at d = {deepest} mm", "N", radial),
         ]
     return sheet("fig10a", *first), sheet("fig10b", *second)
 
@@ -158,7 +161,14 @@ def draw_tilt_and_roll(figure: Figure, sheets: Sequence[Sheet]) -> None:
             right.plot(
                 theta, law, **(style | {"linewidth": 1.1}), label=f"Table I's law, d = {d} mm"
             )
-    right.axhline(1.0, color=KINDS[1], linestyle=":", linewidth=1.2, label="radial springs: flat")
+    radial = rolling["F of radial springs at d = 4 mm"]
+    right.plot(
+        theta,
+        radial / radial[theta == 0.0],
+        color=KINDS[1],
+        linestyle=":",
+        label="radial springs: flat",
+    )
     right.plot(0.0, 1.0, "v", ms=7, color=INK, label="minimum at 0°")
     for x, side in ((TILTED, "right"), (ROLLED, "left")):
         value = float(ratio[np.argmin(np.abs(theta - x))])
