@@ -74,7 +74,7 @@ def draw(figure: Figure, sheets: Sequence[Sheet]) -> None:
             right.annotate(
                 f"{y:.3f}" + (" (Min)" if name == "Min" else ""),
                 (x, y),
-                (-2, -16) if name == "Min" else (4, -11),
+                (-2, -16) if name == "Min" else (-7, 2) if x == PERCENT else (4, -11),
                 textcoords="offset points",
                 ha="right" if x == PERCENT else "left",
                 fontsize=7.5,
