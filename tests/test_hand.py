@@ -93,6 +93,23 @@ def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
     assert slippery.object_pose[1] == pytest.approx(0.03, abs=1e-3)  # on the palm
 
 
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
+    hand = make(tip_friction=friction, table_friction=0.0)
+    settled(hand, (0.9, 0.9), 0.5, 1.0)
+    place_held = hand.object_pose[1]
+    push = 0.0
+    while hand.object_pose[1] < place_held + 0.006:
+        push += 0.01
+        hand.push(0.0, push)
+        run(hand, 0.005)
+        ratio = np.abs(hand.tangential) / hand.normal
+        assert (ratio <= friction * (1 + 1e-9)).all()
+    # Both tips slip, at Coulomb's bound; only inertia is left of the push.
+    np.testing.assert_allclose(ratio, friction, rtol=1e-6)
+    assert push == pytest.approx(2 * friction * hand.normal.mean(), rel=0.15)
+
+
 def test_a_dropped_object_comes_to_rest_on_the_palm():
     for angle in (0.0, 0.4):
         hand = make(gravity=(0.0, -9.80665), object_angle=angle, palm=0.01)
