@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 
+_NEAR = 1e-6  # counts: below it the square root's rounding would never let the trajectory arrive
+
 
 class Profile:
     """Where the trajectory is and how fast it goes; a limit of 0 means none."""
@@ -47,6 +49,9 @@ class Profile:
         """Go on by dt [s]: a trapezoid, which never passes its target."""
         distance = self.target - self.position
         if distance == 0.0 and self.velocity == 0.0:
+            return
+        if abs(distance) < _NEAR and abs(self.velocity) <= max(self.acceleration * dt, _NEAR):
+            self.hold(self.target)
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
