@@ -348,6 +348,15 @@ def test_samples_stand_at_the_frames_instants_between_sub_steps():
         hand.sample(0)
 
 
+def test_sub_step_divides_the_millisecond_and_shrinks_with_stiffness():
+    steps = [make(object_mass=mass).step for mass in (10.0, 0.1, 0.01, 1e-4)]
+    for step in steps:
+        assert 1e-3 / step == pytest.approx(round(1e-3 / step), abs=1e-9)
+    assert steps[0] == steps[1] == 0.25e-3
+    assert steps[1] > steps[2] > steps[3] == 0.05e-3
+    assert make(object_mass=0.01, modulus_scale=4.0).step < steps[2]
+
+
 def test_unknown_servo_is_a_settings_error():
     with pytest.raises(SettingsError, match=r"servos\.model"):
         SimulatedHand(Settings.model_validate({"servos": {"model": "XM999"}}), table=PAPER)
