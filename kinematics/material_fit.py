@@ -18,10 +18,11 @@ FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
 _DEGREES = range(11)  # of the modulus
-_GOOD = 1e-4  # of the greatest stress: a misfit that needs no higher degree
+_GOOD = 1e-9  # of the greatest stress: a misfit that is none
+_NEAR = 1.5  # times the least misfit of any degree is near enough for a lower one
 _BAD = 0.05  # of the greatest stress: a misfit that no law is made of
 _FLOOR = 1e-3  # least modulus over the mean one
-_BEYOND = 0.02  # weight of the points that only continue the curve
+_BEYOND = 0.1  # weight of the points that only continue the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences, against wiggles between points
 
 
@@ -68,25 +69,21 @@ def check_points(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, Floa
 def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float]:
     """Coefficients c_1, c_2, … of σ(ε) [Pa] and the largest misfit of the points [Pa].
 
-    The lowest degree that runs within 10⁻⁴ of the greatest stress is taken, or else the one that
-    comes nearest. Beyond the last point the law goes on with the slope of the last quarter.
+    The lowest degree is taken that comes about as near to the points as any. Beyond the last point
+    the law goes on about straight.
     """
     x, y = check_points(strain, stress)
     top = float(y[-1])
     points, values = _continued(x, y / top)
     weights = np.where(np.arange(points.size) < x.size, 1.0, _BEYOND)
-    best: tuple[float, FloatArray] | None = None
+    tried: list[tuple[float, FloatArray]] = []
     for degree in _DEGREES:
-        if degree > max(2 * x.size, 3):
-            break
-        modulus = _positive_modulus(points, values, weights, degree)
-        misfit = float(np.max(np.abs(_integrals(x, degree) @ modulus - y / top)))
-        if best is None or misfit < 0.9 * best[0]:
-            best = misfit, modulus
-        if misfit <= _GOOD:
-            break
-    assert best is not None
-    misfit, modulus = best
+        if degree <= max(2 * x.size, 3):
+            modulus = _positive_modulus(points, values, weights, degree)
+            misfit = float(np.max(np.abs(_integrals(x, degree) @ modulus - y / top)))
+            tried.append((misfit, modulus))
+    enough = _NEAR * min(misfit for misfit, _ in tried) + _GOOD
+    misfit, modulus = next(one for one in tried if one[0] <= enough)
     if misfit > _BAD:
         raise MaterialError(
             f"no smooth monotone law comes near the points: the best misses one by "
@@ -116,18 +113,21 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike) -> float:
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The points, and more up to strain 1 along the slope of their last quarter."""
+    """The points, and more up to strain 1 along the slope that they end with."""
     if x[-1] > 0.95:
         return x, y
-    start = min(float(np.interp(0.75 * x[-1], [0.0, *x], [0.0, *y])), float(y[-1]))
-    slope = (y[-1] - start) / (0.25 * x[-1])
+    # The end of a parabola through the last third, kept near the slope of the last quarter.
+    last = max(3, x.size // 3)
+    back = x[-last:] - x[-1]
+    slope = float(np.polyfit(back, y[-last:], 2)[1])
+    start = float(np.interp(0.75 * x[-1], [0.0, *x], [0.0, *y]))
+    mean = (float(y[-1]) - start) / (0.25 * float(x[-1]))
+    slope = min(max(slope, 0.5 * mean), 2.0 * mean)
     more = np.linspace(x[-1], 1.0, 2 + int(8 * (1.0 - x[-1])))[1:]
     return np.concatenate([x, more]), np.concatenate([y, y[-1] + slope * (more - x[-1])])
 
 
-def _positive_modulus(
-    x: FloatArray, y: FloatArray, weights: FloatArray, degree: int
-) -> FloatArray:
+def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
     """Bernstein coefficients ≥ _FLOOR of the modulus whose integral runs nearest to the points."""
     matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))

@@ -89,6 +89,8 @@ class ContactTable:
     ) -> ContactTable:
         """Build and certify the cheapest table that meets ``tolerance``, relative, on all outputs.
 
+        ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
+
         ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
         with the best that was reached, when the tolerance can't be met within 256 KiB.
         """

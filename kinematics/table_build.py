@@ -48,7 +48,7 @@ FloatArray = NDArray[np.float64]
 MEMORY_LIMIT = 256 * 1024  # bytes of a table
 _MANTISSA = 52
 _OCTAVES = 3  # of h above the corner, where the ratios contain log h
-_SAFETY = 0.5  # of the tolerance that the fit's own estimate may use up
+_SAFETY = 0.9  # of the tolerance that the fit's own estimate may use up
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
 
 
@@ -103,7 +103,10 @@ def _errors(
     theta: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Largest relative error [n] of the table's six outputs, each against the integral."""
+    """Largest relative error [n] of the table's six outputs, each against the integral.
+
+    ∂F/∂θ may pass through zero where a law softens; it counts relative to F tan θ if that is more.
+    """
     for i in range(d.shape[0]):
         f, u, fd, ft, ud, ut, _ = lookup(data, d[i], theta[i])
         e_f, e_u, e_fd, e_ft, e_ud, e_ut = exact(
@@ -111,8 +114,9 @@ def _errors(
         )
         worst = max(abs(f / e_f - 1.0), abs(u / e_u - 1.0))
         worst = max(worst, abs(fd / e_fd - 1.0), abs(ud / e_ud - 1.0))
-        if e_ft != 0.0:
-            worst = max(worst, abs(ft / e_ft - 1.0), abs(ut / e_ut - 1.0))
+        if theta[i] != 0.0:
+            scale = max(abs(e_ft), abs(e_f * math.tan(theta[i])))
+            worst = max(worst, abs(ft - e_ft) / scale, abs(ut / e_ut - 1.0))
         out[i] = worst
 
 
@@ -197,7 +201,9 @@ def _fit(data: FloatArray, law: Law, form: Form, tolerance: float) -> float:
             places = (j + 0.5 * (y + 1.0)) / form.y_pieces
             values = _ratios_at(law, h[:, None], places[None, :])
             terms = np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True)
-            lost = (np.abs(terms) * ~kept).sum(axis=(1, 2)) / np.abs(values).min(axis=(1, 2))
+            size = np.abs(values)
+            size[3] = np.maximum(size[3], size[0])
+            lost = (np.abs(terms) * ~kept).sum(axis=(1, 2)) / size.min(axis=(1, 2))
             estimate = max(estimate, float(lost.max()))
             if estimate > _SAFETY * tolerance:
                 return estimate
@@ -262,7 +268,9 @@ def _corner(law: Law, piece: int) -> tuple[FloatArray, float]:
     basis = chebyshev.chebvander(2.0 * h / lowest - 1.0, rows - 1)
     matrix = np.concatenate([basis, basis * np.log(h)[:, None]], axis=1)
     found = np.linalg.lstsq(matrix, values, rcond=1e-14)[0]
-    misfit = float(np.max(np.abs(matrix @ found / values - 1.0)))
+    size = np.abs(values).reshape(h.size, LANES, columns)
+    size[:, 3] = np.maximum(size[:, 3], size[:, 0])
+    misfit = float(np.max(np.abs(matrix @ found - values) / size.reshape(h.size, -1)))
     terms = found.reshape(2, rows, LANES, columns)
     powers = np.einsum(
         "ai,bj,pikj->abpk", _to_powers(rows), _to_powers(columns) @ in_y, terms, optimize=True

@@ -86,11 +86,14 @@ def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
     h = 1.0 - depth
     limit = math.atan2(h, math.sqrt(depth * (1 + h)))
     s, c = math.sin(limit * share), math.cos(limit * share)
-    for material in (TABLE_I, STIFFENING):
+    for material, tolerance in ((TABLE_I, 2e-13), (STIFFENING, 1e-12)):
         parts = material.expansions()
         usual = ratios(gauss_rule(), circle_rule(material.degree), parts, depth, h, s, c)
         finer = ratios(gauss_rule(40), circle_rule(40), parts, depth, h, s, c)
-        np.testing.assert_allclose(usual, finer, rtol=2e-13)
+        # ∂F/∂θ may pass through zero: to F tan θ, whose ratio is that of F.
+        scale = np.abs(finer)
+        scale[3] = max(scale[3], scale[0])
+        assert np.all(np.abs(np.subtract(usual, finer)) <= tolerance * scale)
 
 
 @given(
