@@ -284,7 +284,7 @@ def _to_powers(count: int) -> FloatArray:
     return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
 
 
-def certify(data: FloatArray, law: Law, points: int = 8000, seed: int | None = None) -> float:
+def certify(data: FloatArray, law: Law, points: int = 5000, seed: int | None = None) -> float:
     """Prove the table on random points and the domain's corners; writes the result to its header.
 
     A third of the points are dense over the domain; the others crowd, by orders of magnitude, at
