@@ -22,6 +22,7 @@ from dynamixel_sdk.robotis_def import (
     COMM_TX_FAIL,
     INST_READ,
     INST_STATUS,
+    INST_SYNC_WRITE,
     MAX_ID,
 )
 
@@ -31,6 +32,7 @@ _PREFIX = b"\xff\xff\xfd\x00"
 _HEADER = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"
 _MAX_PACKET = 1024
+_SYNC_WRITE = bytes((INST_SYNC_WRITE,))
 _SMALLEST = 11  # bytes of a status packet without data
 
 
@@ -125,6 +127,19 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         if result == COMM_SUCCESS:
             port.setPacketTimeout((_SMALLEST + data_length) * param_length)
         return result
+
+    def syncWriteTxOnly(
+        self,
+        port: SerialPort,
+        start_address: int,
+        data_length: int,
+        param: list[int],
+        param_length: int,
+    ) -> int:
+        """Write a span of several servos; nothing is answered."""
+        span = start_address.to_bytes(2, "little") + data_length.to_bytes(2, "little")
+        packet = _packet(BROADCAST_ID, _SYNC_WRITE + span + bytes(param))
+        return self._send(port, packet)
 
     def rxPacket(self, port: SerialPort, fast_option: bool) -> tuple[Any, int]:
         """The next status packet, unstuffed, and the result code.

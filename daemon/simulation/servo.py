@@ -26,6 +26,16 @@ SENSE = 0.010  # s: temperature, voltage and overload
 AMBIENT = 25.0  # °C
 THERMAL_TIME = 120.0  # s
 THERMAL_RISE = 90.0  # °C over ambient at stall current, in the long run
+# Registers whose writing does more than change them.
+_EFFECTIVE = frozenset(
+    (
+        reg.TORQUE_ENABLE,
+        reg.OPERATING_MODE,
+        reg.GOAL_POSITION,
+        reg.GOAL_VELOCITY,
+        reg.BUS_WATCHDOG,
+    )
+)
 _CLEAR_FIRMWARE = 42
 _BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
 _CLEAR_KEY = b"\x01DXL\x22"
@@ -185,7 +195,10 @@ class EmulatedServo:
         for item, value in plan:
             self.table.set(item.address, value)
         for item, value in plan:
-            self._effect(item.address, value, t)
+            if item.address in _EFFECTIVE:
+                self._effect(item.address, value, t)
+        if self.torque_on and self._joint.moves_by_itself():
+            self._next_step = min(self._next_step, t + STEP)
         self._joint.drive()
         return protocol.OK
 
@@ -300,8 +313,6 @@ class EmulatedServo:
             self._joint.aim()
         elif address == reg.BUS_WATCHDOG:
             self._watched = t
-        if self.torque_on and self._joint.moves_by_itself():
-            self._next_step = min(self._next_step, t + STEP)
 
     def _reset_mode(self) -> None:
         table = self.table

@@ -35,12 +35,12 @@ def shut_down(table: ControlTable) -> bool:
 def refusal(table: ControlTable, model: ServoModel, item: Item, value: int) -> int:
     """The error number that writing ``value`` is met with, OK when it is allowed."""
     memory, address = table.memory, item.address
-    if item.saved and memory[reg.TORQUE_ENABLE]:
-        return protocol.ACCESS
     if address in _GOALS:
         if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
             return protocol.DATA_RANGE
         return protocol.OK if _within_limit(table, address, value) else protocol.DATA_LIMIT
+    if item.saved and memory[reg.TORQUE_ENABLE]:
+        return protocol.ACCESS
     if address == reg.OPERATING_MODE and value not in model.modes:
         return protocol.DATA_RANGE
     if address == reg.BUS_WATCHDOG and value and memory[address] == reg.WATCHDOG_ERROR:
