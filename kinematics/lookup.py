@@ -189,9 +189,7 @@ def lookup(
         s, c = _sine_cosine(theta)
         gap = 0.0
     form = int(data[FORM])
-    # One division for 1/(h cos θ) and 1/cos θ; for h = 0 the corner does without the former.
-    over = 1.0 / (c * max(h, 1e-300))
-    inverse = over * max(h, 1e-300)
+    inverse = 1.0 / c
     slope = s * inverse
     push = math.pi * data[MODULUS] * d * inverse
     force = push * d
@@ -211,14 +209,14 @@ def lookup(
         bits = int(np.float64(h).view(np.int64)) >> int(data[SHIFT])
         i = min(bits - int(data[FIRST]), int(data[H_PIECES]) - 1)
         x = (h - data[CENTRES + 2 * i]) * data[CENTRES + 2 * i + 1]
-        y = math.sqrt(gap) * over
+        y = math.sqrt(gap) * (inverse * (1.0 / h))
         if form >= _SLABS:
             ratios = _evaluate_slab(data, form, i, x, 2.0 * y - 1.0)
         else:
             ratios = _evaluate_local(data, form, i, x, y)
     else:
         s = abs(s)
-        y = math.sqrt((h - s) * (h + s)) * over if h > s else 0.0
+        y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
         ratios = _evaluate_corner(data, h, y)
     r_f, r_u, r_fd, r_ft, r_ut = ratios
     force_theta = force * slope * r_ft
