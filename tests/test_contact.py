@@ -56,9 +56,7 @@ def test_partials_and_moments_meet_the_checkpoints() -> None:
     d, theta = np.array([0.004, 0.008]), np.radians([15, 30])
     c = closed_forms(E, d, theta)
     np.testing.assert_allclose(c.energy_d, [16.377812044863, 81.497102224324], rtol=1e-12)
-    np.testing.assert_allclose(
-        c.energy_theta * 1e3, [11.702457363226, 250.94599417274], rtol=1e-12
-    )
+    np.testing.assert_allclose(c.energy_theta * 1e3, [11.702457363226, 250.94599417274], rtol=1e-12)
     m = moments(TIP, d, theta)
     np.testing.assert_allclose(m.centroid * 1e3, [4.8312888419137, 8.6666666666667], rtol=1e-13)
     np.testing.assert_allclose(m.variance_x * 1e6, [23.6958660463, 36.8888888889], rtol=2e-12)
@@ -74,9 +72,7 @@ def test_partials_and_moments_meet_the_checkpoints() -> None:
 
 def test_limit_of_the_tilt() -> None:
     limits = np.degrees(TIP.theta_limit(np.array([2, 4, 6, 8, 10, 12]) * 1e-3))
-    np.testing.assert_allclose(
-        limits, [64.158, 53.130, 44.427, 36.870, 30.000, 23.578], atol=5e-4
-    )
+    np.testing.assert_allclose(limits, [64.158, 53.130, 44.427, 36.870, 30.000, 23.578], atol=5e-4)
     assert TIP.theta_limit(-1.0) == TIP.theta_limit(0.0) == math.pi / 2
     assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
     assert math.isnan(TIP.theta_limit(math.nan))
