@@ -48,6 +48,15 @@ class CommandServer:
             pass  # the client has gone
         return True
 
+    def refuse_waiting(self, reason: str) -> None:
+        """Refuse all commands that have come so far, as those that came before the loop ran."""
+
+        def refuse(_: dict[str, Any]) -> dict[str, Any]:
+            raise Refused(reason)
+
+        while self.serve(refuse):
+            pass
+
     def _answer(self, payload: bytes, handler: Handler) -> dict[str, Any]:
         try:
             if len(payload) > self._max_bytes:

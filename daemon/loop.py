@@ -83,6 +83,9 @@ class Loop:
         """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
         self.state.t = self.state.reading.t = self._clock.now()
         self.state.wall = self._clock.wall()
+        if self._server is not None:
+            # Whoever sent them has given up waiting: an old command must not move the hand.
+            self._server.refuse_waiting("came while the daemon was starting; send it again")
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from daemon.commands import CommandServer, NoAnswer, Refused, decode, send
 from daemon.sockets import AddressError
+from tests.conftest import until
 
 
 def echo(request: dict[str, Any]) -> dict[str, Any]:
@@ -92,6 +93,21 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"})["ok"] is True
+
+
+def test_commands_from_before_the_start_are_refused_and_not_carried_out(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    server = CommandServer(context, addresses[1], max_bytes=200)
+    early = context.socket(zmq.REQ)
+    early.connect(addresses[1])
+    early.send(msgpack.packb({"command": "arm"}))
+    until(lambda: server._bound.readable())
+    server.refuse_waiting("starting")
+    assert early.poll(5000)
+    assert msgpack.unpackb(early.recv()) == {"ok": False, "error": "starting"}
+    assert not server.serve(echo)
+    server.close()
 
 
 def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
