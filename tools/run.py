@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from daemon.tactile.base import TactileError
 
     log = _Log()
-    log.line("info", "start", f"softfinger: {_scene(settings)}; compiling kernels if they are new")
+    log.line("info", "start", f"softfinger: {_scene(settings)}; new kernels take half a minute to compile")
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=cache_folder())
     except (SettingsError, AddressError, ServoError, TactileError) as error:
