@@ -108,6 +108,8 @@ class Control:
     def _grasp(self, numbers: dict[str, float]) -> None:
         if not self._has_sensors:
             raise Refused("grasp: each finger needs a tactile sensor in this scene")
+        if self._settings.servos.mode == "position":
+            raise Refused('grasp: nothing bounds the current while servos.mode is "position"')
         force = numbers.get("force", self._settings.control.force_default)
         low, high = self._settings.control.contact_force, 0.9 * self._settings.safety.force_max
         if not low < force <= high:

@@ -20,6 +20,10 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Finger = Literal["left", "right"]
+FINGER_NAMES = ("left", "right")
+Index = Annotated[int, Field(ge=0, le=255)]
+Cells = tuple[tuple[Index, Index], ...]
+ServoMode = Literal["current-based position", "current", "position"]
 
 
 class SettingsError(Exception):
@@ -85,6 +89,9 @@ class ServoSettings(Section):
     direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
     zero: tuple[int, int] = (2048, 2048)  # counts at q = 0
     gear_ratio: Positive = 1.0  # servo turns for one joint turn
+    mode: ServoMode = "current-based position"  # or "current", or "position" (can't grasp)
+    stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
+    damping: NonNegative = 0.4  # A·s/rad, likewise
     reply_timeout: Positive = 0.004  # s, a missing reply costs no more
     fault_after: Positive = 0.05  # s without a good exchange → fault
     watchdog: NonNegative = 0.1  # s, the servo's own bus watchdog; 0 leaves it off
@@ -93,19 +100,27 @@ class ServoSettings(Section):
 class TactileSettings(Section):
     """The pressure grids under the tips."""
 
-    backend: Literal["simulated", "flexitac", "none"] = "simulated"
+    backend: Literal["simulated", "flexitac", "glove", "cobs", "replay", "none"] = "simulated"
     port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
     rows: Annotated[int, Field(ge=4, le=256)] = 44
     cols: Annotated[int, Field(ge=4, le=256)] = 44
     pitch: Positive = 0.058 / 44
+    pitch_y: NonNegative = 0.0  # from row to row; 0: as pitch
     centre: tuple[Finite, Finite] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
+    rotation: tuple[Finite, Finite] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
+    dead: tuple[Cells, Cells] = ((), ())  # cells [row, col] that are left out
+    threshold: Annotated[int, Field(ge=0, le=255)] = 0  # smallest count sent; 0 stands for less
     pascal_per_count: Positive = 4.0
     full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
     rate: Positive = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
     latency: NonNegative = 0.005  # s from the middle of a scan to the first byte on the wire
     open_timeout: Positive = 2.0  # s to wait for a first good frame
+    sensor: tuple[str, str] = ("", "")  # what tells the sensors from others, as a serial number
+    calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
+    recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, folder of .npy, ASCII export
+    replay_again: bool = True  # backend = "replay": from the start at the end, else it ends
 
 
 class EstimatorSettings(Section):
@@ -307,7 +322,7 @@ def _contradictions(settings: Settings, directory: Path | None) -> list[str]:
         found.append(f"scene.fingers: found {_shown(scene.fingers)}, expected each finger once")
     if settings.servos.backend == "none" and settings.tactile.backend == "none":
         found.append("servos.backend, tactile.backend: found none and none, expected at least one")
-    for index, finger in enumerate(("left", "right")):
+    for index, finger in enumerate(FINGER_NAMES):
         low, open_, high = hand.q_min[index], hand.open_angle[index], hand.q_max[index]
         if not low < high:
             found.append(f"hand.q_max: found {high:g} for {finger}, expected above q_min {low:g}")
@@ -322,13 +337,27 @@ def _contradictions(settings: Settings, directory: Path | None) -> list[str]:
             f"material.stress: found {len(material.stress)} numbers, "
             f"expected {len(material.strain)} as in material.strain"
         )
-    simulated = {settings.servos.backend, settings.tactile.backend} <= {"simulated", "none"}
+    tactile = settings.tactile
+    for index, cells in enumerate(tactile.dead):
+        found += [
+            f"tactile.dead: found {_shown(cell)} for {FINGER_NAMES[index]}, "
+            f"expected a cell of {tactile.rows} × {tactile.cols}"
+            for cell in cells
+            if cell[0] >= tactile.rows or cell[1] >= tactile.cols
+        ]
+    if tactile.backend == "replay":
+        found += [
+            f'tactile.recording: found "" for {name}, expected a recording'
+            for name in scene.fingers
+            if not tactile.recording[FINGER_NAMES.index(name)]
+        ]
+    simulated = {settings.servos.backend, tactile.backend} <= {"simulated", "replay", "none"}
     if settings.loop.clock == "virtual" and not simulated:
         found.append('loop.clock: found "virtual", expected "real" with hardware backends')
     ports = []
     if settings.servos.backend == "dynamixel":
         ports.append(("servos.port", settings.servos.port))
-    if settings.tactile.backend not in ("simulated", "none"):
+    if tactile.backend not in ("simulated", "replay", "none"):
         ports += [("tactile.port", port) for port in settings.tactile.port]
     if directory is None:
         found += [

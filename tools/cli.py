@@ -16,6 +16,8 @@ SUBCOMMANDS = {
     "emulate": "a stand-in hand in a process of its own: servos and tactile boards on ptys",
     "send": "send one command to the running daemon",
     "monitor": "live terminal page of the running daemon",
+    "doctor": "check ports, servos, boards and this machine, and tell what mends them",
+    "scan": "find the servos on a port, at any rate",
     "figures": "the paper's figures from this model, as CSV and PNG",
     "bench": "measure run time, beside what a user would otherwise pick",
 }

@@ -15,7 +15,17 @@ class ServoError(Exception):
 
 
 class Servos(Protocol):
-    """Joints of the hand, in current-based position mode.
+    """Joints of the hand, in one of three operating modes (``servos.mode``).
+
+    In each of them ``goal.q`` is the angle a joint is drawn to:
+
+    - *current-based position* (5): the servo's own loop, with the motor's current within
+      ± ``goal.current``.
+    - *current* (0): the same meaning, but the loop runs here, once a tick, on the newest reading:
+      ``servos.stiffness`` and ``servos.damping`` within ± ``goal.current``. Without readings the
+      current stays what it was, until the servo's bus watchdog ends it.
+    - *position* (3): the servo's own loop with all the current it has. ``goal.current`` is not
+      looked at, and torque on holds at once; it suits moving and no grasp.
 
     ``connect`` checks and never stiffens or moves the hand. ``read`` and ``write`` are called
     once a tick; a failed exchange is told by ``valid`` and the counters, not by an exception,

@@ -1,7 +1,7 @@
 """What is looked at before the servos are used: every finding in one list, with what mends it.
 
 Pure functions over what was read; they send nothing. The reading itself belongs to
-:mod:`daemon.servos.dynamixel`.
+:mod:`daemon.servos.examine`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 from daemon.servos import registers as reg
 from daemon.servos.models import ServoModel, by_number
+from daemon.servos.modes import mode_number
+from daemon.servos.units import JointScale
+from daemon.settings import Settings
 
 # Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
 RETURN_DELAY_MAX = 25
@@ -29,8 +32,18 @@ class Findings:
     notices: tuple[str, ...] = ()
 
 
+def check_model(model: ServoModel, mode: int) -> str:
+    """What is wrong with running this model in an operating mode; empty when it can."""
+    if mode in model.modes:
+        return ""
+    return (
+        f"an {model.name} has no {reg.MODE_NAMES[mode]} mode: use a model that senses current, or "
+        'set servos.mode = "position"'
+    )
+
+
 def check_servo(
-    name: str, model: ServoModel, table: bytes, watchdog: float, current_max: float
+    name: str, model: ServoModel, table: bytes, settings: Settings, finger: int
 ) -> Findings:
     """Judge one servo by the bytes of its registers 0 … 146.
 
@@ -38,9 +51,11 @@ def check_servo(
         name: how the servo is called in the report.
         model: the model that the settings name.
         table: its control table from address 0, at least up to the present temperature.
-        watchdog: s, the bus watchdog that the settings want, 0 for none.
-        current_max: A, the greatest current that safety may ask for.
+        settings: what is wanted of it.
+        finger: 0 left, 1 right.
     """
+    watchdog, current_max = settings.servos.watchdog, settings.safety.current_max
+    wanted = mode_number(settings.servos)
     number = _word(table, reg.MODEL_NUMBER)
     firmware = table[reg.FIRMWARE_VERSION]
     errors: list[str] = []
@@ -51,15 +66,13 @@ def check_servo(
         errors.append(f"{name}: is an {found}, not an {model.name}: set servos.model")
         return Findings(tuple(errors))
     mode = table[reg.OPERATING_MODE]
-    if reg.CURRENT_BASED_POSITION_MODE not in model.modes:
-        errors.append(
-            f"{name}: an {model.name} has no current-based position mode: use a model that senses "
-            "current"
-        )
-    elif mode != reg.CURRENT_BASED_POSITION_MODE:
+    unfit = check_model(model, wanted)
+    if unfit:
+        errors.append(f"{name}: {unfit}")
+    elif mode != wanted:
         errors.append(
             f"{name}: operating mode is {reg.MODE_NAMES.get(mode, str(mode))} ({mode}), not "
-            f"current-based position (5): {MEND}"
+            f"{reg.MODE_NAMES[wanted]} ({wanted}): {MEND}"
         )
     delay = table[reg.RETURN_DELAY_TIME]
     if delay > RETURN_DELAY_MAX:
@@ -87,13 +100,35 @@ def check_servo(
             "or later, or set servos.watchdog = 0"
         )
     limit = _word(table, reg.CURRENT_LIMIT) * model.current_unit
-    if model.senses_current and limit < current_max:
+    if wanted == reg.POSITION_MODE:
+        notices.append(f"{name}: in position mode nothing bounds its current")
+        errors += _check_range(name, model, table, settings, finger)
+    elif model.senses_current and limit < current_max:
         errors.append(
             f"{name}: current limit is {limit:.3f} A, below safety.current_max {current_max:g} A: "
             f"lower safety.current_max or raise the limit"
         )
     notices += _notices(name, model, table, firmware)
     return Findings(tuple(errors), tuple(notices))
+
+
+def _check_range(
+    name: str, model: ServoModel, table: bytes, settings: Settings, finger: int
+) -> list[str]:
+    """In position mode a goal beyond the servo's position limits is refused without a word."""
+    scale = JointScale.of(settings.servos, finger, model)
+    ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
+    wanted = sorted(scale.position_counts(q) for q in ends)
+    low, high = (
+        int.from_bytes(table[at : at + 4], "little", signed=True)
+        for at in (reg.MIN_POSITION_LIMIT, reg.MAX_POSITION_LIMIT)
+    )
+    if low <= wanted[0] and wanted[1] <= high:
+        return []
+    return [
+        f"{name}: position limits are {low} … {high}, the joint needs {wanted[0]} … {wanted[1]}: "
+        "widen the limits, or correct servos.zero, hand.q_min and hand.q_max"
+    ]
 
 
 def _notices(name: str, model: ServoModel, table: bytes, firmware: int) -> list[str]:

@@ -2,8 +2,9 @@
 
 Current, velocity, position and the alert bit of all servos come in one fast sync read (sync read
 where a firmware is older); goal current and goal position go in one sync write, side by side
-through indirect addresses, which live in RAM and are set whenever torque goes on. What a servo
-must be set to in EEPROM is checked and never changed here.
+through indirect addresses, which live in RAM and are set whenever torque goes on; in current and
+position mode there is one goal and no indirection. What a servo must be set to in EEPROM is checked
+and never changed here.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from daemon.clock import Clock
 from daemon.records import FINGERS, Goal, Reading
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
-from daemon.servos.checks import MEND, check_angle, check_latency, check_servo
+from daemon.servos.checks import check_angle, check_latency
+from daemon.servos.examine import examine, servo_name
 from daemon.servos.line import ServoLine
 from daemon.servos.models import ServoModel, by_name
+from daemon.servos.modes import current_toward, mode_number
 from daemon.servos.packets import GroupRead, PacketHandler
 from daemon.servos.port import PortGone, SerialPort
 from daemon.servos.units import JointScale
@@ -33,6 +36,8 @@ _log = logging.getLogger(__name__)
 
 _PRESENT = struct.Struct("<hii")  # current, velocity, position
 _GOAL = struct.Struct("<hi")  # current, position
+_CURRENT = struct.Struct("<h")
+_POSITION = struct.Struct("<i")
 _GOAL_BYTES = (
     reg.GOAL_CURRENT,
     reg.GOAL_CURRENT + 1,
@@ -41,7 +46,6 @@ _GOAL_BYTES = (
     reg.GOAL_POSITION + 2,
     reg.GOAL_POSITION + 3,
 )
-_CHECKED = reg.BACKUP_READY  # registers 0 … 146 are looked at
 
 
 class DynamixelServos:
@@ -55,8 +59,9 @@ class DynamixelServos:
         self.notices: tuple[str, ...] = ()
         self._clock = clock
         self._settings = servos
-        self._current_max = settings.safety.current_max
+        self._profile = settings
         self._hand = settings.hand
+        self._mode = mode_number(servos)
         self._fingers = [FINGERS.index(finger) for finger in settings.scene.fingers]
         self._ids = {finger: servos.ids[finger] for finger in self._fingers}
         self._handler = PacketHandler()
@@ -71,6 +76,9 @@ class DynamixelServos:
         self._goals: GroupSyncWrite | None = None
         self._scales: dict[int, JointScale] = {}
         self._bounds: dict[int, int] = {}  # greatest goal current in counts
+        self._ends: dict[int, tuple[int, int]] = {}  # position limits in counts
+        self._q = [0.0, 0.0]  # of the last good reading [rad, rad/s]
+        self._dq = [0.0, 0.0]
 
     # --- connect -----------------------------------------------------------------------------
 
@@ -101,29 +109,17 @@ class DynamixelServos:
         port = line.port
         latency = check_latency(port.port_name, port.latency_timer(), port.reply_timeout)
         errors, notices = list(latency.errors), list(latency.notices)
-        silent: list[int] = []
-        counts: dict[int, int] = {}
+        found = examine(line, self._profile, model)
+        silent = [each.finger for each in found if not each.answers]
         self._fast = True
-        for finger, servo_id in self._ids.items():
-            name = self._name(finger)
-            if line.ping(servo_id) is None:
-                silent.append(finger)
-                continue
-            table = line.read(servo_id, 0, _CHECKED)
-            if table is None:
-                errors.append(
-                    f"{name}: answers a ping but no read (status return level 0, or a bad line): "
-                    f"{MEND}"
-                )
-                continue
-            found = check_servo(name, model, table, self._settings.watchdog, self._current_max)
-            errors += found.errors
-            notices += found.notices
-            self._fast = self._fast and model.fast_read(table[reg.FIRMWARE_VERSION])
-            position = table[reg.PRESENT_POSITION : reg.PRESENT_POSITION + 4]
-            counts[finger] = int.from_bytes(position, "little", signed=True)
-            limit = int.from_bytes(table[reg.CURRENT_LIMIT : reg.CURRENT_LIMIT + 2], "little")
-            self._bounds[finger] = limit
+        for each in found:
+            errors += each.findings.errors
+            notices += each.findings.notices
+            if each.table:
+                self._fast = self._fast and model.fast_read(each.table[reg.FIRMWARE_VERSION])
+                self._bounds[each.finger] = each.word(reg.CURRENT_LIMIT)
+                ends = each.long(reg.MIN_POSITION_LIMIT), each.long(reg.MAX_POSITION_LIMIT)
+                self._ends[each.finger] = ends
         if silent and len(silent) == len(self._ids):
             raise ServoError(
                 f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
@@ -137,6 +133,7 @@ class DynamixelServos:
             )
         if errors:
             raise ServoError("\n".join(errors))
+        counts = {each.finger: each.position for each in found}
         notices += [f"{text}; torque is refused there" for text in self._strayed(counts) if text]
         self.notices = tuple(notices)
         for notice in notices:
@@ -183,8 +180,8 @@ class DynamixelServos:
         for finger, servo_id in self._ids.items():
             current, velocity, position = _PRESENT.unpack(present.data_dict[servo_id])
             scale = self._scales[finger]
-            reading.q[finger] = scale.angle(position)
-            reading.dq[finger] = scale.rate(velocity)
+            reading.q[finger] = self._q[finger] = scale.angle(position)
+            reading.dq[finger] = self._dq[finger] = scale.rate(velocity)
             reading.current[finger] = scale.amperes(current)
             if present.errors[servo_id] & 0x80:
                 alert |= 1 << finger
@@ -204,12 +201,22 @@ class DynamixelServos:
         if time.monotonic() - self._last_sent > self._quiet_limit:
             self._check_watchdog()
         for finger, servo_id in self._ids.items():
-            scale = self._scales[finger]
-            bound = min(scale.bound_counts(goal.current[finger]), self._bounds[finger])
-            position = scale.position_counts(goal.q[finger])
-            goals.changeParam(servo_id, _GOAL.pack(bound, position))
+            goals.changeParam(servo_id, self._packed(finger, goal.q[finger], goal.current[finger]))
         if goals.txPacket() == COMM_SUCCESS:
             self._last_sent = time.monotonic()
+
+    def _packed(self, finger: int, q: float, current: float) -> bytes:
+        """One servo's goal as its registers take it in this mode."""
+        scale = self._scales[finger]
+        if self._mode == reg.CURRENT_BASED_POSITION_MODE:
+            bound = min(scale.bound_counts(current), self._bounds[finger])
+            return _GOAL.pack(bound, scale.position_counts(q))
+        if self._mode == reg.POSITION_MODE:
+            low, high = self._ends[finger]
+            return _POSITION.pack(min(max(scale.position_counts(q), low), high))
+        bound = min(scale.bound_counts(current), self._bounds[finger])
+        wanted = current_toward(self._settings, q, current, self._q[finger], self._dq[finger])
+        return _CURRENT.pack(min(max(scale.current_counts(wanted), -bound), bound))
 
     # --- torque ------------------------------------------------------------------------------
 
@@ -237,13 +244,15 @@ class DynamixelServos:
         each = self._ids
         # Writing 0 ends a watchdog's stop, in which goals are read-only.
         self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, 0), "watchdog cleared")
-        self._map_goals(line)
-        self._store(reg.GOAL_CURRENT, "<h", dict.fromkeys(each, 0), "goal current")
+        self._choose_goals(line)
+        if self._mode != reg.POSITION_MODE:
+            self._store(reg.GOAL_CURRENT, "<h", dict.fromkeys(each, 0), "goal current")
         positions = self._positions(line)
         strayed = [text for text in self._strayed(positions) if text]
         if strayed:
             raise ServoError("\n".join(strayed))
-        self._store(reg.GOAL_POSITION, "<i", positions, "goal position")
+        if self._mode != reg.CURRENT_MODE:
+            self._store(reg.GOAL_POSITION, "<i", positions, "goal position")
         self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(each, 1), "torque on")
         self._quiet_limit = math.inf
         if self._settings.watchdog > 0.0:
@@ -254,7 +263,22 @@ class DynamixelServos:
         self._last_sent = time.monotonic()
         self._torque = True
 
-    def _map_goals(self, line: ServoLine) -> None:
+    def _choose_goals(self, line: ServoLine) -> None:
+        """The one sync write of a tick: goal current, goal position, or both side by side."""
+        if self._mode == reg.CURRENT_BASED_POSITION_MODE:
+            self._goals = self._map_goals(line)
+        elif self._mode == reg.CURRENT_MODE:
+            self._goals = self._group(line, reg.GOAL_CURRENT, _CURRENT.size)
+        else:
+            self._goals = self._group(line, reg.GOAL_POSITION, _POSITION.size)
+
+    def _group(self, line: ServoLine, address: int, size: int) -> GroupSyncWrite:
+        goals = GroupSyncWrite(line.port, self._handler, address, size)
+        for servo_id in self._ids.values():
+            goals.addParam(servo_id, bytes(size))
+        return goals
+
+    def _map_goals(self, line: ServoLine) -> GroupSyncWrite:
         """Put goal current and goal position side by side in the indirect data."""
         model = by_name(self._settings.model)
         starts = set()
@@ -272,9 +296,7 @@ class DynamixelServos:
         address, data = starts.pop()
         pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
         self._store_bytes(address, dict.fromkeys(self._ids, pointers), "indirect addresses")
-        self._goals = GroupSyncWrite(line.port, self._handler, data, _GOAL.size)
-        for servo_id in self._ids.values():
-            self._goals.addParam(servo_id, bytes(_GOAL.size))
+        return self._group(line, data, _GOAL.size)
 
     def _strayed(self, positions: dict[int, int]) -> list[str]:
         """What is wrong with the joints' angles; torque there would swing them back at once."""
@@ -332,7 +354,7 @@ class DynamixelServos:
         return self._line
 
     def _name(self, finger: int) -> str:
-        return f"servo {self._ids[finger]} ({FINGERS[finger]})"
+        return servo_name(self._ids[finger], finger)
 
     def _store(self, address: int, form: str, values: dict[int, int], what: str) -> None:
         packed = {finger: struct.pack(form, value) for finger, value in values.items()}

@@ -16,6 +16,7 @@ from daemon.servos.base import ServoError
 from daemon.servos.checks import RETURN_DELAY_MAX
 from daemon.servos.line import ServoLine
 from daemon.servos.models import by_name, by_number
+from daemon.servos.modes import mode_number
 from daemon.servos.packets import PacketHandler
 from daemon.servos.port import SerialPort
 from daemon.settings import Settings
@@ -43,24 +44,34 @@ class FoundServo:
 def scan(path: str, bauds: Iterable[int] = reg.BAUD_RATES, wait: float = 0.8) -> list[FoundServo]:
     """Every servo on the port, at each of the rates; ``wait`` s for each rate.
 
+    Rates that the adapter has not are passed over.
+
     Raises:
-        ServoError: the port can't be opened.
+        ServoError: the port can't be opened at any of them.
     """
     found: list[FoundServo] = []
     handler = PacketHandler()
+    opened, refusal = False, None
     for baud in bauds:
         port = SerialPort(path, baud, _PING_TIMEOUT)
-        port.openPort()
+        try:
+            port.openPort()
+        except ServoError as error:
+            refusal = refusal or error
+            continue
+        opened = True
         try:
             for servo_id, (number, firmware) in ServoLine(port, handler).ping_all(wait).items():
                 found.append(FoundServo(servo_id, baud, number, firmware))
         finally:
             port.closePort()
+    if refusal is not None and not opened:
+        raise refusal
     return found
 
 
 def mend(settings: Settings) -> list[str]:
-    """Set each servo of the scene up: mode 5, no return delay, status return level 2, no errors.
+    """Set each servo of the scene up: mode, no return delay, status return level 2, no errors.
 
     Returns one line for each thing that was done; none when all was well already. IDs and rates
     are left alone.
@@ -89,7 +100,9 @@ def mend(settings: Settings) -> list[str]:
             elif number != model.number:
                 problems.append(f"{title}: is not an {model.name}: set servos.model")
             else:
-                _mend_one(line, servo_id, title, model.modes, done, problems)
+                mode = mode_number(servos)
+                wanted = mode if mode in model.modes else None
+                _mend_one(line, servo_id, title, wanted, done, problems)
     finally:
         port.closePort()
     if problems:
@@ -101,7 +114,7 @@ def _mend_one(
     line: ServoLine,
     servo_id: int,
     title: str,
-    modes: tuple[int, ...],
+    mode: int | None,
     done: list[str],
     problems: list[str],
 ) -> None:
@@ -125,12 +138,9 @@ def _mend_one(
             return
         done.append(f"{title}: torque off, since EEPROM is locked while it is on")
     wanted = []
-    if reg.CURRENT_BASED_POSITION_MODE in modes:
-        mode = table[reg.OPERATING_MODE]
-        if mode != reg.CURRENT_BASED_POSITION_MODE:
-            wanted.append(
-                (reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, f"operating mode {mode}")
-            )
+    now = table[reg.OPERATING_MODE]
+    if mode is not None and now != mode:
+        wanted.append((reg.OPERATING_MODE, mode, f"operating mode {now}"))
     delay = table[reg.RETURN_DELAY_TIME]
     if delay > RETURN_DELAY_MAX:
         wanted.append((reg.RETURN_DELAY_TIME, 0, f"return delay {delay}"))

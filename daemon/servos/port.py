@@ -36,8 +36,12 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     the wire. One owner, one thread; the SDK's ``is_using`` flag stays False.
     """
 
-    def __init__(self, path: str, baud: int, reply_timeout: float) -> None:
+    def __init__(
+        self, path: str, baud: int, reply_timeout: float, low_latency: bool = True
+    ) -> None:
+        """``low_latency``: ask an adapter for its low-latency mode when the port is opened."""
         super().__init__(path)
+        self._low_latency = low_latency
         self.baudrate = baud
         self.reply_timeout = reply_timeout
         self.received = bytearray()  # bytes that came and were not yet taken as a packet
@@ -69,7 +73,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         self.is_open = True
         self._descriptor = self.ser.fileno()
         try:
-            self.ser.set_low_latency_mode(True)
+            if self._low_latency:
+                self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
             pass  # a pseudo-terminal or an adapter without that mode; latency_timer() tells
         self.received.clear()

@@ -6,11 +6,13 @@ import math
 
 from daemon.clock import Clock
 from daemon.records import FINGERS, Goal, Reading
+from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
+from daemon.servos.checks import check_model
 from daemon.servos.models import by_name
+from daemon.servos.modes import current_toward, mode_number
 from daemon.servos.units import JointScale
 from daemon.settings import Settings
-from daemon.simulation import layout
 from daemon.simulation.hand import SimulatedHand
 
 
@@ -23,6 +25,7 @@ class SimulatedServos:
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock) -> None:
         self._settings = settings
+        self._mode = mode_number(settings.servos)
         self._hand = hand
         self._clock = clock
         self._joints = sorted(FINGERS.index(name) for name in settings.scene.fingers)
@@ -33,6 +36,8 @@ class SimulatedServos:
         self._last = -math.inf
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
+        self._q = [0.0, 0.0]  # of the last reading [rad, rad/s]
+        self._dq = [0.0, 0.0]
         self._seq = 0
         self._trips = 0
 
@@ -42,11 +47,9 @@ class SimulatedServos:
             model = by_name(self._settings.servos.model)
         except KeyError as error:
             raise ServoError(f"servos.model: {error.args[0]}") from None
-        if layout.CURRENT_BASED_POSITION_MODE not in model.modes:
-            raise ServoError(
-                f"servos.model: {model.name} has no current-based position mode; "
-                "choose a model that senses current"
-            )
+        unfit = check_model(model, self._mode)
+        if unfit:
+            raise ServoError(f"servos.model: {unfit}")
         self._scales = [JointScale.of(self._settings.servos, joint, model) for joint in range(2)]
         self._connected = True
         self._exchange()
@@ -62,8 +65,8 @@ class SimulatedServos:
         q, dq, current = self._hand.q.tolist(), self._hand.dq.tolist(), self._hand.current.tolist()
         for joint in self._joints:
             scale = self._scales[joint]
-            reading.q[joint] = scale.angle(scale.position_counts(q[joint]))
-            reading.dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
+            reading.q[joint] = self._q[joint] = scale.angle(scale.position_counts(q[joint]))
+            reading.dq[joint] = self._dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
             reading.current[joint] = scale.amperes(scale.current_counts(current[joint]))
         self._seq += 1
         reading.seq = self._seq
@@ -90,9 +93,20 @@ class SimulatedServos:
         for joint in self._joints:
             scale = self._scales[joint]
             self._goal_q[joint] = scale.angle(scale.position_counts(goal.q[joint]))
-            counts = scale.bound_counts(goal.current[joint])
-            self._goal_current[joint] = counts * scale.current_unit
+            bound = scale.bound_counts(goal.current[joint])
+            if self._mode == reg.CURRENT_MODE:
+                self._goal_current[joint] = self._loop(joint, goal.q[joint], bound)
+            else:
+                self._goal_current[joint] = bound * scale.current_unit
         self._drive()
+
+    def _loop(self, joint: int, goal_q: float, bound: int) -> float:
+        """Current [A] of the daemon's own position loop, to the register's count."""
+        scale = self._scales[joint]
+        q, dq = self._q[joint], self._dq[joint]
+        current = current_toward(self._settings.servos, goal_q, bound * scale.current_unit, q, dq)
+        counts = min(max(scale.current_counts(current), -bound), bound)
+        return scale.amperes(counts)
 
     def counters(self) -> dict[str, int]:
         """``timeouts`` and ``crc`` stay 0; ``watchdog`` counts how often torque went off by it."""
@@ -126,7 +140,7 @@ class SimulatedServos:
         for joint in self._joints:
             self._hand.drive(
                 joint,
-                layout.CURRENT_BASED_POSITION_MODE,
+                self._mode,
                 self._torque,
                 self._goal_q[joint],
                 self._goal_current[joint],

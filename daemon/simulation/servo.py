@@ -45,8 +45,8 @@ _BACKUP_KEY = b"CTRL"
 class EmulatedServo:
     """A servo on joint ``joint`` of ``plant``, factory-new unless ``prepared``.
 
-    ``prepared`` brings it up as the backend wants it: current-based position mode where the model
-    has it, and no return delay. ``voltage`` and ``temperature`` may be set from outside, and
+    ``prepared`` brings it up as the backend wants it: in operating mode ``mode`` where the model
+    has it, and with no return delay. ``voltage`` and ``temperature`` may be set from outside, and
     ``silent`` makes it deaf and dumb.
     """
 
@@ -60,6 +60,7 @@ class EmulatedServo:
         *,
         firmware: int | None = None,
         prepared: bool = False,
+        mode: int = reg.CURRENT_BASED_POSITION_MODE,
         baud_index: int = 1,
         t: float = 0.0,
     ) -> None:
@@ -82,8 +83,8 @@ class EmulatedServo:
         self.table.set(reg.BAUD_RATE, baud_index)
         if prepared:
             self.table.set(reg.RETURN_DELAY_TIME, 0)
-            if reg.CURRENT_BASED_POSITION_MODE in model.modes:
-                self.table.set(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE)
+            if mode in model.modes:
+                self.table.set(reg.OPERATING_MODE, mode)
         self._start(t)
 
     # --- state that the bus asks for -------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from daemon.servos import registers as reg
 from daemon.servos.models import ServoModel, by_name
+from daemon.servos.modes import mode_number
 from daemon.servos.units import JointScale
 from daemon.settings import Settings
 from daemon.simulation import protocol
@@ -114,6 +115,7 @@ class ServoBus:
                 joint,
                 JointScale.of(settings.servos, joint, chosen),
                 prepared=prepared,
+                mode=mode_number(settings.servos),
                 baud_index=chosen.baud_rates.index(rate),
                 t=t,
             )

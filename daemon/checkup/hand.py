@@ -1,0 +1,169 @@
+"""The hand itself: each servo of the scene, asked without a change, and each board's frames."""
+
+from __future__ import annotations
+
+import time
+
+from daemon.checkup.result import Result, Status
+from daemon.clock import RealClock
+from daemon.records import FINGERS
+from daemon.servos import registers as reg
+from daemon.servos.base import ServoError
+from daemon.servos.checks import check_angle
+from daemon.servos.examine import Examined, examine
+from daemon.servos.line import ServoLine
+from daemon.servos.mend import FoundServo, scan
+from daemon.servos.models import ServoModel, by_name
+from daemon.servos.packets import PacketHandler
+from daemon.servos.port import SerialPort
+from daemon.servos.units import JointScale
+from daemon.settings import Settings
+from daemon.tactile import make_sensor
+from daemon.tactile.base import TactileError
+
+_PATIENCE = 0.05  # s for a reply: a factory-new servo behind a slow adapter answers within it
+_LISTEN = 0.5  # s of a board's frames
+_OFF_RATE = 0.1  # share of the rate by which a board may be off
+
+
+def check_servos(
+    settings: Settings, patience: float = _PATIENCE, wait: float = 0.8
+) -> list[Result]:
+    """Each servo of the scene; where one does not answer, what answers at every rate instead.
+
+    ``patience`` [s] is given to each reply, ``wait`` [s] to each rate that is searched.
+    """
+    servos = settings.servos
+    try:
+        model = by_name(servos.model)
+    except KeyError as error:
+        return [Result("FAIL", "servos.model", str(error.args[0]), "set servos.model")]
+    # The adapter's low-latency mode would be a change, so it is not asked for.
+    port = SerialPort(servos.port, servos.baud, patience, low_latency=False)
+    try:
+        port.openPort()
+        try:
+            found = examine(ServoLine(port, PacketHandler()), settings, model)
+        finally:
+            port.closePort()
+        results = [line for each in found for line in _judge(each, settings, model)]
+        if not all(each.answers for each in found):
+            results += _search(settings, wait)
+    except ServoError as error:
+        return [Result("FAIL", "servos", str(error))]
+    return results
+
+
+def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Result]:
+    name = servo.name
+    if not servo.answers:
+        return [
+            Result(
+                "FAIL",
+                name,
+                f"no answer at {settings.servos.baud} baud",
+                "check its power and cable, then see what was found below",
+            )
+        ]
+    results = [_result("FAIL", name, text) for text in servo.findings.errors]
+    results += [_result("warn", name, text) for text in servo.findings.notices]
+    if servo.table and not servo.findings.errors:
+        hand = settings.hand
+        low, high = hand.q_min[servo.finger], hand.q_max[servo.finger]
+        angle = JointScale.of(settings.servos, servo.finger, model).angle(servo.position)
+        strayed = check_angle(name, angle, low, high)
+        if strayed:
+            results.append(_result("FAIL", name, strayed))
+        else:
+            results.append(Result("pass", name, _described(servo, model)))
+    return results
+
+
+def _described(servo: Examined, model: ServoModel) -> str:
+    volts = servo.word(reg.PRESENT_INPUT_VOLTAGE) * reg.VOLTAGE_UNIT
+    mode = reg.MODE_NAMES[servo.table[reg.OPERATING_MODE]]
+    return (
+        f"{model.name}, firmware {servo.table[reg.FIRMWARE_VERSION]}, {mode} mode, {volts:.1f} V, "
+        f"{servo.table[reg.PRESENT_TEMPERATURE]} °C"
+    )
+
+
+def _result(status: Status, name: str, text: str) -> Result:
+    """A finding's line, ``what is wrong: what mends it`` behind the servo's name, taken apart."""
+    what, colon, mend = text.removeprefix(f"{name}: ").rpartition(": ")
+    if not colon:
+        return Result(status, name, mend)
+    return Result(status, name, what, mend.replace("`", ""))
+
+
+def _search(settings: Settings, wait: float) -> list[Result]:
+    """What answers on the port at any rate that the model has, told once for each servo."""
+    servos = settings.servos
+    found: dict[int, FoundServo] = {}
+    for servo in scan(servos.port, by_name(servos.model).baud_rates, wait):
+        if servo.id not in found or servo.baud == servos.baud:
+            found[servo.id] = servo
+    if not found:
+        return [
+            Result(
+                "FAIL",
+                "servos",
+                f"nothing answers on {servos.port} at any rate",
+                "check the bus's power and cable",
+            )
+        ]
+    wanted = [servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
+    lines = []
+    for servo in found.values():
+        if servo.baud == servos.baud and servo.id in wanted:
+            continue
+        what = f"ID {servo.id} at {servo.baud} baud: {servo.model}, firmware {servo.firmware}"
+        mend = (
+            f"set servos.baud = {servo.baud}" if servo.id in wanted else "set servos.ids as it is"
+        )
+        lines.append(Result("note", "found", what, mend))
+    return lines
+
+
+def check_boards(settings: Settings, listen: float = _LISTEN) -> list[Result]:
+    """Whether each board sends frames of the settings' grid at their rate; ``listen`` s each."""
+    return [_check_board(settings, FINGERS.index(name), listen) for name in settings.scene.fingers]
+
+
+def _check_board(settings: Settings, finger: int, listen: float) -> Result:
+    tactile = settings.tactile
+    name = f"tactile {FINGERS[finger]}"
+    sensor = make_sensor(settings, RealClock(), None, finger)
+    assert sensor is not None
+    try:
+        sensor.open()
+    except TactileError as error:
+        text = str(error)
+        mend = text.rpartition(": ")[2] if ": set " in text or ": move " in text else ""
+        return Result("FAIL", name, text, mend or "check tactile.port, its baud and its cable")
+    try:
+        before, start = sensor.counters(), time.monotonic()
+        time.sleep(listen)
+        after, spent = sensor.counters(), time.monotonic() - start
+    finally:
+        sensor.close()
+    frames = after["frames"] - before["frames"]
+    rate = frames / spent
+    grid = f"{tactile.rows} × {tactile.cols} cells"
+    lost = after.get("skipped_bytes", 0) - before.get("skipped_bytes", 0)
+    if lost:
+        return Result(
+            "warn",
+            name,
+            f"{grid}, {rate:.0f} frames a second, but {lost} bytes were damaged or lost",
+            "check its cable and what else loads the USB hub",
+        )
+    # One frame more or less falls into the time that was listened for.
+    if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
+        return Result(
+            "warn",
+            name,
+            f"{grid}, {rate:.0f} frames a second, not {tactile.rate:g}",
+            f"set tactile.rate = {rate:.0f}",
+        )
+    return Result("pass", name, f"{grid}, {rate:.0f} frames a second")

@@ -1,0 +1,117 @@
+"""``softfinger doctor``: is all well for the daemon? One line a check, and what mends it.
+
+Arguments, order, printing and exit status; the checks are :mod:`daemon.checkup`'s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from daemon.checkup.addresses import check_addresses
+from daemon.checkup.hand import check_boards, check_servos
+from daemon.checkup.kernels import check_kernels
+from daemon.checkup.machine import check_machine
+from daemon.checkup.mending import mend_kernels, mend_latency_timer, mend_servos
+from daemon.checkup.ports import check_latency_timer, check_port, note_ports
+from daemon.checkup.result import Result
+from daemon.records import FINGERS
+from daemon.settings import Settings, SettingsError, load
+from tools.run import cache_folder
+
+_EPILOG = """\
+exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
+can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
+servos get their operating mode, return delay and status return level and are rebooted after a
+hardware error (the hand lets go meanwhile), and kernels are compiled. Nothing is ever stiffened or
+moved."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``doctor``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    parser.add_argument(
+        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
+    )
+    parser.add_argument("--fix", action="store_true", help="mend what can be mended from here")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Check, print, and tell by the exit status."""
+    try:
+        settings = load(arguments.config, arguments.dir)
+    except SettingsError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(f"settings: {arguments.config or 'the built-in simulated hand'}")
+    counts = {"FAIL": 0, "warn": 0, "pass": 0}
+    for result in results(settings, arguments.fix):
+        counts[result.status] = counts.get(result.status, 0) + 1
+        print(f"{result.status:5}  {result.subject}: {result.text}", flush=True)
+        if result.mend:
+            print(f"       → {result.mend}", flush=True)
+    print(f"{counts['pass']} passed, {counts['warn']} warnings, {counts['FAIL']} failed")
+    return 1 if counts["FAIL"] else 0
+
+
+def results(settings: Settings, fix: bool) -> Iterator[Result]:
+    """All checks in the order of what needs what, with what was mended before them."""
+    ports = _ports(settings)
+    yield note_ports()
+    free = {}
+    for key, path in ports:
+        found = check_port(path, key)
+        free[path] = not found.failed
+        yield found
+        if free[path]:
+            yield from _latency(settings, path, fix)
+    yield from _servos(settings, free, fix)
+    tactile = settings.tactile
+    if tactile.backend == "none" or tactile.backend == "simulated":
+        yield Result("note", "tactile", f"{tactile.backend}: no board to ask")
+    elif all(free[path] for key, path in ports if key == "tactile.port"):
+        yield from check_boards(settings)
+    yield from check_machine()
+    if fix and any(result.status == "warn" for result in check_kernels(settings)):
+        yield mend_kernels(settings, cache_folder())
+    yield from check_kernels(settings)
+    yield from check_addresses(settings)
+
+
+def _ports(settings: Settings) -> list[tuple[str, str]]:
+    """(key, path) of every port that the scene needs."""
+    ports = []
+    if settings.servos.backend == "dynamixel":
+        ports.append(("servos.port", settings.servos.port))
+    if settings.tactile.backend not in ("simulated", "none"):
+        for name in settings.scene.fingers:
+            ports.append(("tactile.port", settings.tactile.port[FINGERS.index(name)]))
+    return ports
+
+
+def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Result]:
+    if fix:
+        mended = mend_latency_timer(path)
+        if mended is not None:
+            yield mended
+    servos = path == settings.servos.port
+    # A board sends by itself: the timer makes its frames late and none of them fail.
+    found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
+    if found is not None:
+        yield found
+
+
+def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Result]:
+    servos = settings.servos
+    if servos.backend != "dynamixel":
+        yield Result("note", "servos", f"{servos.backend}: no servo to ask")
+        return
+    if not free[servos.port]:
+        return
+    if fix:
+        yield from mend_servos(settings)
+    yield from check_servos(settings)

@@ -1,0 +1,61 @@
+"""``softfinger scan [PORT …]``: which servos answer, at which rate. It changes nothing in them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from daemon.checkup.ports import serial_ports
+from daemon.servos.base import ServoError
+from daemon.servos.mend import FoundServo, scan
+from daemon.servos.registers import BAUD_RATES
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``scan``."""
+    parser.epilog = "Exit status: 0 when a servo answered, 1 when none did or no port can be used."
+    parser.add_argument(
+        "ports", metavar="PORT", nargs="*", help="where to look; every serial port if none is named"
+    )
+    parser.add_argument(
+        "--baud",
+        type=int,
+        action="append",
+        metavar="N",
+        help="a rate to try, given as often as needed; all that servos have if none is named",
+    )
+    parser.add_argument(
+        "--wait",
+        type=float,
+        default=0.8,
+        metavar="S",
+        help="how long to listen at each rate (0.8: 253 servos at 1 Mbaud)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Scan, print a line for each servo, tell by the exit status whether there was one."""
+    paths = arguments.ports or [path for path, _ in serial_ports()]
+    if not paths:
+        print("scan: this machine has no serial port; name one", file=sys.stderr)
+        return 1
+    count = 0
+    for path in paths:
+        try:
+            found = scan(path, arguments.baud or BAUD_RATES, arguments.wait)
+        except ServoError as error:
+            print(f"scan: {error}", file=sys.stderr)
+            continue
+        for servo in found:
+            print(_line(path, servo), flush=True)
+        if not found:
+            print(f"{path}: no servo answers at any of these rates", flush=True)
+        count += len(found)
+    return 0 if count else 1
+
+
+def _line(path: str, servo: FoundServo) -> str:
+    return (
+        f"{path}: ID {servo.id} at {servo.baud} baud: {servo.model} (number {servo.number}), "
+        f"firmware {servo.firmware}"
+    )
