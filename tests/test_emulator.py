@@ -6,6 +6,7 @@ import contextlib
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -425,7 +426,7 @@ def test_time_leaves_interruptions_out(monkeypatch):
 
 def test_a_board_that_nobody_reads_disturbs_nothing(tmp_path):
     with thread(tmp_path) as made:
-        boards = made._boards
+        boards = list(made._boards.values())
         until(lambda: all(board.dropped > 20 for board in boards))
         servos = Servos(tmp_path)
         assert servos.ping(1) == 1020
@@ -435,3 +436,103 @@ def test_a_board_that_nobody_reads_disturbs_nothing(tmp_path):
         assert sensor.counters()["skipped_bytes"] < 2 * 1026
         sensor.close()
     assert not os.path.lexists(tmp_path / "servos")
+
+
+# The control socket.
+
+
+def test_faults_while_it_runs(tmp_path, capsys):
+    with thread(tmp_path):
+        servos = Servos(tmp_path)
+        assert tell(tmp_path, "silent=1 drop=1") == 0
+        assert (servos.ping(1), servos.ping(2)) == (None, None)
+        assert tell(tmp_path, "well") == 0
+        assert (servos.ping(1), servos.ping(2)) == (None, 1020)
+        assert tell(tmp_path, "answer=1") == 0
+        until(lambda: servos.ping(1) == 1020)
+        assert tell(tmp_path, "unplug plug@0.05") == 0
+        servos.close()
+        until((tmp_path / "servos").exists)
+        again = Servos(tmp_path)
+        assert again.ping(1) == 1020
+        again.close()
+        assert capsys.readouterr().err == ""
+        # One word that makes no sense, and none of them counts.
+        assert tell(tmp_path, "silent=2 sillent=2") == 1
+        assert "'sillent=2'" in capsys.readouterr().err
+        assert Servos(tmp_path).ping(2) == 1020
+
+
+def test_boards_go_and_come_back(tmp_path):
+    with thread(tmp_path):
+        left = board(tmp_path, 0)
+        left.open()
+        right = board(tmp_path, 1)
+        right.open()
+        assert tell(tmp_path, "left:unplug right:frozen") == 0
+        until(lambda: not left.latest().valid)
+        assert "gone" in left.error
+        left.close()
+        assert not (tmp_path / "tactile-left").exists()
+        until(lambda: no_change(right))
+        assert tell(tmp_path, "left:plug right:well") == 0
+        until((tmp_path / "tactile-left").exists)
+        left.open()
+        until(lambda: not no_change(right))
+        left.close()
+        right.close()
+
+
+def no_change(sensor: FlexiTac) -> bool:
+    """Whether three frames that follow each other are the same, which noise rules out."""
+    frames = [sensor.latest()]
+    while len(frames) < 3:
+        until(lambda: sensor.latest() is not frames[-1])
+        frames.append(sensor.latest())
+    return all(np.array_equal(frames[0].data, frame.data) for frame in frames)
+
+
+def test_nobody_to_tell(tmp_path, capsys):
+    assert tell(tmp_path, "unplug") == 1
+    assert "no emulator answers here" in capsys.readouterr().err
+    assert tell(tmp_path / "nowhere", "unplug") == 1
+
+
+def test_the_control_socket_survives_rude_clients_and_is_taken_away(tmp_path, monkeypatch):
+    folder = tmp_path / ("long" * 30)  # past what a socket's own path may have
+    folder.mkdir()
+    with thread(folder):
+        place = folder / "control"
+        assert place.is_socket()
+        monkeypatch.chdir(folder)
+        rude = [socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(12)]
+        for each in rude:
+            each.connect("control")
+        rude[-1].send(b"\xff\xfe\x00")
+        assert rude[-1].recv(999).startswith(b"error: ")
+        assert tell(folder, "drop=0") == 0
+        for each in rude:
+            each.close()
+        assert tell(folder, "x" * 4000) == 1
+    assert not place.exists()
+
+
+def test_something_else_in_the_control_sockets_place_is_left_alone(tmp_path):
+    (tmp_path / "control").write_text("mine")
+    with pytest.raises(EmulatorError, match="in the way"):
+        Emulator(Settings(), tmp_path)
+    assert (tmp_path / "control").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["control"]
+
+
+def tell(folder: Path, words: str) -> int:
+    return main(["emulate", "--dir", str(folder), "--send", words])
+
+
+def test_factory_new_servos(tmp_path):
+    with Process("--dir", tmp_path, "--factory", "--model", "XL330-M288").ready() as process:
+        servos = Servos(tmp_path)
+        assert servos.read(1, OPERATING_MODE, 1) == 3
+        assert servos.read(2, 9, 1) == 250
+        servos.close()
+        assert process.end() == (0, "", "")

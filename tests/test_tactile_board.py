@@ -194,12 +194,23 @@ def test_faults_in_words(text, kind, value, start):
 
 
 def test_faults_are_sorted_to_boards_and_servos():
-    faults = Faults(
-        ["silent=2@3", "silent", "left:torn=0.2", "right:frozen@1", "drop=0.1", "unplug@2"], (1, 2)
-    )
-    assert faults.boards[0] == [BoardFault("silent"), BoardFault("torn", 0.2)]
-    assert faults.boards[1] == [BoardFault("silent"), BoardFault("frozen", 1.0, 1.0)]
-    assert faults.servos == [(0.0, "drop=0.1"), (2.0, "unplug"), (3.0, "silent=2")]
+    words = ["silent=2@3", "silent", "left:torn=0.2", "right:frozen@1", "drop=0.1", "unplug@2"]
+    assert Faults(words, (1, 2)).events == [
+        (0.0, "left", BoardFault("silent")),
+        (0.0, "right", BoardFault("silent")),
+        (0.0, "left", BoardFault("torn", 0.2)),
+        (0.0, "servos", "drop=0.1"),
+        (1.0, "right", BoardFault("frozen", 1.0, 1.0)),
+        (2.0, "servos", "unplug"),
+        (3.0, "servos", "silent=2"),
+    ]
+    assert Faults(["well", "left:well@1", "right:plug"], (1, 2)).events == [
+        (0.0, "servos", "well"),
+        (0.0, "left", "well"),
+        (0.0, "right", "well"),
+        (0.0, "right", "plug"),
+        (1.0, "left", "well"),
+    ]
 
 
 @pytest.mark.parametrize(

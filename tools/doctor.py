@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from daemon.checkup.addresses import check_addresses
-from daemon.checkup.hand import check_boards, check_servos
+from daemon.checkup.hand import check_board, check_servos
 from daemon.checkup.kernels import check_kernels
 from daemon.checkup.machine import check_machine
 from daemon.checkup.mending import mend_kernels, mend_latency_timer, mend_servos
@@ -21,6 +21,7 @@ from daemon.records import FINGERS
 from daemon.settings import Settings, SettingsError, load
 from tools.run import cache_folder
 
+_PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board
 _EPILOG = """\
 exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
 can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
@@ -71,10 +72,13 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
             yield from _latency(settings, path, fix)
     yield from _servos(settings, free, fix)
     tactile = settings.tactile
-    if tactile.backend == "none" or tactile.backend == "simulated":
+    if tactile.backend in _PORTLESS:
         yield Result("note", "tactile", f"{tactile.backend}: no board to ask")
-    elif all(free[path] for key, path in ports if key == "tactile.port"):
-        yield from check_boards(settings)
+    else:
+        for name in settings.scene.fingers:
+            finger = FINGERS.index(name)
+            if free[tactile.port[finger]]:
+                yield check_board(settings, finger)
     yield from check_machine()
     if fix and any(result.status == "warn" for result in check_kernels(settings)):
         yield mend_kernels(settings, cache_folder())
@@ -87,7 +91,7 @@ def _ports(settings: Settings) -> list[tuple[str, str]]:
     ports = []
     if settings.servos.backend == "dynamixel":
         ports.append(("servos.port", settings.servos.port))
-    if settings.tactile.backend not in ("simulated", "none"):
+    if settings.tactile.backend not in _PORTLESS:
         for name in settings.scene.fingers:
             ports.append(("tactile.port", settings.tactile.port[FINGERS.index(name)]))
     return ports

@@ -17,8 +17,11 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
                    both boards, or one: left:silent, right:torn=0.2
   servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY
   servos           silent, answer, reboot, overheat, overload, undervoltage, recover =ID
-  servos' port     unplug, plug
+  ports            unplug, plug for the servos'; left:unplug, right:plug … for a board's
+  all well again   well for servo replies and boards, left:well for one board
   @SECONDS         when it starts; at once without
+
+softfinger emulate --dir DIR --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
 """
 
 
@@ -45,6 +48,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "0 answers at once and at any rate (default)",
     )
     parser.add_argument(
+        "--factory",
+        action="store_true",
+        help="servos as they leave the factory: position mode, 500 µs return delay",
+    )
+    parser.add_argument(
+        "--send",
+        metavar="WORDS",
+        help="tell the emulator that runs in DIR what goes wrong from now on, and end",
+    )
+    parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
     )
 
@@ -61,6 +74,8 @@ def _ids(text: str) -> tuple[int, ...]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Emulate until SIGINT or SIGTERM; 1 with one line when it can't be set up."""
+    if arguments.send is not None:
+        return _send(arguments.dir, arguments.send)
     try:
         settings = _settings(arguments)
     except SettingsError as error:
@@ -76,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             settings,
             arguments.dir,
             baud=arguments.baud,
+            prepared=not arguments.factory,
             faults=arguments.fault,
             table_cache=cache_folder(),
         )
@@ -94,6 +110,19 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         emulator.close()
     return 0
+
+
+def _send(folder: Path, words: str) -> int:
+    from daemon.simulation.control_port import NoEmulator, send_words
+
+    try:
+        reply = send_words(folder, words)
+    except NoEmulator as error:
+        reply = f"error: {error}"
+    if reply == "ok":
+        return 0
+    print(f"softfinger: {reply.removeprefix('error: ')}", file=sys.stderr)
+    return 1
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:

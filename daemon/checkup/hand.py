@@ -122,15 +122,11 @@ def _search(settings: Settings, wait: float) -> list[Result]:
             f"set servos.baud = {servo.baud}" if servo.id in wanted else "set servos.ids as it is"
         )
         lines.append(Result("note", "found", what, mend))
-    return lines
+    return lines or [Result("note", "found", "no other servo answers at any rate")]
 
 
-def check_boards(settings: Settings, listen: float = _LISTEN) -> list[Result]:
-    """Whether each board sends frames of the settings' grid at their rate; ``listen`` s each."""
-    return [_check_board(settings, FINGERS.index(name), listen) for name in settings.scene.fingers]
-
-
-def _check_board(settings: Settings, finger: int, listen: float) -> Result:
+def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Result:
+    """Whether a board sends frames of the settings' grid at their rate; ``listen`` s are heard."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     sensor = make_sensor(settings, RealClock(), None, finger)
@@ -138,9 +134,10 @@ def _check_board(settings: Settings, finger: int, listen: float) -> Result:
     try:
         sensor.open()
     except TactileError as error:
-        text = str(error)
-        mend = text.rpartition(": ")[2] if ": set " in text or ": move " in text else ""
-        return Result("FAIL", name, text, mend or "check tactile.port, its baud and its cable")
+        what, _, mend = str(error).rpartition(": ")
+        if mend.startswith(("set ", "move ")):
+            return Result("FAIL", name, what, mend)
+        return Result("FAIL", name, str(error), "check tactile.port, its baud and its cable")
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(listen)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import socket
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -17,13 +18,14 @@ from pathlib import Path
 from daemon.model import make_material, make_table
 from daemon.records import FINGERS
 from daemon.settings import Settings, TactileSettings
-from daemon.simulation.bus_faults import FaultError
-from daemon.simulation.fault_words import Faults
+from daemon.simulation.bus_faults import FaultError, ReplyFaults
+from daemon.simulation.control_port import ControlPort
+from daemon.simulation.fault_words import SERVOS, Event, Faults
 from daemon.simulation.hand import SimulatedHand
 from daemon.simulation.link_folder import FolderError, LinkFolder
 from daemon.simulation.pty_bus import PtyServoBus
 from daemon.simulation.servo_bus import ServoBus
-from daemon.simulation.tactile_board import ENCODERS, TactileBoard
+from daemon.simulation.tactile_board import ENCODERS, BoardFault, TactileBoard
 from daemon.tactile.simulated import SimulatedTactile
 
 _STEP = 0.002  # s, longest that the physics lags behind
@@ -83,12 +85,14 @@ class Emulator:
         folder: Path,
         *,
         baud: int = 0,
+        prepared: bool = True,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
-        ``baud`` 0: servos answer at once and at any rate. ``faults``: see :class:`Faults`.
+        ``baud`` 0: servos answer at once and at any rate. ``prepared`` False: servos as they leave
+        the factory but for their IDs and rate. ``faults``: see :class:`Faults`.
         ``table_cache``: a folder where the contact table is kept. Raises EmulatorError, and
         SettingsError when the settings' material is no stress-strain law.
         """
@@ -97,7 +101,7 @@ class Emulator:
         self._closers.append(self._close_wake)
         self._stopping = False
         try:
-            self._build(with_board(settings), folder, baud, faults, table_cache)
+            self._build(with_board(settings), folder, baud, prepared, faults, table_cache)
         except (FolderError, FaultError) as error:
             self.close()
             raise EmulatorError(str(error)) from None
@@ -110,21 +114,24 @@ class Emulator:
         settings: Settings,
         folder: Path,
         baud: int,
+        prepared: bool,
         words: Iterable[str],
         table_cache: Path | None,
     ) -> None:
-        faults = Faults(words, settings.servos.ids)
-        links = LinkFolder(folder)
+        self._ids = settings.servos.ids
+        self._events = Faults(words, self._ids).events
+        links = self._links = LinkFolder(folder)
         self._closers.append(links.close)
+        self._control = ControlPort(folder, self.tell)
+        self._closers.append(self._control.close)
         self.clock = EmulatorClock()
         table = make_table(settings, make_material(settings.material), table_cache)
         self.hand = SimulatedHand(settings, 0.0, table)
         self._servos: PtyServoBus | None = None
-        self._servo_faults = faults.servos
         if settings.servos.backend != "none":
-            self._servos = self._make_servos(settings, links, baud)
+            self._servos = self._make_servos(settings, links, baud, prepared)
             self._closers.append(self._servos.close)
-        self._boards: list[TactileBoard] = []
+        self._boards: dict[str, TactileBoard] = {}
         self._sources: list[SimulatedTactile] = []
         tactile = settings.tactile
         if tactile.backend != "none":
@@ -136,18 +143,19 @@ class Emulator:
                     ENCODERS[tactile.backend],
                     tactile.rate,
                     settings.simulation.tactile_delay,
-                    tuple(faults.boards[finger]),
-                    settings.simulation.seed + finger,
+                    seed=settings.simulation.seed + finger,
                 )
                 self._sources.append(source)
-                self._boards.append(board)
+                self._boards[FINGERS[finger]] = board
                 self._closers.append(board.close)
                 links.link(f"tactile-{FINGERS[finger]}", board.path)
         self._advance_due = 0.0
 
-    def _make_servos(self, settings: Settings, links: LinkFolder, baud: int) -> PtyServoBus:
+    def _make_servos(
+        self, settings: Settings, links: LinkFolder, baud: int, prepared: bool
+    ) -> PtyServoBus:
         try:
-            bus = ServoBus.from_settings(settings, self.hand, baud=baud)
+            bus = ServoBus.from_settings(settings, self.hand, baud=baud, prepared=prepared)
         except KeyError as error:
             raise EmulatorError(f"servos.model: {error.args[0]}") from None
         except ValueError as error:
@@ -181,10 +189,14 @@ class Emulator:
 
     def _turn(self) -> None:
         """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
-        servos, boards = self._servos, self._boards
+        servos, boards = self._servos, self._boards.values()
         t = self.clock.now()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
-        watched: list[int | TactileBoard] = [self._wake[0], *boards]
+        watched: list[int | TactileBoard | socket.socket] = [
+            self._wake[0],
+            *self._control.sockets(),
+            *[board for board in boards if board.plugged],
+        ]
         if servos is not None:
             due = min(due, servos.next_event(t))
             if servos.fileno() >= 0:
@@ -196,6 +208,9 @@ class Emulator:
         for board in boards:
             if board in ready:
                 board.hear()
+        asked = [each for each in ready if isinstance(each, socket.socket)]
+        if asked:
+            self._control.serve(asked)
         late = [board for board in boards if board.next_event() <= t]
         if late:
             self._advance(t)
@@ -204,23 +219,59 @@ class Emulator:
             self._advance(t)
 
     def _advance(self, t: float) -> None:
-        while self._servo_faults and self._servo_faults[0][0] <= t:
-            self._apply(self._servo_faults.pop(0)[1], t)
+        while self._events and self._events[0].after <= t:
+            self._apply(self._events.pop(0), t)
         if self._servos is not None:
             self._servos.bus.advance(t)
         else:
             self.hand.advance(t)
         self._advance_due = t + _STEP
 
-    def _apply(self, fault: str, t: float) -> None:
-        if self._servos is None:
+    def tell(self, text: str) -> str:
+        """Take words from the control socket; ``ok``, or ``error: `` and why none of them counts.
+
+        A time behind a word counts from now.
+        """
+        try:
+            fresh = Faults(text.split(), self._ids).events
+        except FaultError as error:
+            return f"error: {error}"
+        now = self.clock.now()
+        self._events += [event._replace(after=now + event.after) for event in fresh]
+        self._events.sort(key=lambda event: event.after)
+        self._advance_due = now  # so that what starts now does
+        return "ok"
+
+    def _apply(self, event: Event, t: float) -> None:
+        servos = self._servos
+        if event.part != SERVOS:
+            self._apply_to_board(event.part, event.what)
+        elif servos is None or isinstance(event.what, BoardFault):
             return
-        if fault == "unplug":
-            self._servos.unplug()
-        elif fault == "plug":
-            self._servos.plug()
+        elif event.what == "unplug":
+            servos.unplug()
+        elif event.what == "plug":
+            if servos.fileno() < 0:
+                servos.plug()
+        elif event.what == "well":
+            servos.bus.faults.rates = ReplyFaults()
         else:
-            self._servos.bus.fault(fault, t)
+            servos.bus.fault(event.what, t)
+
+    def _apply_to_board(self, side: str, what: str | BoardFault) -> None:
+        board = self._boards.get(side)
+        if board is None:
+            return
+        if isinstance(what, BoardFault):
+            board.fault(what)
+        elif what == "well":
+            board.recover()
+        elif what == "unplug":
+            self._links.unlink(f"tactile-{side}")
+            board.unplug()
+        elif not board.plugged:
+            board.plug()
+            self._links.link(f"tactile-{side}", board.path)
 
 
 def with_board(settings: Settings) -> Settings:

@@ -65,13 +65,17 @@ class LinkFolder:
         fresh.replace(place)
         self._links[place] = target
 
+    def unlink(self, name: str) -> None:
+        """Remove the link ``name``, unless it leads elsewhere by now."""
+        target = self._links.pop(self.path / name, "")
+        with contextlib.suppress(OSError):
+            if str((self.path / name).readlink()) == target:
+                (self.path / name).unlink()
+
     def close(self) -> None:
         """Remove what is ours: the links, unless they lead elsewhere by now, and the lock."""
-        for place, target in self._links.items():
-            with contextlib.suppress(OSError):
-                if str(place.readlink()) == target:
-                    place.unlink()
-        self._links.clear()
+        for place in list(self._links):
+            self.unlink(place.name)
         with contextlib.suppress(OSError):
             (self.path / _LOCK).unlink()
         with contextlib.suppress(OSError):

@@ -16,7 +16,7 @@ import re
 import termios
 import tty
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -169,15 +169,35 @@ class TactileBoard:
         self._encode = encode
         self._rate = rate
         self._delay = delay
-        self._faults = faults
+        self._faults = list(faults)
         self._random = np.random.default_rng(seed)
-        self._writer = FrameWriter()
+        self.plug()
         self._seq = -1
         self._start: float | None = None
         self._kept: NDArray[np.uint16] | None = None  # the image that a frozen board repeats
         self._due = -math.inf
-        self.path = self._writer.path
         self.sent = 0  # frames
+
+    def plug(self) -> None:
+        """Make the port (again), at a new ``path``."""
+        self._writer = FrameWriter()
+        self.path = self._writer.path
+        self.plugged = True
+
+    def unplug(self) -> None:
+        """Take the port away; a client reads an error. The board goes on."""
+        if self.plugged:
+            self._writer.close()
+        self.plugged = False
+
+    def fault(self, fault: BoardFault) -> None:
+        """Let this go wrong from now on, whatever its start, instead of an earlier one alike."""
+        kept = [each for each in self._faults if each.kind != fault.kind]
+        self._faults = [*kept, replace(fault, start=0.0)]
+
+    def recover(self) -> None:
+        """End all faults."""
+        self._faults = []
 
     @property
     def dropped(self) -> int:
@@ -190,7 +210,8 @@ class TactileBoard:
 
     def hear(self) -> None:
         """Take what the client wrote. A free-running board does nothing with it."""
-        self._writer.drain()
+        if self.plugged:
+            self._writer.drain()
 
     def next_event(self) -> float:
         """When :meth:`service` next has something to do [s]."""
@@ -198,7 +219,8 @@ class TactileBoard:
 
     def service(self, t: float) -> None:
         """Send the newest frame if a new one is due at time t [s]."""
-        self._writer.flush()
+        if self.plugged:
+            self._writer.flush()
         # The instant of a due frame itself may be rounded either way.
         self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
         self._due += self._delay
@@ -209,13 +231,15 @@ class TactileBoard:
         self._seq = frame.seq
         if self._start is None:
             self._start = t
+        if not self.plugged:
+            return
         data = self._spoil(frame.data, t - self._start)
         if data:
             self.sent += self._writer.send(data)
 
     def close(self) -> None:
         """Close the pty."""
-        self._writer.close()
+        self.unplug()
 
     def _spoil(self, counts: NDArray[np.uint16], age: float) -> bytes:
         faults = [fault for fault in self._faults if age >= fault.start]
