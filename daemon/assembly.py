@@ -94,7 +94,9 @@ class Daemon:
             sensor = make_sensor(settings, self.clock, self.hand, finger)
             if sensor is None:
                 continue
-            estimator = make_estimator(settings, self.material)
+            estimator = make_estimator(
+                settings, self.material, finger, getattr(sensor, "live", None)
+            )
             made.append(
                 FingerPerception(finger, sensor, estimator, self.table, tactile.pascal_per_count)
             )

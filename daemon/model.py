@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon.settings import MaterialLaw, Settings, SettingsError
 from kinematics.contact import Fingertip
@@ -40,22 +41,45 @@ def make_table(settings: Settings, material: Material, cache: Path | None) -> Co
     return ContactTable.load_or_build(cache, tip, material, tolerance=tolerance)
 
 
-def make_grid(settings: Settings) -> SensorGrid:
-    """The sensor's cells."""
+def make_grid(settings: Settings, finger: int = 0) -> SensorGrid:
+    """The sensor's cells under one finger."""
     tactile = settings.tactile
     return SensorGrid(
-        rows=tactile.rows, cols=tactile.cols, pitch=tactile.pitch, centre=tactile.centre
+        rows=tactile.rows,
+        cols=tactile.cols,
+        pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
+        centre=tactile.centre,
+        rotation=tactile.rotation[finger],
     )
 
 
-def make_estimator(settings: Settings, material: Material) -> ContactEstimator:
-    """An estimator of its own for each finger, since it starts from its last estimate."""
+def live_cells(settings: Settings, finger: int) -> NDArray[np.bool_]:
+    """The cells that the settings don't call dead, bool [rows, cols]."""
+    live = np.ones((settings.tactile.rows, settings.tactile.cols), np.bool_)
+    for row, col in settings.tactile.dead[finger]:
+        live[row, col] = False
+    return live
+
+
+def make_estimator(
+    settings: Settings,
+    material: Material,
+    finger: int = 0,
+    live: NDArray[np.bool_] | None = None,
+) -> ContactEstimator:
+    """An estimator of its own for each finger, since it starts from its last estimate.
+
+    ``live`` tells the cells that there are, beside the settings' dead ones.
+    """
+    alive = live_cells(settings, finger)
     return ContactEstimator(
         make_tip(settings),
         material,
-        make_grid(settings),
+        make_grid(settings, finger),
         noise=settings.tactile.noise,
         method=settings.estimator.method,
         free_gain=settings.estimator.free_gain,
+        live=alive if live is None else alive & live,
         saturation=settings.tactile.full_count,
+        threshold=settings.tactile.threshold,
     )

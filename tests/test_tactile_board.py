@@ -10,8 +10,9 @@ import pytest
 
 from daemon.records import Frame
 from daemon.simulation.bus_faults import FaultError
+from daemon.simulation.encoders import ENCODERS, encode_flexitac
 from daemon.simulation.fault_words import Faults
-from daemon.simulation.tactile_board import BoardFault, FrameWriter, TactileBoard, encode_flexitac
+from daemon.simulation.tactile_board import BoardFault, FrameWriter, TactileBoard
 from daemon.tactile.flexitac import FlexiTacDecoder
 
 ROWS, COLS = 8, 6
@@ -58,7 +59,7 @@ class Client:
 
 def board(source: Source, *faults: str, rate: float = 100.0, delay: float = 0.01) -> TactileBoard:
     parsed = tuple(BoardFault.parse(fault) for fault in faults)
-    return TactileBoard(source, encode_flexitac, rate, delay, parsed, seed=4)
+    return TactileBoard(source, ENCODERS["flexitac"], rate, delay, parsed, seed=4)
 
 
 def stream(*faults: str, frames: int = 40) -> tuple[list[bytes], TactileBoard]:

@@ -20,12 +20,13 @@ from daemon.records import FINGERS
 from daemon.settings import Settings, TactileSettings
 from daemon.simulation.bus_faults import FaultError, ReplyFaults
 from daemon.simulation.control_port import ControlPort
+from daemon.simulation.encoders import ENCODERS
 from daemon.simulation.fault_words import SERVOS, Event, Faults
 from daemon.simulation.hand import SimulatedHand
 from daemon.simulation.link_folder import FolderError, LinkFolder
 from daemon.simulation.pty_bus import PtyServoBus
 from daemon.simulation.servo_bus import ServoBus
-from daemon.simulation.tactile_board import ENCODERS, BoardFault, TactileBoard
+from daemon.simulation.tactile_board import BoardFault, TactileBoard
 from daemon.tactile.simulated import SimulatedTactile
 
 _STEP = 0.002  # s, longest that the physics lags behind

@@ -58,8 +58,9 @@ class SensorModel:
     """A pressure sensor under one simulated tip.
 
     ``noise`` [Pa] is a cell's standard deviation, ``gain_spread`` that of the cells' sensitivities
-    round 1, ``dead`` the cells (row, col) that always read 0, ``bits`` the converter's. Two models
-    of equal arguments give equal frames. Raises ValueError for arguments out of their range.
+    round 1, ``dead`` the cells (row, col) that always read 0, ``bits`` the converter's, and
+    ``threshold`` the smallest count that is sent: below it goes 0. Two models of equal arguments
+    give equal frames. Raises ValueError for arguments out of their range.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class SensorModel:
         gain: float = 1.0,
         gain_spread: float = 0.0,
         dead: Sequence[tuple[int, int]] = (),
+        threshold: int = 0,
     ) -> None:
         if not 1 <= bits <= 16:
             raise ValueError(f"bits must be 1 … 16, got {bits}")
@@ -90,6 +92,7 @@ class SensorModel:
         self._generator = np.random.Generator(np.random.SFC64(seed))
         self._noise = noise / pascal_per_count
         self._full = 2**bits - 1
+        self._threshold = threshold
         spread = self._generator.standard_normal(grid.shape)
         self._sensitivity = gain * np.maximum(1.0 + gain_spread * spread, 0.0) / pascal_per_count
         for row, col in dead:
@@ -123,3 +126,5 @@ class SensorModel:
             self._scratch,
             out,
         )
+        if self._threshold > 0:
+            out[out < self._threshold] = 0

@@ -1,8 +1,7 @@
 """An emulated tactile board: the simulated sensor's frames, in a board's framing, on a pty.
 
-Framings plug in as encoders, pure functions from counts to bytes; they share no code with the
-decoders, so that one tested against the other means something. The faults that a board may have
-are applied here too.
+Framings plug in as encoders (encoders.py), pure functions from counts to bytes. The faults that a
+board may have are applied here too.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import os
 import re
 import termios
 import tty
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -24,21 +22,12 @@ from numpy.typing import NDArray
 
 from daemon.records import Frame
 from daemon.simulation.bus_faults import FaultError
-
-Encoder = Callable[[NDArray[np.uint16]], bytes]
+from daemon.simulation.encoders import Encoder
 
 _TTY_ROOM = 2048  # bytes; a tty reports at most 4095 unread ones, so more is never asked for
 _DRAIN = 4096
 _RETRY = 5e-4  # s until a frame that is late is asked for again
 _NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
-
-
-def encode_flexitac(counts: NDArray[np.uint16]) -> bytes:
-    """``AA 55``, then one byte a cell, row-major; counts above 255 saturate."""
-    return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
-
-
-ENCODERS: dict[str, Encoder] = {"flexitac": encode_flexitac}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +142,15 @@ class FrameWriter:
 
 
 class TactileBoard:
-    """Sends each new frame of ``source`` on a pty, in one framing, with the faults asked for."""
+    """Sends each new frame of ``source`` on a pty, in one framing, with the faults asked for.
+
+    A board that is asked for its frames sends the next one that comes after it was asked.
+    """
 
     def __init__(
         self,
         source: FrameSource,
-        encode: Encoder,
+        encoder: Encoder,
         rate: float,
         delay: float,
         faults: tuple[BoardFault, ...] = (),
@@ -166,7 +158,8 @@ class TactileBoard:
     ) -> None:
         """Frames are due at k/rate + delay [Hz, s]; ``seed`` drives the faults' chance."""
         self._source = source
-        self._encode = encode
+        self._encoder = encoder
+        self._asked = not encoder.request
         self._rate = rate
         self._delay = delay
         self._faults = list(faults)
@@ -209,9 +202,10 @@ class TactileBoard:
         return self._writer.fileno()
 
     def hear(self) -> None:
-        """Take what the client wrote. A free-running board does nothing with it."""
-        if self.plugged:
-            self._writer.drain()
+        """Take what the client wrote: requests, where the board waits for them."""
+        written = self._writer.drain() if self.plugged else b""
+        if self._encoder.request and self._encoder.request in written:
+            self._asked = True
 
     def next_event(self) -> float:
         """When :meth:`service` next has something to do [s]."""
@@ -231,17 +225,19 @@ class TactileBoard:
         self._seq = frame.seq
         if self._start is None:
             self._start = t
-        if not self.plugged:
+        if not self._asked or not self.plugged:
             return
-        data = self._spoil(frame.data, t - self._start)
+        data = self._spoil(frame, t - self._start)
         if data:
+            self._asked = not self._encoder.request
             self.sent += self._writer.send(data)
 
     def close(self) -> None:
         """Close the pty."""
         self.unplug()
 
-    def _spoil(self, counts: NDArray[np.uint16], age: float) -> bytes:
+    def _spoil(self, frame: Frame, age: float) -> bytes:
+        counts = frame.data
         faults = [fault for fault in self._faults if age >= fault.start]
         kinds = {fault.kind for fault in faults}
         if "silent" in kinds:
@@ -251,7 +247,7 @@ class TactileBoard:
         self._kept = counts
         if "wrong-size" in kinds:
             counts = counts[: counts.shape[0] // 2, : counts.shape[1] // 2]
-        data = self._encode(counts)
+        data = self._encoder.encode(counts, frame.seq, frame.t_sample)
         for fault in faults:
             if fault.kind == "torn" and self._random.random() < fault.value:
                 left, right = sorted(self._random.integers(0, len(data) + 1, 2).tolist())

@@ -26,4 +26,16 @@ def make_sensor(
         from daemon.tactile.flexitac import FlexiTac
 
         return FlexiTac(settings.tactile, clock, finger)
+    if backend == "glove":
+        from daemon.tactile.glove import Glove
+
+        return Glove(settings.tactile, clock, finger)
+    if backend == "cobs":
+        from daemon.tactile.cobs import Cobs
+
+        return Cobs(settings.tactile, clock, finger)
+    if backend == "replay":
+        from daemon.tactile.replay import ReplayTactile
+
+        return ReplayTactile(settings.tactile, clock, finger)
     return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import select
 import threading
@@ -35,12 +36,14 @@ class Decoded:
 
     data: NDArray[np.uint16]
     t: float
+    steps: int = 1  # frames since the last one by the board's own number
+    t_sensor: float | None = None  # the board's clock at the middle of the scan [s]
 
 
 class Decoder(Protocol):
     """A framing: bytes in, frames out. Pure: no port, no clock, no thread.
 
-    ``frame_bytes`` is a frame's length on the wire.
+    ``frame_bytes`` is a frame's length on the wire; the last one's where lengths vary.
     """
 
     frame_bytes: int
@@ -70,12 +73,40 @@ class Decoder(Protocol):
         """What is wrong with a stream that gives no frames, in one line."""
 
 
+class SensorClock:
+    """From a board's clock to ours: frames are late by varying times, never early.
+
+    So the least delay of late tells the offset, and t_sample doesn't jitter with the port. The
+    offset may rise by 200 ppm, more than two quartzes differ; a board that started anew is seen by
+    a jump of more than a second.
+    """
+
+    _DRIFT = 2e-4
+    _JUMP = 1.0  # s
+
+    def __init__(self) -> None:
+        self._offset = 0.0
+        self._t = -math.inf
+
+    def arrival(self, t_sensor: float, t: float) -> float:
+        """When the frame of ``t_sensor`` [s], read at ``t`` [s], would have come undelayed [s]."""
+        offset = t - t_sensor
+        risen = self._offset + self._DRIFT * (t - self._t)
+        self._offset = offset if abs(offset - risen) > self._JUMP else min(offset, risen)
+        self._t = t
+        return t_sensor + self._offset
+
+
 class SerialReader:
     """Reads one port in a thread of its own. The whole of a backend but for its framing.
 
     Times: a frame's ``t_arrival`` is when its last byte was read. ``t_sample`` is the middle of the
     board's scan as well as it can be known: ``t_arrival`` less the time the frame's bytes take on
-    the wire, less ``latency`` [s], from the middle of the scan to the frame's first byte.
+    the wire, less ``latency`` [s], from the middle of the scan to the frame's first byte. Where
+    frames carry the board's time, the least delayed of late ones stands for ``t_arrival`` in it.
+
+    A board that must be asked is asked with ``request`` at first, after each frame, and again when
+    none came for ``patience`` [s] longer than its bytes take.
 
     ``latest`` may be called from any thread. Its frame's array is fresh for each frame and is never
     written again. When the port is gone, or the stream can't be read any more, one last frame with
@@ -91,6 +122,8 @@ class SerialReader:
         latency: float,
         open_timeout: float,
         settle: float = 5e-4,
+        request: bytes = b"",
+        patience: float = 0.1,
     ) -> None:
         """``settle`` [s]: how long the line must be quiet to be taken for a gap between frames."""
         self._path = port
@@ -100,7 +133,10 @@ class SerialReader:
         self._clock = clock
         self._settle = settle
         self._byte_time = BITS_PER_BYTE / baud
-        self._age = self._decoder.frame_bytes * self._byte_time + latency
+        self._latency = latency
+        self._request = request
+        self._patience = patience
+        self._sensor_clock = SensorClock()
         self._open_timeout = open_timeout
         self._latest: Frame | None = None
         self._seq = 0
@@ -117,6 +153,7 @@ class SerialReader:
         if self._port is not None:
             raise TactileError(f"{self._path}: is open already")
         self._decoder = self._make_decoder()
+        self._sensor_clock = SensorClock()
         self._latest, self._bytes = None, 0
         self._error, self._gone = "", False
         self._event.clear()
@@ -181,15 +218,16 @@ class SerialReader:
     def _run(self, port: int, stop: int) -> None:
         """The thread: waits in the kernel, wakes once or twice a frame."""
         decoder = self._decoder
-        timeout = None
+        timeout = self._ask(port)
         while True:
             ready, _, _ = select.select((port, stop), (), (), timeout)
             if stop in ready:
                 return None
-            timeout = None
             if not ready:
                 self._hand_over(decoder.settle())
+                timeout = self._ask(port)
                 continue
+            timeout = None
             try:
                 data = os.read(port, _CHUNK)
             except BlockingIOError:
@@ -199,7 +237,10 @@ class SerialReader:
             if not data:
                 return self._end("the port is gone (it reports data and has none)")
             self._bytes += len(data)
-            self._hand_over(decoder.feed(data, self._clock.now()))
+            decoded = decoder.feed(data, self._clock.now())
+            self._hand_over(decoded)
+            if self._request:
+                timeout = self._wait if decoded is None else self._ask(port)
             if decoder.lost and not self._error:
                 self._invalidate(decoder.diagnosis())
             if decoder.pending:
@@ -212,11 +253,27 @@ class SerialReader:
             ):
                 return None
 
+    @property
+    def _wait(self) -> float:
+        return self._decoder.frame_bytes * self._byte_time + self._patience
+
+    def _ask(self, port: int) -> float | None:
+        """Ask for a frame where the board wants that; how long to wait for it [s]."""
+        if not self._request:
+            return None
+        with contextlib.suppress(OSError):  # a port that is gone tells so when it is read
+            os.write(port, self._request)
+        return self._wait
+
     def _hand_over(self, decoded: Decoded | None) -> None:
         if decoded is None:
             return
-        self._seq += 1
-        self._latest = Frame(self._seq, decoded.t - self._age, decoded.t, True, decoded.data)
+        self._seq += decoded.steps
+        whole = decoded.t
+        if decoded.t_sensor is not None:
+            whole = self._sensor_clock.arrival(decoded.t_sensor, decoded.t)
+        sampled = whole - self._decoder.frame_bytes * self._byte_time - self._latency
+        self._latest = Frame(self._seq, sampled, decoded.t, True, decoded.data)
         self._error = ""
         self._event.set()
 

@@ -33,13 +33,15 @@ class SimulatedTactile:
         self._slack = 1e-9
         self._shape = (settings.tactile.rows, settings.tactile.cols)
         self._model = SensorModel(
-            make_grid(settings),
+            make_grid(settings, finger),
             make_tip(settings),
             make_material(settings.material),
             settings.tactile.pascal_per_count,
             noise=settings.simulation.tactile_noise,
             seed=(settings.simulation.seed, finger),
             gain=settings.simulation.modulus_scale,
+            dead=settings.tactile.dead[finger],
+            threshold=settings.tactile.threshold,
         )
         self._newest = -1
         self._frame: Frame | None = None

@@ -1,0 +1,50 @@
+"""Framings of emulated tactile boards: counts → bytes, as a board's firmware would send them.
+
+They share no code with the decoders, so that one tested against the other means something. (The
+reference encoder of our own framing, which the documentation of that framing is, serves here too.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.tactile import cobs
+
+# counts [rows, cols], the scan's number, the board's time [s] → bytes
+Encode = Callable[[NDArray[np.uint16], int, float], bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder:
+    """A framing, and the byte that a board waits for before each frame; empty when it runs free."""
+
+    encode: Encode
+    request: bytes = b""
+
+
+def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
+    """``AA 55``, then one byte a cell, row-major; counts above 255 saturate."""
+    return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
+
+
+def encode_glove(counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0) -> bytes:
+    """Number + 11, each count's high and low five bits + 11, newline; counts over 1023 saturate."""
+    counts = np.minimum(counts, 1023)
+    halves = np.stack([counts // 32 + 11, counts % 32 + 11], axis=-1)
+    return bytes((11 + number % 245,)) + halves.astype(np.uint8).tobytes() + b"\n"
+
+
+def encode_cobs(counts: NDArray[np.uint16], number: int = 0, t: float = 0.0) -> bytes:
+    """Our own framing with uint16 counts, see :mod:`daemon.tactile.cobs`."""
+    return cobs.encode(counts, number, t)
+
+
+ENCODERS = {
+    "flexitac": Encoder(encode_flexitac),
+    "glove": Encoder(encode_glove, b"a"),
+    "cobs": Encoder(encode_cobs),
+}

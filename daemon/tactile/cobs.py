@@ -1,0 +1,166 @@
+"""Our framing for do-it-yourself boards and 44 × 44 sensors, and the backend that reads one.
+
+What a board's firmware has to do, at any baud (USB boards may ignore it), for each scan, unasked:
+
+1. Build the message, all numbers little-endian:
+
+   ======  ====== =====================================================================
+   offset  type   what
+   ======  ====== =====================================================================
+   0       uint8  bytes a count: 1 (uint8 counts) or 2 (uint16 counts)
+   1       uint8  0, kept for later
+   2       uint16 sequence number: one more each scan, 0 after 65535, also for scans not sent
+   4       uint32 the board's clock at the middle of the scan [µs]; wraps at 2³²
+   8       uint16 rows
+   10      uint16 cols
+   12      …      rows × cols counts, row after row
+   ======  ====== =====================================================================
+
+2. Append the CRC-16 of all of it, low byte first: polynomial 0x1021, start 0xFFFF, highest bit
+   first, no inversion (CRC-16/IBM-3740, also called CCITT-FALSE; "123456789" gives 0x29B1)::
+
+       crc = 0xFFFF
+       for each byte:  crc ^= byte << 8
+                       eight times:  crc = (crc << 1) ^ (crc & 0x8000 ? 0x1021 : 0)   in 16 bits
+
+3. Stuff it with COBS, which leaves no zero byte: cut the message at its zero bytes (drop those);
+   write each piece as one byte, its length + 1, and then the piece. A piece of 254 bytes or more
+   goes out in blocks of 254 with the byte 255 before each; the rest of it, which may be empty,
+   follows as a piece of its own, unless the message ends right behind a block of 254.
+
+4. Send a zero byte. One more before the first frame does no harm.
+
+A 44 × 44 frame of uint16 is 3903 bytes on the wire at most. `encode` is the reference. A reader
+that comes in the middle is in step at the next zero byte; a torn or flipped frame is dropped (the
+CRC sees every error of up to 16 adjacent bits, and all but 1 in 65536 of the others); frames that
+never came are told by the sequence number.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.clock import Clock
+from daemon.settings import TactileSettings
+from daemon.tactile.cobs_packet import BAD_CRC, CRC_START, crc_tables, unpack
+from daemon.tactile.delimited import DelimitedDecoder
+from daemon.tactile.serial_reader import Decoded, SerialReader
+
+_HEADER = struct.Struct("<BBHIHH")
+_CRC = 2
+_TICK = 1e-6  # s of the board's clock
+_BLOCK = 254
+
+
+def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
+    """One frame on the wire: counts [rows, cols], its number, the board's time ``t`` [s].
+
+    The reference for firmware. Raises ValueError for other types of counts.
+    """
+    if counts.dtype not in (np.uint8, np.uint16) or counts.ndim != 2:
+        raise ValueError(f"counts must be uint8 or uint16 [rows, cols], got {counts.dtype}")
+    ticks = round(t / _TICK) & 0xFFFFFFFF
+    kind = counts.dtype.itemsize
+    message = _HEADER.pack(kind, 0, seq & 0xFFFF, ticks, *counts.shape)
+    message += counts.astype(f"<u{kind}").tobytes()
+    message += binascii.crc_hqx(message, CRC_START).to_bytes(_CRC, "little")
+    parts = []
+    pieces = message.split(b"\0")
+    for number, piece in enumerate(pieces):
+        while len(piece) >= _BLOCK:
+            parts.append(b"\xff" + piece[:_BLOCK])
+            piece = piece[_BLOCK:]
+            if not piece and number == len(pieces) - 1:
+                break
+        else:
+            parts.append(bytes((len(piece) + 1,)) + piece)
+    return b"".join(parts) + b"\0"
+
+
+def longest_frame(rows: int, cols: int) -> int:
+    """Bytes on the wire of a uint16 frame at most, with the delimiter."""
+    message = _HEADER.size + 2 * rows * cols + _CRC
+    return message + 1 + message // _BLOCK + 1
+
+
+class CobsDecoder(DelimitedDecoder):
+    """Bytes of a COBS stream in, frames of counts with number and board's time out."""
+
+    def __init__(self, rows: int, cols: int) -> None:
+        super().__init__(rows, cols, 0, longest_frame(rows, cols))
+        self._tables = crc_tables()
+        self._scratch = np.zeros(self.longest, np.uint8)
+        self._reason = ""
+        self._bad_crc = 0
+        self._missed = 0
+        self._seq: int | None = None
+        self._steps = 1
+        self._ticks = 0
+        self._turns = 0  # of the board's clock
+
+    def parse(self, packet: bytearray) -> NDArray[np.uint16] | None:
+        """As :meth:`DelimitedDecoder.parse`."""
+        if len(packet) >= self.longest:
+            self._reason = f"packets of {len(packet)} bytes"
+            return None
+        size = unpack(np.frombuffer(packet, np.uint8), self._tables, self._scratch)
+        if size < _HEADER.size:
+            self._bad_crc += size == BAD_CRC
+            self._reason = "packets whose CRC is wrong" if size == BAD_CRC else "packets not COBS"
+            return None
+        kind, kept, seq, ticks, rows, cols = _HEADER.unpack_from(self._scratch.data)
+        if kind not in (1, 2) or kept != 0:
+            self._reason = f"packets of kind {kind}.{kept}, which this version doesn't know"
+            return None
+        if (rows, cols) != (self.rows, self.cols) or size != _HEADER.size + kind * rows * cols:
+            self._reason = f"frames of {rows} × {cols} cells in {size} bytes"
+            return None
+        self._steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
+        if self._steps > 32768:  # it went back: the board started anew
+            self._steps = 1
+        self._missed += self._steps - 1
+        self._seq = seq
+        # The clock wrapped, or the board started anew, which its reader notices.
+        self._turns += ticks < self._ticks
+        self._ticks = ticks
+        raw = self._scratch[_HEADER.size : size]
+        counts = raw if kind == 1 else raw.view("<u2")
+        return counts.astype(np.uint16).reshape(rows, cols)
+
+    def decoded(self, counts: NDArray[np.uint16], t: float) -> Decoded:
+        """As :meth:`DelimitedDecoder.decoded`, with the board's own number and time."""
+        t_sensor = (self._turns * 2.0**32 + self._ticks) * _TICK
+        return Decoded(counts, t, self._steps, t_sensor)
+
+    def reason(self) -> str:
+        """As :meth:`DelimitedDecoder.reason`."""
+        return self._reason
+
+    def counters(self) -> dict[str, int]:
+        """Besides the usual ones ``bad_crc``, and ``missed``: frames that never came."""
+        return {**super().counters(), "bad_crc": self._bad_crc, "missed": self._missed}
+
+
+class Cobs(SerialReader):
+    """A board with our framing under one fingertip."""
+
+    def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
+        """``finger`` 0 is the left one; it chooses the port."""
+
+        def make_decoder() -> CobsDecoder:
+            return CobsDecoder(settings.rows, settings.cols)
+
+        make_decoder()  # compiled here, and not when the first frame comes
+        unpack(np.frombuffer(bytearray(8), np.uint8), crc_tables(), np.zeros(8, np.uint8))
+        super().__init__(
+            settings.port[finger],
+            settings.baud,
+            make_decoder,
+            clock,
+            latency=settings.latency,
+            open_timeout=settings.open_timeout,
+        )

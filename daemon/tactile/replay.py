@@ -1,0 +1,96 @@
+"""A recording in the place of the sensor under one tip. Works with the virtual clock; no thread."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.clock import Clock
+from daemon.records import FINGERS, Frame
+from daemon.settings import TactileSettings
+from daemon.tactile.base import TactileError
+from daemon.tactile.recording import Recording, RecordingError, load_recording
+
+
+class ReplayTactile:
+    """Frames of a recording at its own times, counted from ``open``.
+
+    At its end it starts again, one mean interval after the last frame, or, with
+    ``tactile.replay_again`` false, hands the last frame over once more with ``valid`` False.
+    ``live`` [rows, cols] are the cells that the recording has.
+    """
+
+    def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
+        """Raises TactileError when the recording can't be read or has another grid."""
+        path = settings.recording[finger]
+        if not path:
+            raise TactileError(f"tactile.recording: found none for the {FINGERS[finger]} finger")
+        try:
+            recording = load_recording(Path(path), settings.pascal_per_count, settings.rate)
+        except RecordingError as error:
+            raise TactileError(str(error)) from None
+        if recording.counts.shape[1:] != (settings.rows, settings.cols):
+            rows, cols = recording.counts.shape[1:]
+            raise TactileError(
+                f"{path}: frames of {rows} × {cols} cells, {settings.rows} × {settings.cols} "
+                f"expected: set tactile.rows and tactile.cols"
+            )
+        self.live: NDArray[np.bool_] = recording.live
+        self._recording: Recording = recording
+        self._again = settings.replay_again
+        self._clock = clock
+        self._latency = settings.latency
+        self._times: list[float] = recording.t.tolist()
+        count = len(self._times)
+        interval = self._times[-1] / (count - 1) if count > 1 else 1.0 / settings.rate
+        self._period = self._times[-1] + interval
+        self._start = 0.0
+        self._due = math.inf
+        self._frame: Frame | None = None
+
+    def open(self) -> None:
+        """Start with the recording's first frame, now."""
+        self._start = self._due = self._clock.now()
+        self._frame = None
+        self.latest()
+
+    def latest(self) -> Frame | None:
+        """The newest frame that is due, None when not open."""
+        now = self._clock.now() + 1e-9  # a frame due now counts as come
+        if now < self._due:
+            return self._frame
+        turn = math.floor((now - self._start) / self._period)
+        if turn and not self._again:
+            return self._end()
+        begin = self._start + turn * self._period
+        count = len(self._times)
+        k = max(bisect.bisect_right(self._times, now - begin) - 1, 0)
+        arrival = begin + self._times[k]
+        self._due = begin + (self._times[k + 1] if k + 1 < count else self._period)
+        data = self._recording.counts[k]
+        seq = turn * count + k + 1
+        self._frame = Frame(seq, arrival - self._latency, arrival, True, data)
+        return self._frame
+
+    def counters(self) -> dict[str, int]:
+        """``frames`` that were due since open; ``resyncs`` and ``skipped_bytes`` stay 0."""
+        frames = 0 if self._frame is None else self._frame.seq
+        return {"frames": frames, "resyncs": 0, "skipped_bytes": 0}
+
+    def close(self) -> None:
+        """Deliver nothing more."""
+        self._due = math.inf
+
+    def _end(self) -> Frame | None:
+        self._due = math.inf
+        old = self._frame
+        if old is not None:
+            data = self._recording.counts[-1]
+            arrival = self._start + self._times[-1]
+            seq = len(self._times) + 1
+            self._frame = Frame(seq, arrival - self._latency, arrival, False, data)
+        return self._frame

@@ -1,0 +1,212 @@
+"""Import of Tekscan-style ASCII exports: text in, pressure frames out. No clock, no files.
+
+Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
+``Frame n`` (more may stand behind it) and its rows, cells separated by commas, ``B`` where the
+sensor has no cell; a line ``@@`` may end it. Keys are misspelt in the wild (``NOISE_TRESHOLD``) and
+lengths come in mm, cm or in, areas in their squares, readings raw or in a unit of pressure.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_MOST = 1024  # rows or cols
+_LENGTHS = {"": 1e-3, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "inch": 0.0254}
+_RAW = ("raw", "rawsum", "counts", "")
+_PRESSURES = {
+    "pa": 1.0,
+    "hpa": 1e2,
+    "kpa": 1e3,
+    "mpa": 1e6,
+    "bar": 1e5,
+    "mbar": 1e2,
+    "psi": 6894.757293168,
+    "mmhg": 133.322387415,
+    "n/m2": 1.0,
+    "n/cm2": 1e4,
+    "n/mm2": 1e6,
+    "g/cm2": 98.0665,
+    "kg/cm2": 98066.5,
+    "kgf/cm2": 98066.5,
+}
+_KEYS = (
+    "ROWS",
+    "COLS",
+    "ROW_SPACING",
+    "COL_SPACING",
+    "SENSEL_AREA",
+    "SECONDS_PER_FRAME",
+    "NOISE_THRESHOLD",
+    "SATURATION_PRESSURE",
+    "START_FRAME",
+    "END_FRAME",
+    "UNITS",
+    "SENSOR_TYPE",
+)
+
+
+class TekscanError(ValueError):
+    """The text is no such export. The message names the line."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """What an export holds.
+
+    ``values`` float64 [frames, rows, cols]: Pa, or counts where ``raw``; 0 where ``live`` [rows,
+    cols] is False. ``t`` float64 [frames] from the first frame on [s]; ``pitch`` (x, y) [m], NaN
+    where the header doesn't tell. ``header`` has every ``KEY value``, keys spelt right.
+    """
+
+    values: NDArray[np.float64]
+    live: NDArray[np.bool_]
+    t: NDArray[np.float64]
+    raw: bool
+    pitch: tuple[float, float]
+    header: dict[str, str]
+
+
+def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
+    """Read an export; ``seconds_per_frame`` [s] where its header has none. Raises TekscanError."""
+    lines = text.splitlines()
+    header, first = _header(lines)
+    rows, cols = _count(header, "ROWS"), _count(header, "COLS")
+    numbers, frames = _frames(lines, first, rows, cols)
+    values = np.stack(frames)
+    if np.isinf(values).any() or (values < 0.0).any():
+        k, i, j = (int(x) for x in np.argwhere(np.isinf(values) | (values < 0.0))[0])
+        raise TekscanError(f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}")
+    live: NDArray[np.bool_] = np.logical_not(np.isnan(values).any(axis=0))
+    values[:, ~live] = 0.0
+    unit = re.sub(r"[\s^]", "", header.get("UNITS", "")).lower()
+    if unit not in _RAW and unit not in _PRESSURES:
+        raise TekscanError(f"UNITS: found {header['UNITS']!r}, expected RAW or a pressure's unit")
+    step = seconds_per_frame
+    if "SECONDS_PER_FRAME" in header:
+        step = _quantity(header, "SECONDS_PER_FRAME", {"": 1.0, "s": 1.0, "ms": 1e-3})
+    if not step > 0.0:
+        raise TekscanError("SECONDS_PER_FRAME: expected a time above 0")
+    t = (np.array(numbers, np.float64) - numbers[0]) * step
+    raw = unit in _RAW
+    if not raw:
+        values *= _PRESSURES[unit]
+    return Export(values, live, t, raw, _pitch(header), header)
+
+
+def _header(lines: list[str]) -> tuple[dict[str, str], int]:
+    header: dict[str, str] = {}
+    for number, line in enumerate(lines):
+        key, _, value = line.strip().partition(" ")
+        if key.upper() == "ASCII_DATA":
+            return header, number + 1
+        if key:
+            header[_spelt(key.upper())] = value.strip()
+    raise TekscanError("no line ASCII_DATA: this is no Tekscan-style export")
+
+
+def _spelt(key: str) -> str:
+    """The known key that a misspelt one means; short keys must be right, they differ too little."""
+    if key in _KEYS or len(key) < 8:
+        return key
+    return (difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.9) or [key])[0]
+
+
+def _frames(
+    lines: list[str], first: int, rows: int, cols: int
+) -> tuple[list[int], list[NDArray[np.float64]]]:
+    numbers: list[int] = []
+    frames: list[NDArray[np.float64]] = []
+    row = rows
+    for number, line in enumerate(lines[first:], first + 1):
+        line = line.strip()
+        if not line:
+            continue
+        if line.startswith("@@"):
+            break
+        match = re.match(r"frame\s+(\d{1,9})\b", line, re.IGNORECASE)
+        if match or line[:5].lower() == "frame":
+            if match is None:
+                raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
+            if row < rows:
+                raise TekscanError(f"line {number}: frame {numbers[-1]} has {row} rows of {rows}")
+            if numbers and int(match[1]) <= numbers[-1]:
+                raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
+            numbers.append(int(match[1]))
+            frames.append(np.empty((rows, cols)))
+            row = 0
+            continue
+        if row == rows:
+            raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
+        frames[-1][row] = _row(line, cols, number)
+        row += 1
+    if not frames:
+        raise TekscanError("no frame in it")
+    if row < rows:
+        raise TekscanError(f"the file ends in frame {numbers[-1]}: {row} rows of {rows}")
+    return numbers, frames
+
+
+def _row(line: str, cols: int, number: int) -> NDArray[np.float64]:
+    cells = line.rstrip(",").split(",")
+    if len(cells) != cols:
+        raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
+    try:
+        values = np.array(cells, dtype=np.float64)
+    except ValueError:
+        try:
+            values = np.array(
+                [math.nan if cell.strip().upper() == "B" else float(cell) for cell in cells]
+            )
+        except ValueError as error:
+            raise TekscanError(f"line {number}: {error}") from None
+        written = sum(cell.strip().upper() == "B" for cell in cells)
+    else:
+        written = 0
+    if np.count_nonzero(np.isnan(values)) != written:
+        raise TekscanError(f"line {number}: a cell that is no number")
+    return values
+
+
+def _count(header: dict[str, str], key: str) -> int:
+    if key not in header:
+        raise TekscanError(f"{key} is missing")
+    text = header[key]
+    if not re.fullmatch(r"[0-9]{1,4}", text) or not 1 <= int(text) <= _MOST:
+        raise TekscanError(f"{key}: found {text!r}, expected 1 to {_MOST}")
+    return int(text)
+
+
+def _quantity(header: dict[str, str], key: str, units: dict[str, float], power: int = 1) -> float:
+    """A number with its unit, in SI."""
+    match = re.fullmatch(r"([-+0-9.eE]+)\s*([A-Za-z]*)\s*\^?\s*([23]?)", header[key])
+    try:
+        value = float(match[1]) if match else math.nan
+    except ValueError:
+        value = math.nan
+    unit = match[2].lower() if match else ""
+    wrong_power = match is not None and match[3] not in ("", str(power))
+    if not math.isfinite(value) or unit not in units or wrong_power:
+        known = ", ".join(name for name in units if name)
+        raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
+    return float(value * units[unit] ** power)
+
+
+def _pitch(header: dict[str, str]) -> tuple[float, float]:
+    """(x, y) from the spacings, or from the area of a square cell."""
+    side = math.nan
+    if "SENSEL_AREA" in header:
+        area = _quantity(header, "SENSEL_AREA", _LENGTHS, power=2)
+        side = math.sqrt(area) if area > 0.0 else math.nan
+    found = []
+    for key in ("COL_SPACING", "ROW_SPACING"):
+        value = _quantity(header, key, _LENGTHS) if key in header else side
+        if value <= 0.0:
+            raise TekscanError(f"{key}: expected a length above 0")
+        found.append(value)
+    return found[0], found[1]

@@ -1,0 +1,115 @@
+"""Every tactile backend at work, each with known images: what the conformance suite runs on."""
+
+from __future__ import annotations
+
+import select
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.clock import Clock, RealClock, VirtualClock
+from daemon.records import Frame
+from daemon.settings import Settings
+from daemon.simulation.encoders import ENCODERS
+from daemon.simulation.hand import SimulatedHand
+from daemon.simulation.tactile_board import BoardFault, TactileBoard
+from daemon.tactile import make_sensor
+from daemon.tactile.base import TactileSensor
+from tests.conftest import until
+
+ROWS = COLS = 32
+BACKENDS = ("simulated", "flexitac", "glove", "cobs", "replay")
+SERIAL = ("flexitac", "glove", "cobs")
+RATE = 200.0  # Hz
+
+
+def image(number: int) -> NDArray[np.uint16]:
+    """A different image for each number; no cell is like its transposed one."""
+    cells = np.arange(ROWS * COLS, dtype=np.uint16).reshape(ROWS, COLS)
+    return (cells * 7 + 3 * (cells // COLS) + number) % 160
+
+
+class _Images:
+    """A board's source: a new image at each call."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.sent: dict[int, NDArray[np.uint16]] = {}
+
+    def latest(self) -> Frame:
+        self.number += 1
+        self.sent[self.number] = image(self.number)
+        return Frame(self.number, self.number / RATE, 0.0, True, self.sent[self.number])
+
+
+class Rig:
+    """One backend with what it needs around it. Use as a context."""
+
+    def __init__(self, backend: str, folder: Path, fault: str = "", rows: int = ROWS) -> None:
+        self.backend = backend
+        self._stack = ExitStack()
+        self._stop = threading.Event()
+        tactile: dict[str, object] = {
+            "backend": backend,
+            "rows": rows,
+            "cols": COLS,
+            "rate": RATE,
+            "open_timeout": 0.5 if fault or rows != ROWS else 10.0,
+        }
+        self.clock: Clock = RealClock() if backend in SERIAL else VirtualClock()
+        hand = None
+        if backend in SERIAL:
+            faults = (BoardFault.parse(fault),) if fault else ()
+            self.board = TactileBoard(_Images(), ENCODERS[backend], RATE, 0.0, faults)
+            self._stack.callback(self.board.close)
+            tactile["port"] = ("/dev/none", self.board.path)
+            thread = threading.Thread(target=self._serve, daemon=True)
+            thread.start()
+            self._stack.callback(thread.join)
+            self._stack.callback(self._stop.set)
+        elif backend == "replay":
+            file = folder / "run.npz"
+            np.savez(file, frames=np.stack([image(k) for k in range(20)]))
+            tactile["recording"] = ("", str(file))
+        settings = Settings.model_validate({"tactile": tactile, "scene": {"fingers": ("right",)}})
+        if backend == "simulated":
+            hand = SimulatedHand(settings, self.clock.now())
+        sensor = make_sensor(settings, self.clock, hand, 1)
+        assert sensor is not None
+        self.sensor: TactileSensor = sensor
+        self._stack.callback(sensor.close)
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def newest(self) -> Frame:
+        frame = self.sensor.latest()
+        assert frame is not None
+        return frame
+
+    def wait(self, condition: Callable[[Frame], object]) -> Frame:
+        """Let time pass until a frame fulfils ``condition``."""
+
+        def holds() -> bool:
+            if not isinstance(self.clock, RealClock):
+                self.clock.sleep_until(self.clock.now() + 0.5 / RATE)
+            frame = self.sensor.latest()
+            return frame is not None and bool(condition(frame))
+
+        until(holds)
+        return self.newest()
+
+    def _serve(self) -> None:
+        t = 0.0
+        while not self._stop.is_set():
+            if select.select([self.board], [], [], 0.5 / RATE)[0]:
+                self.board.hear()
+            t += 1.0 / RATE
+            self.board.service(t)

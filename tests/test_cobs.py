@@ -1,0 +1,188 @@
+"""Our framing: its bytes as documented, its decoder against a plain twin, its times."""
+
+from __future__ import annotations
+
+import binascii
+import struct
+import time
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from daemon.tactile.cobs import CobsDecoder, encode, longest_frame
+from daemon.tactile.cobs_packet import BAD_CRC, NOT_COBS, crc16, crc_tables, unpack
+from daemon.tactile.serial_reader import SensorClock
+
+TABLES = crc_tables()
+
+
+def plain_stuff(message: bytes) -> bytes:
+    """COBS as its definition reads, a byte at a time."""
+    out, block = bytearray(), bytearray()
+    for k, byte in enumerate(message):
+        if byte == 0:
+            out += bytes([len(block) + 1]) + block
+            block = bytearray()
+            continue
+        block.append(byte)
+        if len(block) == 254 and k < len(message) - 1:
+            out += b"\xff" + block
+            block = bytearray()
+    return bytes(out + bytes([len(block) + 1]) + block)
+
+
+def plain_crc(data: bytes) -> int:
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = ((crc << 1) ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return crc
+
+
+def crc(data: bytes) -> int:
+    return crc16(np.frombuffer(data, np.uint8), len(data), TABLES)
+
+
+def unpacked(packet: bytes) -> bytes | int:
+    out = np.zeros(len(packet) + 1, np.uint8)
+    size = unpack(np.frombuffer(bytearray(packet), np.uint8), TABLES, out)
+    return size if size < 0 else out[:size].tobytes()
+
+
+messages = st.one_of(
+    st.binary(max_size=60),
+    st.lists(st.sampled_from([0, 0, 1, 255]), max_size=40).map(bytes),
+    st.integers(250, 1100).map(lambda n: bytes(k % 255 + 1 for k in range(n))),
+)
+
+
+def test_the_check_value_of_the_crc():
+    assert crc(b"123456789") == plain_crc(b"123456789") == 0x29B1
+    assert binascii.crc_hqx(b"123456789", 0xFFFF) == 0x29B1
+
+
+@settings(max_examples=80, deadline=None)
+@given(messages)
+def test_the_crc_equals_its_plain_twin(data):
+    assert crc(data) == plain_crc(data)
+
+
+@settings(max_examples=150, deadline=None)
+@given(messages)
+@example(b"")
+@example(bytes(300))
+@example(b"\x01" * 252)
+@example(b"\x01" * 506)
+def test_unpack_undoes_what_the_plain_twin_packed(message):
+    whole = message + plain_crc(message).to_bytes(2, "little")
+    assert unpacked(plain_stuff(whole)) == message
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.integers(1, 255), min_size=1, max_size=600).map(bytes))
+def test_any_packet_is_refused_or_right(packet):
+    found = unpacked(packet)
+    if isinstance(found, int):
+        assert found in (NOT_COBS, BAD_CRC)
+    else:
+        assert plain_stuff(found + plain_crc(found).to_bytes(2, "little")) == packet
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_frame_is_as_documented(kind):
+    counts = np.array([[0, 1, 2], [253, 0, 255]], kind)
+    data = encode(counts, 70000, 1.25)
+    assert data.endswith(b"\0")
+    assert data.count(b"\0") == 1
+    size = kind().itemsize
+    message = struct.pack("<BBHIHH", size, 0, 70000 % 65536, 1250000, 2, 3)
+    message += struct.pack("<6" + ("B" if size == 1 else "H"), *counts.ravel().tolist())
+    assert data == plain_stuff(message + plain_crc(message).to_bytes(2, "little")) + b"\0"
+
+
+def test_frames_come_with_number_and_time_and_losses_are_told():
+    decoder = CobsDecoder(2, 3)
+    counts = np.arange(6, dtype=np.uint16).reshape(2, 3) * 300
+    first = decoder.feed(encode(counts, 65534, 4294.0), 1.0)
+    second = decoder.feed(encode(counts, 1, 4295.0), 2.0)  # the clock wraps at 4294.97 s
+    assert first is not None
+    assert second is not None
+    assert np.array_equal(second.data, counts)
+    assert second.steps == 3
+    assert second.t_sensor == pytest.approx(first.t_sensor + 1.0)
+    assert decoder.counters()["missed"] == 2
+    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # it started anew
+    assert again is not None
+    assert again.steps == 1
+
+
+def test_uint8_counts_of_the_same_grid_are_read_too():
+    decoder = CobsDecoder(4, 4)
+    counts = np.arange(16, dtype=np.uint8).reshape(4, 4)
+    decoded = decoder.feed(encode(counts, 1, 0.0), 0.0)
+    assert decoded is not None
+    assert decoded.data.dtype == np.uint16
+    assert np.array_equal(decoded.data, counts)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda data: encode(np.zeros((3, 2), np.uint16), 1, 0.0), r"3 × 2.*2 × 3"),
+        (lambda data: data[:3] + bytes([data[3] ^ 4]) + data[4:], "CRC is wrong|not COBS"),
+        (lambda data: data[4:], "CRC is wrong|not COBS"),
+        (lambda data: b"\x01" * 500 + b"\0", "packets of 500 bytes|no packet"),
+    ],
+)
+def test_what_is_wrong_with_a_stream_is_told(spoil, told):
+    decoder = CobsDecoder(2, 3)
+    good = encode(np.full((2, 3), 777, np.uint16), 1, 0.0)
+    assert decoder.feed(spoil(good), 0.0) is None
+    import re
+
+    assert re.search(told, decoder.diagnosis())
+    assert decoder.feed(b"\0" + good, 0.0) is not None
+
+
+def test_every_single_flipped_bit_is_seen():
+    good = encode(np.random.default_rng(1).integers(0, 900, (4, 5)).astype(np.uint16), 5, 0.5)
+    for bit in range(8 * len(good)):
+        wrong = bytearray(good)
+        wrong[bit // 8] ^= 1 << bit % 8
+        decoder = CobsDecoder(4, 5)
+        # Unless the flip made or took the end, in which case nothing is left that is a frame.
+        assert decoder.feed(bytes(wrong) + b"\0", 0.0) is None
+
+
+def test_the_sensor_clock_takes_the_least_delay_and_follows_drift_and_restarts():
+    clock = SensorClock()
+    rng = np.random.default_rng(2)
+    misses = []
+    for k in range(2000):
+        scan = 0.01 * k
+        late = 0.003 * rng.random()
+        misses.append(clock.arrival(scan * (1 - 5e-5) + 77.0, scan + late) - scan)
+    assert max(misses[200:]) < 3e-4  # the delays are up to 3 ms
+    assert min(misses) > -1e-4
+    assert clock.arrival(0.0, 30.0) == 30.0
+
+
+def test_a_frame_of_44_by_44_is_decoded_in_time():
+    rng = np.random.default_rng(3)
+    # Half of the cells read nothing, as under a tip in the air: the worst case, all is zero bytes.
+    frames = [
+        encode(np.maximum(rng.normal(0, 380, (44, 44)), 0).astype(np.uint16), k, 0.01 * k)
+        for k in range(300)
+    ]
+    assert max(map(len, frames)) <= longest_frame(44, 44) == 3903
+    decoder = CobsDecoder(44, 44)
+    times = []
+    for data in frames:
+        begin = time.perf_counter()
+        decoded = decoder.feed(data, 0.0)
+        times.append(time.perf_counter() - begin)
+        assert decoded is not None
+    assert np.median(times) < 50e-6  # 9 µs where this was written

@@ -1,0 +1,155 @@
+"""Recordings in their files, and their replay on virtual time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.clock import VirtualClock
+from daemon.settings import Settings, TactileSettings
+from daemon.tactile.base import TactileError
+from daemon.tactile.recording import Recording, RecordingError, load_recording, save_recording
+from daemon.tactile.replay import ReplayTactile
+
+FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)
+
+
+def replay(path, clock, **keys) -> ReplayTactile:
+    settings = TactileSettings.model_validate(
+        {
+            "backend": "replay",
+            "rows": 4,
+            "cols": 6,
+            "rate": 100.0,
+            "recording": (str(path), ""),
+            "latency": 0.002,
+            **keys,
+        }
+    )
+    return ReplayTactile(settings, clock, 0)
+
+
+def numbers(sensor, clock, times):
+    found = []
+    for t in times:
+        clock.sleep_until(t)
+        frame = sensor.latest()
+        found.append((frame.seq, int(frame.data[0, 0]) // 24))
+    return found
+
+
+def test_frames_come_at_their_times_and_from_the_start_again(tmp_path):
+    path = tmp_path / "run.npz"
+    np.savez(path, frames=FRAMES, t=np.array([7.0, 7.01, 7.05, 7.06, 7.08]))
+    clock = VirtualClock(start=3.0)
+    sensor = replay(path, clock)
+    sensor.open()
+    found = numbers(sensor, clock, (3.0, 3.009, 3.010, 3.049, 3.05, 3.079, 3.08, 3.0999, 3.1, 3.11))
+    assert found == [
+        (1, 0), (1, 0), (2, 1), (2, 1), (3, 2), (4, 3), (5, 4), (5, 4), (6, 0), (7, 1),
+    ]  # fmt: skip
+    frame = sensor.latest()
+    assert frame.t_arrival == pytest.approx(3.11)
+    assert frame.t_sample == pytest.approx(3.108)
+    clock.sleep_until(1000.0)
+    assert sensor.latest().seq == 5 * int(997.0 / 0.1) + 1
+
+
+def test_without_again_it_ends_with_an_invalid_frame(tmp_path):
+    path = tmp_path / "run.npz"
+    np.savez(path, frames=FRAMES)
+    clock = VirtualClock()
+    sensor = replay(path, clock, replay_again=False)
+    sensor.open()
+    assert numbers(sensor, clock, (0.045,)) == [(5, 4)]
+    assert sensor.latest().valid
+    assert numbers(sensor, clock, (0.051, 9.0)) == [(6, 4), (6, 4)]
+    assert not sensor.latest().valid
+
+
+def test_a_folder_of_frames_is_read_in_the_order_of_their_numbers(tmp_path):
+    for k in range(5):
+        np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 after frame9
+    recording = load_recording(tmp_path, 1.0, 50.0)
+    assert np.array_equal(recording.counts, FRAMES)
+    assert recording.t.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
+    np.save(tmp_path / "t.npy", np.array([1.0, 2, 3, 5, 8]))
+    assert load_recording(tmp_path, 1.0, 50.0).t.tolist() == [0, 1, 2, 4, 7]
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    live = np.ones((4, 6), bool)
+    live[1, 2] = False
+    written = Recording(FRAMES, np.arange(5) * 0.1, live, {"d": np.linspace(0, 0.008, 5)})
+    save_recording(tmp_path / "run.npz", written)
+    read = load_recording(tmp_path / "run.npz", 1.0, 1.0)
+    assert np.array_equal(read.counts, FRAMES)
+    assert np.array_equal(read.live, live)
+    assert np.array_equal(read.truths["d"], written.truths["d"])
+
+
+@pytest.mark.parametrize(
+    ("held", "told"),
+    [
+        ({"other": FRAMES}, "no array 'frames'"),
+        ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),
+        ({"frames": FRAMES[:0]}, "shape"),
+        ({"frames": FRAMES.astype(complex)}, "expected numbers"),
+        ({"frames": -FRAMES.astype(float)}, "outside 0 to 65535"),
+        ({"frames": FRAMES * np.nan}, "outside 0 to 65535"),
+        ({"frames": FRAMES * 1e305}, "outside 0 to 65535"),
+        ({"frames": FRAMES, "t": np.zeros(5)}, "must rise"),
+        ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
+        ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: not finite"),
+        ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),
+        ({"frames": np.array([{}], dtype=object)}, "run.npz"),
+    ],
+)
+def test_what_is_no_recording_is_told(tmp_path, held, told):
+    path = tmp_path / "run.npz"
+    np.savez(path, **held)
+    with pytest.raises(RecordingError, match=told):
+        load_recording(path, 0.001, 100.0)
+
+
+def test_files_that_cannot_be_read_are_told(tmp_path):
+    with pytest.raises(RecordingError, match="No such file"):
+        load_recording(tmp_path / "none.npz", 1.0, 1.0)
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no zip")
+    with pytest.raises(RecordingError, match=r"bad\.npz"):
+        load_recording(tmp_path / "bad.npz", 1.0, 1.0)
+    with pytest.raises(RecordingError, match=r"no \.npy file"):
+        load_recording(tmp_path, 1.0, 1.0)
+    with pytest.raises(TactileError, match="found none for the left finger"):
+        replay("", VirtualClock())
+
+
+def test_the_daemon_runs_on_a_recording_on_virtual_time(tmp_path):
+    path = tmp_path / "press.npz"
+    frames = np.zeros((4, 44, 44), np.uint16)
+    live = np.ones((44, 44), bool)
+    settings = Settings.model_validate(
+        {
+            "loop": {"clock": "virtual"},
+            "servos": {"backend": "none"},
+            "scene": {"fingers": ("left",)},
+            "tactile": {"backend": "replay", "recording": (str(path), "")},
+        }
+    )
+    from daemon.model import make_grid, make_material, make_tip
+
+    for k in range(4):
+        pressure = make_grid(settings).pressure(
+            make_tip(settings), make_material(settings.material), 0.001 * (k + 1), 0.1
+        )
+        frames[k] = np.round(pressure / settings.tactile.pascal_per_count)
+    live[20, 20] = False
+    frames[:, 20, 20] = 0
+    np.savez(path, frames=frames, live=live)
+    with Daemon(settings, wire=False) as daemon:
+        seen = []
+        for _ in range(4):
+            daemon.loop.advance(0.01)
+            seen.append(daemon.loop.state.contacts[0].d)
+    assert seen[:3] == pytest.approx([0.001, 0.002, 0.003], rel=5e-3)

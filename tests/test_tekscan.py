@@ -1,0 +1,117 @@
+"""Tekscan-style exports: what they may look like, and what is told of those that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daemon.tactile.recording import RecordingError, load_recording
+from daemon.tactile.tekscan import TekscanError, parse
+
+EXPORT = """\
+DATA_TYPE MOVIE
+VERSION I-Scan 5.1
+SENSOR_TYPE 5051
+ROWS 2
+ROW_SPACING 1.27 mm
+COLS 3
+COL_SPACING 0.2 cm
+SENSEL_AREA 0.0254 cm2
+NOISE_TRESHOLD 3
+SECONDS_PER_FRAME 0.04
+UNITS RAW
+START_FRAME 4
+END_FRAME 6
+ASCII_DATA @@
+Frame 4
+0,5,B
+7,255,1
+
+Frame 6 0.08 s
+1,2,B
+3,4,5
+@@
+"""
+
+
+def test_header_frames_times_and_missing_cells():
+    export = parse(EXPORT)
+    assert export.raw
+    assert export.pitch == pytest.approx((2e-3, 1.27e-3))
+    assert export.t.tolist() == pytest.approx([0.0, 0.08])
+    assert export.live.tolist() == [[True, True, False], [True, True, True]]
+    assert export.values.tolist() == [[[0, 5, 0], [7, 255, 1]], [[1, 2, 0], [3, 4, 5]]]
+    assert export.header["NOISE_THRESHOLD"] == "3"
+    assert export.header["VERSION"] == "I-Scan 5.1"
+
+
+def test_line_ends_and_a_missing_end_mark_make_no_difference():
+    again = parse(EXPORT.removesuffix("@@\n").replace("\n", "\r\n"))
+    assert np.array_equal(again.values, parse(EXPORT).values)
+
+
+@pytest.mark.parametrize(
+    ("unit", "pascal"),
+    [
+        ("kPa", 1e3),
+        ("KPA", 1e3),
+        ("N/cm2", 1e4),
+        ("N/mm^2", 1e6),
+        ("PSI", 6894.757),
+        ("mmHg", 133.32239),
+    ],
+)
+def test_pressures_are_told_in_pa(unit, pascal):
+    export = parse(EXPORT.replace("UNITS RAW", f"UNITS {unit}").replace("255", "2.55"))
+    assert not export.raw
+    assert export.values[0, 1, 1] == pytest.approx(2.55 * pascal)
+
+
+@pytest.mark.parametrize(
+    ("area", "side"), [("1.6129 mm2", 1.27e-3), ("0.016129 cm2", 1.27e-3), ("0.0025 in2", 1.27e-3)]
+)
+def test_without_spacings_the_area_tells_the_pitch(area, side):
+    text = EXPORT.replace("ROW_SPACING 1.27 mm\n", "").replace("COL_SPACING 0.2 cm\n", "")
+    assert parse(text.replace("0.0254 cm2", area)).pitch == pytest.approx((side, side), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("ASCII_DATA @@", "", "no line ASCII_DATA"),
+        ("ROWS 2\n", "", "ROWS is missing"),
+        ("ROWS 2", "ROWS two", "ROWS: found 'two'"),
+        ("ROWS 2", "ROWS 99999", "ROWS: found"),
+        ("1.27 mm", "1.27 furlong", "ROW_SPACING"),
+        ("1.27 mm", "-1.27 mm", "ROW_SPACING"),
+        ("UNITS RAW", "UNITS stone", "UNITS"),
+        ("0.04", "-1", "SECONDS_PER_FRAME"),
+        ("Frame 6 0.08 s", "Frame 3", "line 19: frame 3 after frame 4"),
+        ("Frame 6 0.08 s", "Frame six", "line 19"),
+        ("7,255,1", "7,255", "line 17: 2 cells, expected 3"),
+        ("7,255,1", "7,,1", "line 17"),
+        ("7,255,1", "7,nan,1", "line 17: a cell that is no number"),
+        ("7,255,1", "7,-255,1", "row 2, cell 2 is -255"),
+        ("7,255,1", "7,inf,1", "row 2, cell 2 is inf"),
+        ("7,255,1\n", "", "frame 4 has 1 rows of 2"),
+        ("3,4,5\n", "", "the file ends in frame 6: 1 rows of 2"),
+        ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
+    ],
+)
+def test_what_is_no_export_is_told(old, new, told):
+    with pytest.raises(TekscanError, match=told):
+        parse(EXPORT.replace(old, new))
+
+
+def test_an_export_is_a_recording(tmp_path):
+    path = tmp_path / "run.asf"
+    path.write_text(EXPORT)
+    recording = load_recording(path, 4.0, 100.0)
+    assert recording.counts.dtype == np.uint16
+    assert recording.counts[0, 1].tolist() == [7, 255, 1]
+    assert not recording.live[0, 2]
+    path.write_text(EXPORT.replace("RAW", "kPa"))
+    assert load_recording(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
+    path.write_text("nothing")
+    with pytest.raises(RecordingError, match=r"run\.asf: no line ASCII_DATA"):
+        load_recording(path, 4.0, 100.0)
