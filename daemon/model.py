@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.settings import MaterialLaw, Settings, SettingsError
+from daemon.table_files import load_or_build
 from kinematics.contact import Fingertip
 from kinematics.estimator import ContactEstimator
 from kinematics.material import Material
@@ -38,7 +39,7 @@ def make_table(settings: Settings, material: Material, cache: Path | None) -> Co
     tolerance = settings.table.tolerance
     if cache is None:
         return ContactTable.build(tip, material, tolerance=tolerance)
-    return ContactTable.load_or_build(cache, tip, material, tolerance=tolerance)
+    return load_or_build(cache, tip, material, tolerance)
 
 
 def make_grid(settings: Settings, finger: int = 0) -> SensorGrid:

@@ -40,8 +40,17 @@ def fast_kernel(function: Function) -> Function:
     return _compile(function, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 
-def _compile(function: Function, fastmath: bool | set[str]) -> Function:
-    compiler = numba.njit(cache=True, error_model="numpy", fastmath=fastmath)
+def inlined_kernel(function: Function) -> Function:
+    """As :func:`kernel`, but a part of every compiled caller, and products and sums may be fused.
+
+    For the innermost functions of a hot path, where a call costs as much as the work. Its code is
+    there again in each caller, so it should be short.
+    """
+    return _compile(function, fastmath={"contract"}, inline=True)
+
+
+def _compile(function: Function, fastmath: bool | set[str], inline: bool = False) -> Function:
+    compiler = numba.njit(cache=True, error_model="numpy", fastmath=fastmath, forceinline=inline)
     dispatcher: Any = compiler(function)
     # Numba compares this stamp with the one it saved; it offers no public way to widen it.
     index = dispatcher._cache._cache_file

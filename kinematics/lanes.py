@@ -7,28 +7,48 @@ multiply-add. LLVM splits the vectors where the machine's are narrower.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.extending import intrinsic
+from numpy.typing import NDArray
 
 LANES = 5  # polynomials
-STRIDE = 8  # coefficients stored for each power: the lanes, padded to a vector register
+STRIDE = 8  # numbers stored for each coefficient: the lanes, padded to a vector register
+
+# Shapes by number: how many powers of x each power of y has, the lowest first. Squares, then
+# shapes cut to what an analytic function needs for one precision after the other, and the shape
+# for a narrow strip of x.
+SHAPES: tuple[tuple[int, ...], ...] = (
+    (),
+    (2,) * 2,
+    (4,) * 4,
+    (6,) * 6,
+    (5, 5, 5, 5, 4, 4, 4, 3, 2, 2, 1),
+    (7, 6, 6, 6, 6, 5, 5, 4, 4, 3, 3, 3, 2, 2, 1),
+    (9, 8, 8, 7, 7, 7, 6, 6, 5, 5, 5, 4, 4, 4, 3, 3, 3, 2, 1, 1),
+    (10, 9, 9, 8, 8, 8, 7, 7, 7, 6, 6, 6, 5, 5, 5, 5, 4, 4, 4, 3, 3, 2, 2, 1),
+    (8,) * 15,
+)
+SIZES = tuple(STRIDE * sum(shape) for shape in SHAPES)  # numbers of one set of coefficients
+
+# What `address` gives, as far as kernels index it.
+Pointer: TypeAlias = NDArray[np.float64]
 
 _DOUBLE = ir.DoubleType()
 _VECTOR = ir.VectorType(_DOUBLE, STRIDE)
 _INDEX = ir.IntType(64)
 
 
-def _code(columns: Any, context: Any, data: Any, x: Any, y: Any, literals: Any) -> Any:
-    """Signature and code generator of a sum over powers of y of polynomials in x."""
-    signature = cast(Any, types).UniTuple(types.float64, LANES)(data, types.intp, *literals, x, y)
+def _polynomials(context: Any, data: Any, at: Any, shape: Any, x: Any, y: Any) -> Any:
+    """Signature and code generator; see :data:`polynomials`."""
+    signature = cast(Any, types).UniTuple(types.float64, LANES)(data, types.intp, shape, x, y)
 
     def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        array = codegen.make_array(sig.args[0])(codegen, builder, arguments[0])
-        at, x, y = arguments[1], arguments[-2], arguments[-1]
+        start, at, _, x, y = arguments
         # llvmlite's own fma takes scalars only.
         function = cast(Any, cgutils).get_or_insert_function(
             builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fma.v{STRIDE}f64"
@@ -45,11 +65,11 @@ def _code(columns: Any, context: Any, data: Any, x: Any, y: Any, literals: Any) 
             return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), mask)
 
         xs, ys = spread(x), spread(y)
-        pointer = builder.bitcast(builder.gep(array.data, [at]), _VECTOR.as_pointer())
+        pointer = builder.bitcast(builder.gep(start, [at]), _VECTOR.as_pointer())
         # All powers of y are independent, and the machine may work on them before y is known.
         rows = []
         read = 0
-        for terms in columns([literal.literal_value for literal in literals]):
+        for terms in SHAPES[sig.args[2].literal_value]:
             row = None
             for _ in range(terms):
                 place = builder.gep(pointer, [ir.Constant(_INDEX, read)])
@@ -84,29 +104,22 @@ def _in_powers(builder: Any, fma: Any, rows: list[Any], y: Any) -> Any:
     return fma(fma(sums[3], y, sums[2]), y2, fma(sums[1], y, sums[0]))
 
 
-def _slab(context: Any, data: Any, at: Any, nx: Any, ny: Any, x: Any, y: Any) -> Any:
-    """Type of, and code for, the evaluation; see :data:`slab`."""
-    return _code(lambda n: slab_columns(n[0], n[1]), context, data, x, y, (nx, ny))
+def _address(context: Any, array: Any) -> Any:
+    """Signature and code generator; see :data:`address`."""
+    signature = cast(Any, types).CPointer(types.float64)(array)
+
+    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return codegen.make_array(sig.args[0])(codegen, builder, arguments[0]).data
+
+    return signature, generate
 
 
-def _square(context: Any, data: Any, at: Any, n: Any, x: Any, y: Any) -> Any:
-    """Type of, and code for, the evaluation; see :data:`square`."""
-    return _code(lambda n: square_columns(n[0]), context, data, x, y, (n,))
+# polynomials(pointer, at, shape, x, y): the five sums Σ c_ij x^i y^j over a shape of SHAPES, whose
+# number is a literal. From pointer[at] on stand, for j = 0, 1, …, the coefficients of falling
+# powers of x, STRIDE numbers each.
+polynomials = cast(Any, intrinsic(prefer_literal=True))(_polynomials)
 
-
-# slab(data, at, nx, ny, x, y): the five sums Σ c_ij x^i y^j over the triangle of powers with the
-# corners x^nx and y^ny; square(data, at, n, x, y): over all i, j ≤ n. The degrees are literals.
-# From data[at] on stand, for j = 0, 1, …, the coefficients of falling powers of x, STRIDE numbers
-# each.
-slab = cast(Any, intrinsic(prefer_literal=True))(_slab)
-square = cast(Any, intrinsic(prefer_literal=True))(_square)
-
-
-def slab_columns(nx: int, ny: int) -> list[int]:
-    """How many coefficients :data:`slab` has for each power of y, the lowest first."""
-    return [int((nx + 0.5) * (1.0 - j / (ny + 0.5))) + 1 for j in range(ny + 1)]
-
-
-def square_columns(n: int) -> list[int]:
-    """How many coefficients :data:`square` has for each power of y."""
-    return [n + 1] * (n + 1)
+# address(array): where a contiguous float64 array starts. Numba counts the references to an array
+# wherever a function that has it returns in several ways, and each count is an atomic instruction
+# that costs as much as a lookup; it counts none for an address. The caller keeps the array.
+address = cast(Any, intrinsic)(_address)

@@ -17,62 +17,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinematics.contact import theta_limit
-from kinematics.kernels import kernel
-from kinematics.lanes import slab, square
+from kinematics.kernels import inlined_kernel, kernel
+from kinematics.lanes import SIZES, Pointer, address, polynomials
 
 FloatArray = NDArray[np.float64]
 Ratios: TypeAlias = tuple[float, float, float, float, float]
+Six: TypeAlias = tuple[float, float, float, float, float, float, bool]
 
 HALF_PI = math.pi / 2
+_NEAR = 0.25 * math.pi
 
 # Header of a table's array, by index.
-FORMAT, FORM, RADIUS, MODULUS, INVERSE_RADIUS = 0, 1, 2, 3, 4
-LOWEST, SHIFT, FIRST, H_PIECES, Y_PIECES = 5, 6, 7, 8, 9
-SIZE, CORNER, TOLERANCE, MAX_ERROR, WORST_D, WORST_THETA = 10, 11, 12, 13, 14, 15
-CENTRES = 16  # of the pieces of h, each with the inverse of its half width
+FORMAT, FORM, RADIUS, MODULUS, INVERSE_RADIUS, CORNER = 0, 1, 2, 3, 4, 5
+TOLERANCE, MAX_ERROR, WORST_D, WORST_THETA = 6, 7, 8, 9
+START = 16  # of the coefficients: a whole number of cache lines
 
-VERSION = 1.0
+VERSION = 2.0
 
-# The corner h → 0: pieces over y, and terms in h and y of A and B in each; the same for all forms.
-CORNER_PIECES = 6
-CORNER_TERMS = (8, 10)
-CORNER_SIZE = 10 * CORNER_TERMS[0] * CORNER_TERMS[1]
+OCTAVES = 3  # of h above the corner
+LOWEST = 0.5**OCTAVES  # h where the corner begins
+
+# The corner h → 0, the same for all forms: its pieces over y, and the shape of A and of B in each.
+CORNER_PIECES = 2
+CORNER_SHAPE = 8
 
 
 class Form(NamedTuple):
-    """One representation: degrees of its local polynomials and the grid of their pieces."""
+    """One representation: the shape of its local polynomials in h and y, and their pieces."""
 
     name: str
-    nx: int  # degree in h
-    ny: int  # degree in y; with ny = nx all powers, else the triangle between the two
     bits: int  # 2^bits pieces an octave of h
     y_pieces: int
 
 
-# Forms by number, as the header has it, cheapest first. The slabs span all of y, so that where
-# their coefficients stand depends on d alone: they are read while θ's cosine is being computed.
+# Forms by number, as the header has it; the number is also that of the shape. The slabs span all of
+# y, so that where their coefficients stand depends on d alone: they are read while θ's cosine is
+# being computed. Their names tell the degrees in h and in y.
 FORMS = (
-    Form("closed", 0, 0, 0, 0),
-    Form("bilinear", 1, 1, 3, 16),
-    Form("bicubic", 3, 3, 2, 8),
-    Form("quintic", 5, 5, 2, 4),
-    Form("slab 6-11", 6, 11, 2, 1),
-    Form("slab 7-18", 7, 18, 2, 1),
-    Form("slab 10-21", 10, 21, 2, 1),
-    Form("slab 12-28", 12, 28, 2, 1),
+    Form("closed", 0, 0),
+    Form("bilinear", 3, 16),
+    Form("bicubic", 2, 8),
+    Form("quintic", 2, 4),
+    Form("slab 4-10", 3, 1),
+    Form("slab 6-14", 3, 1),
+    Form("slab 8-19", 3, 1),
+    Form("slab 9-23", 3, 1),
 )
 CLOSED = 0
-_SLABS = 4  # the first form that spans all of y
+# The cubes and quintics have to wait for y, and cost more than a slab that errs less.
+CHEAPEST_FIRST = (0, 1, 4, 5, 6, 7)
+
+_BLOCK = 256  # points that `lookups` takes at once, so that they stay in the first cache
+_MANTISSA = 52
+_FRACTION = (1 << _MANTISSA) - 1
+_ONE = 1023 << _MANTISSA  # the bits of 1.0
+_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above LOWEST
 
 
-@kernel
-def _sine_cosine(theta: float) -> tuple[float, float]:
-    """sin θ and cos θ to an ulp, both relative, for |θ| ≤ π/2; inlined, unlike the C library's."""
-    size = abs(theta)
-    far = size > 0.7853981633974483
-    # π/2 − |θ| keeps its digits near π/2, and so does the cosine.
-    r = (HALF_PI - size) + 6.123233995736766e-17 if far else size
-    z = r * r
+@inlined_kernel
+def _near_sine_cosine(theta: float) -> tuple[float, float]:
+    """sin θ and cos θ to an ulp for |θ| ≤ π/4; inlined, unlike the C library's."""
+    z = theta * theta
     z2 = z * z
     z4 = z2 * z2
     p = (-0.16666666666666666 + z * 0.00833333333333095) + z2 * (
@@ -83,163 +88,213 @@ def _sine_cosine(theta: float) -> tuple[float, float]:
         2.4801587298766353e-05 - z * 2.755731727203115e-07
     )
     q += z4 * (2.087614632409855e-09 - z * 1.1382636028190913e-11)
-    sine = r + r * z * p
     half = 0.5 * z
     most = 1.0 - half
-    cosine = most + (((1.0 - most) - half) + z2 * q)
+    return theta + theta * z * p, most + (((1.0 - most) - half) + z2 * q)
+
+
+@inlined_kernel
+def _sine_cosine(theta: float) -> tuple[float, float]:
+    """sin θ and cos θ to an ulp, both relative, for |θ| ≤ π/2."""
+    size = abs(theta)
+    far = size > _NEAR
+    # π/2 − |θ| keeps its digits near π/2, and so does the cosine.
+    sine, cosine = _near_sine_cosine((HALF_PI - size) + 6.123233995736766e-17 if far else size)
     if far:
         sine, cosine = cosine, sine
     return math.copysign(sine, theta), cosine
 
 
-_START_SLABS = CENTRES + 24  # three octaves of four pieces
+@inlined_kernel
+def _piece(h: float, bits: int) -> tuple[int, float]:
+    """Number of the piece of h in (LOWEST, 1], and h's place in it from −1 to 1.
+
+    The float's own bits tell: its exponent the octave, its mantissa the piece and the place. A
+    piece has its upper end, not its lower one.
+    """
+    number = int(np.float64(h).view(np.int64)) - _FIRST
+    fraction = ((number << bits) & _FRACTION) | _ONE
+    return number >> (_MANTISSA - bits), 2.0 * float(np.int64(fraction).view(np.float64)) - 3.0
 
 
-@kernel
-def _evaluate_slab(data: FloatArray, form: int, i: int, x: float, y: float) -> Ratios:
-    """The five ratios of a piece of h. The degrees are literals, as FORMS says."""
-    at = _START_SLABS + i * int(data[SIZE])
+@inlined_kernel
+def _from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
+    """The five ratios by one of the forms that span y. Shapes and strides are literals."""
+    i, x = _piece(h, 3)
+    y = 2.0 * y - 1.0
     if form == 5:
-        ratios: Ratios = slab(data, at, 7, 18, x, y)
+        ratios: Ratios = polynomials(p, START + i * SIZES[5], 5, x, y)
     elif form == 6:
-        ratios = slab(data, at, 10, 21, x, y)
+        ratios = polynomials(p, START + i * SIZES[6], 6, x, y)
     elif form == 4:
-        ratios = slab(data, at, 6, 11, x, y)
+        ratios = polynomials(p, START + i * SIZES[4], 4, x, y)
     else:
-        ratios = slab(data, at, 12, 28, x, y)
+        ratios = polynomials(p, START + i * SIZES[7], 7, x, y)
     return ratios
 
 
 @kernel
-def _evaluate_local(data: FloatArray, form: int, i: int, x: float, y: float) -> Ratios:
-    """The five ratios of the piece of h and y."""
-    count = int(data[Y_PIECES])
+def _from_square(p: Pointer, form: int, h: float, y: float) -> Ratios:
+    """The five ratios by one of the forms in pieces of h and y."""
+    if form == 1:
+        i, x = _piece(h, 3)
+        j, y = _share(y, 16)
+        ratios: Ratios = polynomials(p, START + (16 * i + j) * SIZES[1], 1, x, y)
+    elif form == 2:
+        i, x = _piece(h, 2)
+        j, y = _share(y, 8)
+        ratios = polynomials(p, START + (8 * i + j) * SIZES[2], 2, x, y)
+    else:
+        i, x = _piece(h, 2)
+        j, y = _share(y, 4)
+        ratios = polynomials(p, START + (4 * i + j) * SIZES[3], 3, x, y)
+    return ratios
+
+
+@inlined_kernel
+def _share(y: float, count: int) -> tuple[int, float]:
+    """Which of ``count`` equal parts of [0, 1] has y, and y's place in it from −1 to 1."""
     y *= count
     j = min(int(y), count - 1)
-    y = 2.0 * (y - j) - 1.0
-    at = CENTRES + 2 * int(data[H_PIECES]) + (i * count + j) * int(data[SIZE])
-    if form == 1:
-        ratios: Ratios = square(data, at, 1, x, y)
-    elif form == 2:
-        ratios = square(data, at, 3, x, y)
-    else:
-        ratios = square(data, at, 5, x, y)
-    return ratios
+    return j, 2.0 * (y - j) - 1.0
 
 
 @kernel
-def _evaluate_corner(data: FloatArray, h: float, y: float) -> Ratios:
-    """The five ratios A + B log h below the lowest octave; slower, since no hand works there."""
-    j = min(int(y * CORNER_PIECES), CORNER_PIECES - 1)
-    y = 2.0 * (y * CORNER_PIECES - j) - 1.0
-    x = 2.0 * h / data[LOWEST] - 1.0
+def _from_corner(p: Pointer, h: float, y: float) -> Ratios:
+    """The five ratios A + B log h below the lowest octave."""
+    j, y = _share(y, CORNER_PIECES)
+    x = (2.0 / LOWEST) * h - 1.0
+    at = int(p[CORNER]) + 2 * j * SIZES[CORNER_SHAPE]
+    a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 8, x, y)
+    b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 8, x, y)
     # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
     scale = math.log(max(h, 1e-300))
-    rows, columns = CORNER_TERMS
-    at = int(data[CORNER]) + j * CORNER_SIZE
-    r0 = 0.0
-    r1 = 0.0
-    r2 = 0.0
-    r3 = 0.0
-    r4 = 0.0
-    for _ in range(rows):
-        q0 = 0.0
-        q1 = 0.0
-        q2 = 0.0
-        q3 = 0.0
-        q4 = 0.0
-        for _ in range(columns):
-            q0 = q0 * y + (data[at] + scale * data[at + 5])
-            q1 = q1 * y + (data[at + 1] + scale * data[at + 6])
-            q2 = q2 * y + (data[at + 2] + scale * data[at + 7])
-            q3 = q3 * y + (data[at + 3] + scale * data[at + 8])
-            q4 = q4 * y + (data[at + 4] + scale * data[at + 9])
-            at += 10
-        r0 = r0 * x + q0
-        r1 = r1 * x + q1
-        r2 = r2 * x + q2
-        r3 = r3 * x + q3
-        r4 = r4 * x + q4
-    return r0, r1, r2, r3, r4
+    return (
+        a_f + scale * b_f,
+        a_u + scale * b_u,
+        a_fd + scale * b_fd,
+        a_ft + scale * b_ft,
+        a_ut + scale * b_ut,
+    )
 
 
-@kernel
-def lookup(
-    data: FloatArray, d: float, theta: float
-) -> tuple[float, float, float, float, float, float, bool]:
-    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
-
-    Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
-    gives NaN out.
-    """
-    radius = data[RADIUS]
-    inside = True
-    h = (radius - d) * data[INVERSE_RADIUS]
-    rho2 = d * data[INVERSE_RADIUS] * (1.0 + h)
-    s, c = _sine_cosine(theta)
-    gap = c * c - rho2  # cos² θ u², and h² − sin² θ
-    if not (d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= HALF_PI):
-        if math.isnan(d) or math.isnan(theta):
-            nan = math.nan
-            return nan, nan, nan, nan, nan, nan, False
-        if d <= 0.0:
-            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
-        d, theta, inside = _clamp(radius, d, theta)
-        h = (radius - d) * data[INVERSE_RADIUS]
-        s, c = _sine_cosine(theta)
-        gap = 0.0
-    form = int(data[FORM])
+@inlined_kernel
+def _ratios(
+    p: Pointer, form: int, h: float, s: float, c: float, gap: float
+) -> tuple[float, Ratios]:
+    """1/cos θ and the five ratios; gap = cos² θ u² = h² − sin² θ."""
+    if h > LOWEST:
+        both = 1.0 / (c * h)
+        inverse = both * h
+        y = math.sqrt(gap) * both
+        if form > 3:
+            return inverse, _from_slab(p, form, h, y)
+        return inverse, _from_square(p, form, h, y)
     inverse = 1.0 / c
-    slope = s * inverse
-    push = math.pi * data[MODULUS] * d * inverse
-    force = push * d
-    energy = force * inverse * d * (1.0 / 3.0)
+    s = abs(s)
+    y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
+    return inverse, _from_corner(p, h, y)
+
+
+@inlined_kernel
+def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: bool) -> Six:
+    """What :func:`lookup` gives, in the domain."""
+    form = int(p[FORM])
     if form == CLOSED:
+        inverse = 1.0 / c
+        slope = s * inverse
+        push = math.pi * p[MODULUS] * d * inverse
+        force = push * d
+        energy = force * inverse * d * (1.0 / 3.0)
+        force_d = 2.0 * push
         return (
             force,
             energy,
-            2.0 * push,
+            force_d,
             force * slope,
             force * inverse,
             2.0 * energy * slope,
             inside,
         )
-    if h >= data[LOWEST]:
-        # The float's own bits count the pieces: its exponent the octave, its mantissa within.
-        bits = int(np.float64(h).view(np.int64)) >> int(data[SHIFT])
-        i = min(bits - int(data[FIRST]), int(data[H_PIECES]) - 1)
-        x = (h - data[CENTRES + 2 * i]) * data[CENTRES + 2 * i + 1]
-        y = math.sqrt(gap) * (inverse * (1.0 / h))
-        if form >= _SLABS:
-            ratios = _evaluate_slab(data, form, i, x, 2.0 * y - 1.0)
-        else:
-            ratios = _evaluate_local(data, form, i, x, y)
-    else:
-        s = abs(s)
-        y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
-        ratios = _evaluate_corner(data, h, y)
-    r_f, r_u, r_fd, r_ft, r_ut = ratios
-    force_theta = force * slope * r_ft
-    force *= r_f
+    inverse, (r_f, r_u, r_fd, r_ft, r_ut) = _ratios(p, form, h, s, c, gap)
+    slope = s * inverse
+    push = math.pi * p[MODULUS] * d * inverse
+    force = push * d
+    energy = force * inverse * d * (1.0 / 3.0)
     return (
-        force,
+        force * r_f,
         energy * r_u,
         2.0 * push * r_fd,
-        force_theta,
-        force * inverse,
+        force * slope * r_ft,
+        force * r_f * inverse,
         2.0 * energy * slope * r_ut,
         inside,
     )
 
 
 @kernel
-def _clamp(radius: float, d: float, theta: float) -> tuple[float, float, bool]:
-    """The nearest d and θ of the domain, and whether they were in it (rounding aside)."""
+def _outside(p: Pointer, d: float, theta: float) -> Six:
+    """What :func:`lookup` gives where d or θ is no number, not positive, or past the domain."""
+    if math.isnan(d) or math.isnan(theta):
+        nan = math.nan
+        return nan, nan, nan, nan, nan, nan, False
+    if d <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
+    radius = p[RADIUS]
     inside = d <= radius
     d = min(d, radius)
+    h = (radius - d) * p[INVERSE_RADIUS]
+    if abs(theta) <= HALF_PI:
+        s, c = _sine_cosine(theta)
+        gap = c * c - d * p[INVERSE_RADIUS] * (1.0 + h)
+        if gap >= 0.0:
+            return _at(p, d, h, s, c, gap, inside)
     limit = theta_limit(radius, d)
+    # At the limit itself, rounding may have led here.
     inside = inside and abs(theta) <= limit
-    return d, min(max(theta, -limit), limit), inside
+    s, c = _sine_cosine(min(max(theta, -limit), limit))
+    return _at(p, d, h, s, c, 0.0, inside)
+
+
+@inlined_kernel
+def _lookup(p: Pointer, d: float, theta: float) -> Six:
+    h = (p[RADIUS] - d) * p[INVERSE_RADIUS]
+    rho2 = d * p[INVERSE_RADIUS] * (1.0 + h)
+    s, c = _near_sine_cosine(theta)
+    gap = c * c - rho2
+    if d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= _NEAR:
+        return _at(p, d, h, s, c, gap, True)
+    return _outside(p, d, theta)
+
+
+@inlined_kernel
+def lookup(data: FloatArray, d: float, theta: float) -> Six:
+    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
+
+    Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
+    gives NaN out.
+    """
+    return _lookup(address(data), d, theta)
+
+
+@inlined_kernel
+def _coordinates(p: Pointer, d: FloatArray, theta: FloatArray, work: FloatArray) -> None:
+    """y, h, 1/cos θ and tan θ of a block into ``work`` [4 * _BLOCK].
+
+    y is NaN outside the domain and in the corner, where :func:`lookup` has to be asked.
+    """
+    for i in range(d.shape[0]):
+        h = (p[RADIUS] - d[i]) * p[INVERSE_RADIUS]
+        rho2 = d[i] * p[INVERSE_RADIUS] * (1.0 + h)
+        s, c = _sine_cosine(theta[i])
+        gap = c * c - rho2
+        both = 1.0 / (c * h)
+        # No branch, which would keep the loop out of SIMD lanes.
+        usual = (d[i] > 0.0) & (gap >= 0.0) & (h > LOWEST) & (abs(theta[i]) <= HALF_PI)
+        work[i] = math.sqrt(max(gap, 0.0)) * both if usual else math.nan
+        work[i + _BLOCK] = h
+        work[i + 2 * _BLOCK] = both * h
+        work[i + 3 * _BLOCK] = s * both * h
 
 
 @kernel
@@ -250,8 +305,39 @@ def lookups(
     out: FloatArray,
     inside: NDArray[np.bool_],
 ) -> None:
-    """:func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n]."""
-    for i in range(d.shape[0]):
-        (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i], out[5, i], inside[i]) = lookup(
-            data, d[i], theta[i]
-        )
+    """:func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
+
+    In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
+    """
+    p = address(data)
+    form = int(p[FORM])
+    push = math.pi * p[MODULUS]
+    work = np.empty(4 * _BLOCK)
+    for start in range(0, d.shape[0], _BLOCK):
+        stop = min(start + _BLOCK, d.shape[0])
+        _coordinates(p, d[start:stop], theta[start:stop], work)
+        for k in range(start, stop):
+            y = work[k - start]
+            if math.isnan(y):
+                out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
+                    _lookup(p, d[k], theta[k])
+                )
+                continue
+            r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0
+            if form > 3:
+                r_f, r_u, r_fd, r_ft, r_ut = _from_slab(p, form, work[k - start + _BLOCK], y)
+            elif form != CLOSED:
+                r_f, r_u, r_fd, r_ft, r_ut = _from_square(p, form, work[k - start + _BLOCK], y)
+            inverse = work[k - start + 2 * _BLOCK]
+            slope = work[k - start + 3 * _BLOCK]
+            force_d = 2.0 * push * d[k] * inverse
+            force = 0.5 * force_d * d[k]
+            energy_d = force * inverse
+            energy = energy_d * d[k] * (1.0 / 3.0)
+            out[0, k] = force * r_f
+            out[1, k] = energy * r_u
+            out[2, k] = force_d * r_fd
+            out[3, k] = force * slope * r_ft
+            out[4, k] = energy_d * r_f
+            out[5, k] = 2.0 * energy * slope * r_ut
+            inside[k] = True

@@ -1,19 +1,16 @@
 """Contact tables: force, energy and their partials by lookup, to a proven tolerance.
 
-Holds the lookup kernel and the table as an object and as bytes; how one is built and certified is
-in `table_build`. A table is one flat float64 array, header and coefficients, which is the kernel's
-argument and the file's content alike.
-
-The lookup itself and the array's layout are in `lookup`.
+Holds the table as an object and as bytes. A table is one flat float64 array, header and
+coefficients, which is the kernel's argument and the bytes' content alike. How one is built and
+certified is in `table_build`, the lookup itself and the array's layout in `lookup`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
 import struct
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,7 +42,7 @@ class TableError(Exception):
 
 
 class Contact(NamedTuple):
-    """What a table returns; arrays of the broadcast shape of d and θ."""
+    """What a table returns; arrays of the broadcast shape of d and θ, NumPy numbers for floats."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
@@ -64,6 +61,9 @@ class Certificate(NamedTuple):
     d: float  # [m]
     theta: float  # [rad]
 
+
+# For numbers, which the fields' types do not name; a call's overhead counts there.
+_contact: Any = Contact
 
 _MAGIC = b"SFTIPTAB"
 _CHECK = 32  # bytes of a SHA-256
@@ -99,56 +99,28 @@ class ContactTable:
 
         return cls(build(tip, material, tolerance, form))
 
-    @classmethod
-    def load_or_build(
-        cls, path: Path | str, tip: Fingertip, material: Material, tolerance: float = 1e-9
-    ) -> ContactTable:
-        """The table kept at ``path``, or built and kept there.
-
-        ``path`` is a file, or a folder where the file is named after its key. A damaged or foreign
-        file is replaced; where nothing can be written the table is built all the same.
-        """
-        file = Path(path)
-        if file.is_dir() or not file.suffix:
-            file = file / f"contact-{table_key(tip, material, tolerance).hex()[:16]}.table"
-        try:
-            return cls.load(file, tip, material, tolerance)
-        except (OSError, TableError):
-            table = cls.build(tip, material, tolerance)
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            table.save(file, tip, material)
-        except OSError:
-            pass
-        return table
-
-    def save(self, path: Path | str, tip: Fingertip, material: Material) -> None:
-        """Write the table with its key and checksum; the file appears whole or not at all."""
+    def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
+        """The table with its key and checksum, for :meth:`from_bytes` to read again."""
         key = table_key(tip, material, self.tolerance)
         body = key + struct.pack("<Q", self.data.size) + self.data.astype("<f8").tobytes()
-        target = Path(path)
-        part = target.with_name(f"{target.name}.{os.getpid()}.part")
-        part.write_bytes(_MAGIC + hashlib.sha256(body).digest() + body)
-        part.replace(target)
+        return _MAGIC + hashlib.sha256(body).digest() + body
 
     @classmethod
-    def load(
-        cls, path: Path | str, tip: Fingertip, material: Material, tolerance: float = 1e-9
+    def from_bytes(
+        cls, content: bytes, tip: Fingertip, material: Material, tolerance: float = 1e-9
     ) -> ContactTable:
-        """Read a table that was saved for this tip, material and tolerance by this version.
+        """The table of this tip, material and tolerance that this version made ``content`` of.
 
-        Raises TableError when the file is damaged or belongs to another table, OSError when it
-        can't be read.
+        Raises TableError when it is damaged, belongs to another table or is none.
         """
-        content = Path(path).read_bytes()
         start = len(_MAGIC) + _CHECK
         body = content[start:]
         if content[: len(_MAGIC)] != _MAGIC:
-            raise TableError(f"{path} holds no contact table")
+            raise TableError("it holds no contact table")
         if hashlib.sha256(body).digest() != content[len(_MAGIC) : start]:
-            raise TableError(f"{path} is damaged: its checksum does not match")
+            raise TableError("it is damaged: its checksum does not match")
         if body[:_CHECK] != table_key(tip, material, tolerance):
-            raise TableError(f"{path} belongs to another tip, material, tolerance or version")
+            raise TableError("it belongs to another tip, material, tolerance or version")
         (size,) = struct.unpack_from("<Q", body, _CHECK)
         data = aligned(size)
         data[:] = np.frombuffer(body, dtype="<f8", offset=_CHECK + 8, count=size)
@@ -184,12 +156,15 @@ class ContactTable:
 
         Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged.
         """
+        if type(d) is float and type(theta) is float:
+            *six, inside = lookup(self.data, d, theta)
+            return _contact(*map(np.float64, six), np.bool_(inside), self.max_error)
         shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
-        inside = np.empty(depth.size, dtype=np.bool_)
-        lookups(self.data, depth, tilt, out, inside)
+        within = np.empty(depth.size, dtype=np.bool_)
+        lookups(self.data, depth, tilt, out, within)
         f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
-        return Contact(f, u, f_d, f_theta, u_d, u_theta, inside.reshape(shape), self.max_error)
+        return Contact(f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error)
 
 
 def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:

@@ -11,31 +11,27 @@ from numpy.typing import NDArray
 
 from kinematics.contact import Fingertip, theta_limits
 from kinematics.kernels import kernel
-from kinematics.lanes import LANES, STRIDE, slab_columns, square_columns
+from kinematics.lanes import LANES, SHAPES, SIZES, STRIDE
 from kinematics.lookup import (
-    CENTRES,
+    CHEAPEST_FIRST,
     CLOSED,
     CORNER,
     CORNER_PIECES,
-    CORNER_SIZE,
-    CORNER_TERMS,
-    FIRST,
+    CORNER_SHAPE,
     FORM,
     FORMAT,
     FORMS,
-    H_PIECES,
     INVERSE_RADIUS,
     LOWEST,
     MAX_ERROR,
     MODULUS,
+    OCTAVES,
     RADIUS,
-    SHIFT,
-    SIZE,
+    START,
     TOLERANCE,
     VERSION,
     WORST_D,
     WORST_THETA,
-    Y_PIECES,
     Form,
     lookup,
 )
@@ -46,8 +42,6 @@ from kinematics.table import TableError, aligned
 FloatArray = NDArray[np.float64]
 
 MEMORY_LIMIT = 256 * 1024  # bytes of a table
-_MANTISSA = 52
-_OCTAVES = 3  # of h above the corner, where the ratios contain log h
 _SAFETY = 0.9  # of the tolerance that the fit's own estimate may use up
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
 
@@ -129,13 +123,13 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
         raise TableError(f"no form is called {form!r}; there are {', '.join(names)}")
     law = Law.of(material)
     best = math.inf
-    for number, plan in enumerate(FORMS):
-        if form not in (None, plan.name) or (number == CLOSED and not material.is_linear):
+    for number in CHEAPEST_FIRST if form is None else [names.index(form)]:
+        if number == CLOSED and not material.is_linear:
             continue
         data = _header(tip, law, number, tolerance)
         if data.nbytes > MEMORY_LIMIT:
             continue
-        estimate = _fit(data, law, plan, tolerance) if number != CLOSED else 0.0
+        estimate = _fit(data, law, number, tolerance) if number != CLOSED else 0.0
         if estimate <= _SAFETY * tolerance:
             estimate = certify(data, law)
             if estimate <= tolerance:
@@ -149,52 +143,42 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
 
 def _header(tip: Fingertip, law: Law, number: int, tolerance: float) -> FloatArray:
     """The array with its header filled in, coefficients zero."""
-    form = FORMS[number]
-    h_pieces = _OCTAVES << form.bits if number != CLOSED else 0
-    size = STRIDE * sum(_columns(form))
-    corner = CENTRES + 2 * h_pieces + h_pieces * form.y_pieces * size
-    data = aligned(corner + (CORNER_PIECES * CORNER_SIZE if number != CLOSED else 0))
-    shift = _MANTISSA - form.bits
-    lowest = 0.5**_OCTAVES
-    data[[FORMAT, FORM, TOLERANCE]] = VERSION, number, tolerance
+    pieces = _h_pieces(FORMS[number]) * FORMS[number].y_pieces
+    corner = START + pieces * SIZES[number]
+    corner_size = 2 * CORNER_PIECES * SIZES[CORNER_SHAPE] if number != CLOSED else 0
+    data = aligned(corner + corner_size)
+    data[[FORMAT, FORM, TOLERANCE, CORNER]] = VERSION, number, tolerance, corner
     data[[RADIUS, MODULUS, INVERSE_RADIUS]] = tip.radius, law.modulus, 1.0 / tip.radius
-    data[[LOWEST, SHIFT]] = lowest, shift
-    data[FIRST] = int(np.float64(lowest).view(np.int64)) >> shift
-    data[[H_PIECES, Y_PIECES, SIZE, CORNER]] = h_pieces, form.y_pieces, size, corner
-    for i in range(h_pieces):
-        low, high = _h_piece(form, i)
-        data[CENTRES + 2 * i : CENTRES + 2 * i + 2] = 0.5 * (low + high), 2.0 / (high - low)
     return data
 
 
-def _columns(form: Form) -> list[int]:
-    """How many powers of x the form has for each power of y."""
-    return square_columns(form.nx) if form.nx == form.ny else slab_columns(form.nx, form.ny)
+def _h_pieces(form: Form) -> int:
+    return OCTAVES << form.bits
 
 
 def _h_piece(form: Form, i: int) -> tuple[float, float]:
     octave, part = divmod(i, 1 << form.bits)
-    base = 0.5 ** (_OCTAVES - octave)
+    base = 0.5 ** (OCTAVES - octave)
     width = base / (1 << form.bits)
     return base + part * width, base + (part + 1) * width
 
 
-def _fit(data: FloatArray, law: Law, form: Form, tolerance: float) -> float:
+def _fit(data: FloatArray, law: Law, number: int, tolerance: float) -> float:
     """Fill in a form's coefficients; returns the largest relative error to be expected.
 
     That is the largest sum of the discarded Chebyshev coefficients, over the ratio. Gives up as
     soon as it is too large for the tolerance.
     """
-    columns = _columns(form)
+    form, columns = FORMS[number], SHAPES[number]
     # Two more than needed in each direction, which tell what is left out.
-    x, in_x = _nodes(form.nx + 3)
-    y, in_y = _nodes(form.ny + 3)
+    x, in_x = _nodes(columns[0] + 2)
+    y, in_y = _nodes(len(columns) + 2)
     kept = np.zeros((x.size, y.size), dtype=np.bool_)
     for j, count in enumerate(columns):
         kept[:count, j] = True
-    at = CENTRES + 2 * int(data[H_PIECES])
+    at = START
     estimate = 0.0
-    for i in range(int(data[H_PIECES])):
+    for i in range(_h_pieces(form)):
         low, high = _h_piece(form, i)
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
         for j in range(form.y_pieces):
@@ -213,8 +197,8 @@ def _fit(data: FloatArray, law: Law, form: Form, tolerance: float) -> float:
     for j in range(CORNER_PIECES):
         numbers, misfit = _corner(law, j)
         estimate = max(estimate, misfit)
-        data[at : at + CORNER_SIZE] = numbers
-        at += CORNER_SIZE
+        data[at : at + numbers.size] = numbers
+        at += numbers.size
     return estimate
 
 
@@ -225,8 +209,8 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
     return nodes, np.asarray(inverse, dtype=np.float64)
 
 
-def _powers(terms: FloatArray, columns: list[int]) -> FloatArray:
-    """Chebyshev coefficients [5, x, y] as the numbers that the kernels in `lanes` read."""
+def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
+    """Chebyshev coefficients [5, x, y] as the numbers that the kernel in `lanes` reads."""
     rising = np.einsum(
         "ai,bj,kij->kab",
         _to_powers(terms.shape[1]),
@@ -237,7 +221,7 @@ def _powers(terms: FloatArray, columns: list[int]) -> FloatArray:
     out = np.zeros((sum(columns), STRIDE))
     at = 0
     for j, count in enumerate(columns):
-        out[at : at + count, :LANES] = rising[:, count - 1 :: -1, j].T if count else 0.0
+        out[at : at + count, :LANES] = rising[:, count - 1 :: -1, j].T
         at += count
     return out.reshape(-1)
 
@@ -256,26 +240,25 @@ def _corner(law: Law, piece: int) -> tuple[FloatArray, float]:
     A and B of R = A + B log h are found by least squares in h at each node of y. Only their sum is
     well determined; since it is found linearly, it is interpolated in y as R itself would be.
     """
-    rows, columns = CORNER_TERMS
-    lowest = 0.5**_OCTAVES
+    shape = SHAPES[CORNER_SHAPE]
+    rows, columns = shape[0], len(shape)
     nodes, in_y = _nodes(columns)
     y = (piece + 0.5 * (nodes + 1.0)) / CORNER_PIECES
     near, _ = _nodes(2 * rows)
     h = np.concatenate(
-        [0.5 * lowest * (near + 1.0), lowest * 0.5 ** np.arange(1, _CORNER_DEEPEST, 1.0)]
+        [0.5 * LOWEST * (near + 1.0), LOWEST * 0.5 ** np.arange(1, _CORNER_DEEPEST, 1.0)]
     )
     values = np.moveaxis(_ratios_at(law, h[:, None], y[None, :]), 0, 1).reshape(h.size, -1)
-    basis = chebyshev.chebvander(2.0 * h / lowest - 1.0, rows - 1)
+    basis = chebyshev.chebvander(2.0 * h / LOWEST - 1.0, rows - 1)
     matrix = np.concatenate([basis, basis * np.log(h)[:, None]], axis=1)
     found = np.linalg.lstsq(matrix, values, rcond=1e-14)[0]
     size = np.abs(values).reshape(h.size, LANES, columns)
     size[:, 3] = np.maximum(size[:, 3], size[:, 0])
     misfit = float(np.max(np.abs(matrix @ found - values) / size.reshape(h.size, -1)))
     terms = found.reshape(2, rows, LANES, columns)
-    powers = np.einsum(
-        "ai,bj,pikj->abpk", _to_powers(rows), _to_powers(columns) @ in_y, terms, optimize=True
-    )
-    return powers[::-1, ::-1].reshape(-1), misfit
+    # From values at the nodes of y to coefficients.
+    terms = np.einsum("bj,pikj->pkib", in_y, terms, optimize=True)
+    return np.concatenate([_powers(part, shape) for part in terms]), misfit
 
 
 def _to_powers(count: int) -> FloatArray:

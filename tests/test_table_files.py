@@ -1,0 +1,107 @@
+"""Contact tables in files: kept whole, replaced when damaged, built without a place to keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import table_files
+from daemon.model import make_table
+from daemon.settings import Settings
+from daemon.table_files import load_or_build, load_table, save_table, table_file
+from kinematics import ContactTable, Fingertip, Material
+from kinematics.table import TableError
+
+TIP = Fingertip(0.020)
+CONSTANT = Material.constant(0.304e6)
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+def kept(folder: Path, said: list[str], tolerance: float = 1e-9) -> ContactTable:
+    return load_or_build(folder, TIP, CONSTANT, tolerance, said.append)
+
+
+def test_built_once_and_then_read(
+    tmp_path: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "new" / "cache"
+    first = kept(folder, said)
+    kept(folder, said, 1e-8)
+    assert len(list(folder.iterdir())) == 2
+    monkeypatch.setattr(ContactTable, "build", None)
+    again = kept(folder, said)
+    np.testing.assert_array_equal(first.data, again.data)
+    assert said == []
+
+
+def test_a_file_appears_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "tip.table"
+    table = ContactTable.build(TIP, CONSTANT)
+    save_table(file, table, TIP, CONSTANT)
+    before = file.read_bytes()
+
+    def full(self: Path, content: bytes) -> int:
+        with self.open("wb") as part:
+            part.write(content[:50])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_table(file, ContactTable.build(TIP, CONSTANT, 1e-3), TIP, CONSTANT)
+    assert [path.name for path in tmp_path.iterdir()] == ["tip.table"]
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"# notes", None])
+def test_a_damaged_or_foreign_file_is_replaced(
+    tmp_path: Path, said: list[str], content: bytes | None
+) -> None:
+    kept(tmp_path, said)
+    file = table_file(tmp_path, TIP, CONSTANT, 1e-9)
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]) if content is None else content)
+    with pytest.raises(TableError, match=rf"{file.name}: it (is damaged|holds no)"):
+        load_table(file, TIP, CONSTANT, 1e-9)
+    assert kept(tmp_path, said).form.name == "closed"
+    assert len(said) == 1
+    assert "built anew" in said[0]
+    assert str(file) in said[0]
+    load_table(file, TIP, CONSTANT, 1e-9)
+
+
+def test_a_table_of_another_tip_under_this_name_is_replaced(
+    tmp_path: Path, said: list[str]
+) -> None:
+    other = Fingertip(0.021)
+    file = table_file(tmp_path, TIP, CONSTANT, 1e-9)
+    save_table(file, ContactTable.build(other, CONSTANT), other, CONSTANT)
+    assert kept(tmp_path, said).tip == TIP
+    assert "another tip" in said[0]
+
+
+def test_without_a_place_the_table_is_built_all_the_same(tmp_path: Path, said: list[str]) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert kept(blocked / "cache", said).form.name == "closed"
+    assert "can't be kept" in said[-1]
+    with pytest.warns(RuntimeWarning, match="can't be kept"):
+        load_or_build(blocked, TIP, CONSTANT, 1e-9)
+
+
+def test_the_daemon_keeps_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings()
+    asked = []
+    monkeypatch.setattr(
+        table_files, "table_file", lambda *words: asked.append(words) or tmp_path / "one.table"
+    )
+    table = make_table(settings, CONSTANT, tmp_path)
+    assert asked == [(tmp_path, Fingertip(settings.tip.radius), CONSTANT, settings.table.tolerance)]
+    assert (tmp_path / "one.table").read_bytes()[-table.data.nbytes :] == table.data.tobytes()
