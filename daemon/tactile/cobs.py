@@ -94,6 +94,8 @@ class CobsDecoder(DelimitedDecoder):
         super().__init__(rows, cols, 0, longest_frame(rows, cols))
         self._tables = crc_tables()
         self._scratch = np.zeros(self.longest, np.uint8)
+        # Compiled here, and not when the first frame comes.
+        unpack(np.frombuffer(bytearray(8), np.uint8), self._tables, self._scratch)
         self._reason = ""
         self._bad_crc = 0
         self._missed = 0
@@ -154,8 +156,6 @@ class Cobs(SerialReader):
         def make_decoder() -> CobsDecoder:
             return CobsDecoder(settings.rows, settings.cols)
 
-        make_decoder()  # compiled here, and not when the first frame comes
-        unpack(np.frombuffer(bytearray(8), np.uint8), crc_tables(), np.zeros(8, np.uint8))
         super().__init__(
             settings.port[finger],
             settings.baud,

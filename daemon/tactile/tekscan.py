@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MOST = 1024  # rows or cols
+_LARGEST = 1e12  # of any reading, in its unit
 _LENGTHS = {"": 1e-3, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "inch": 0.0254}
 _RAW = ("raw", "rawsum", "counts", "")
 _PRESSURES = {
@@ -79,8 +80,9 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     rows, cols = _count(header, "ROWS"), _count(header, "COLS")
     numbers, frames = _frames(lines, first, rows, cols)
     values = np.stack(frames)
-    if np.isinf(values).any() or (values < 0.0).any():
-        k, i, j = (int(x) for x in np.argwhere(np.isinf(values) | (values < 0.0))[0])
+    wrong = (values < 0.0) | (values > _LARGEST)
+    if wrong.any():
+        k, i, j = (int(x) for x in np.argwhere(wrong)[0])
         raise TekscanError(f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}")
     live: NDArray[np.bool_] = np.logical_not(np.isnan(values).any(axis=0))
     values[:, ~live] = 0.0

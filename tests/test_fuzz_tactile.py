@@ -1,0 +1,17 @@
+"""A little of the fuzzing of tests/fuzz_tactile.py."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.fuzz_tactile import TARGETS, fuzz
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_no_input_breaks_a_reader(target):
+    report = fuzz(target, 4000, seed=7)
+    assert report.wrong == []
+    assert report.frames > 300
+    assert report.slowest < 0.1
+    if target == "cobs":  # the CRC lets one wrong packet in 65536 through
+        assert report.foreign <= 2
