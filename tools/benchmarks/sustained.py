@@ -1,0 +1,59 @@
+"""A minute of 500 Hz on two servos at 2 Mbaud, paced: which cycles are missed, and through whom."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+
+from daemon.realtime import settle
+from tools.benchmarks.report import Row, row
+from tools.benchmarks.servo_rig import OurCycle, emulated, urgent
+
+_SECONDS = 60.0
+_BAUD = 2_000_000
+_PERIOD = 0.002  # s
+
+
+def measure() -> list[Row]:
+    """Cycles that ended after the next one was due, by what held them up.
+
+    Where it is allowed, both processes run under SCHED_FIFO, so that what else the machine does
+    is left out; the rows say so.
+    """
+    with ExitStack() as stack:
+        cycle = OurCycle(stack.enter_context(emulated(_BAUD, hurry=True)), _BAUD)
+        stack.callback(cycle.close)
+        settle()
+        allowed = stack.enter_context(urgent())
+        return _run(cycle, "SCHED_FIFO" if allowed else "usual scheduling")
+
+
+def _run(cycle: OurCycle, scheduling: str) -> list[Row]:
+    late, work, busy = [], [], []
+    missed = own = unanswered = 0
+    start = deadline = time.monotonic() + 0.01
+    while deadline < start + _SECONDS:
+        time.sleep(max(deadline - time.monotonic(), 0.0))
+        failed = cycle.failed
+        now, cpu = time.monotonic(), time.thread_time()
+        cycle()
+        done, spent = time.monotonic(), time.thread_time() - cpu
+        late.append((now - deadline) * 1e6)
+        work.append((done - now) * 1e6)
+        busy.append(spent * 1e6)
+        deadline += _PERIOD
+        unanswered += cycle.failed - failed
+        if done > deadline:
+            missed += 1
+            # What it computed, and not what it waited for, was too long for the rest of a period.
+            own += spent > 0.5 * _PERIOD
+            deadline = time.monotonic()
+    count = len(work)
+    return [
+        row(f"500 Hz for {_SECONDS:g} s at 2 Mbaud, {scheduling}: a cycle's work", "µs", work),
+        row("  its processor time", "µs", busy, aim=200.0),
+        row("  its wake-up after the deadline", "µs", late),
+        row(f"  cycles of {count} that ended after the next was due", "", [missed]),
+        row("  of them for the program's own computing", "", [own], aim=0.0),
+        row("  replies that did not come in time", "", [unanswered]),
+    ]
