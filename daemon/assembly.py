@@ -18,13 +18,15 @@ from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.loop import EventSink, Loop
 from daemon.model import make_estimator, make_grid, make_material, make_table, make_tip
-from daemon.perception import FingerPerception, ObjectPerception
-from daemon.records import FINGERS, Contact, ObjectPose
+from daemon.perception import FingerPerception
+from daemon.prediction import Prediction
+from daemon.records import FINGERS, Contact, ObjectPose, Reading
 from daemon.servos import make_servos
 from daemon.servos.base import Servos
 from daemon.settings import Settings
 from daemon.stream import Publisher
 from daemon.tactile import make_sensor
+from kinematics.table import ContactTable
 
 
 class Daemon:
@@ -63,17 +65,17 @@ class Daemon:
             self.hand = SimulatedHand(settings, self.clock.now(), self.table)
         self.servos = make_servos(settings, self.clock, self.hand)
         perceptions = self._make_perceptions()
-        objects = None
-        if settings.scene.object_model and len(perceptions) == 2 and self.servos is not None:
-            objects = ObjectPerception(settings)
-        warm_up(settings, perceptions, objects)
+        prediction = None
+        if perceptions and self.servos is not None:
+            prediction = Prediction(settings, self.table)
+        warm_up(settings, self.table, perceptions)
         if self.servos is not None:
             self._connect(self.servos)
         for perception in perceptions:
             self._closers.append(perception.sensor.close)
             perception.sensor.open()
         self.loop = Loop(
-            settings, self.clock, self.servos, perceptions, objects, publisher, server, on_event
+            settings, self.clock, self.servos, perceptions, prediction, publisher, server, on_event
         )
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
@@ -123,9 +125,7 @@ class Daemon:
         self.close()
 
 
-def warm_up(
-    settings: Settings, perceptions: list[FingerPerception], objects: ObjectPerception | None
-) -> None:
+def warm_up(settings: Settings, table: ContactTable, perceptions: list[FingerPerception]) -> None:
     """Run every kernel of the loop once on a made-up contact, on estimators' scratch alone."""
     if not perceptions:
         return
@@ -138,7 +138,10 @@ def warm_up(
     for perception in perceptions:
         for frame in (counts, counts, np.zeros_like(counts)):
             perception.estimate(frame, contacts[perception.finger])
-    if objects is not None:
-        for contact in contacts:
-            contact.valid = contact.contact = True
-        objects.update(contacts, ObjectPose())
+    prediction = Prediction(settings, table)
+    for k in (1, 2):
+        prediction.advance(Reading(t=0.01 * k))
+        for perception in perceptions:
+            made_up = Contact(valid=True, contact=True, d=1e-3, force=1.0, d_std=1e-5)
+            prediction.correct(perception.finger, made_up, contacts[perception.finger])
+        prediction.fill(contacts, ObjectPose())

@@ -11,8 +11,9 @@ import math
 from typing import Any
 
 from daemon.commands import Refused
-from daemon.grip import Grip, Joints
+from daemon.grip import Grip
 from daemon.modes import Command, Mode
+from daemon.prediction import Held
 from daemon.records import FINGERS, Contact, Goal, ObjectPose, Reading
 from daemon.settings import Settings
 
@@ -35,11 +36,13 @@ class Control:
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._has_servos = has_servos
         self._has_sensors = has_sensors
-        self._grip = Grip(settings)
+        self._grip = Grip(settings, self._fingers)
+        self._force = settings.control.force_default  # N that the next grip goes to
         self.mode = Mode.DISARMED
         self.torque = False  # what the servos' torque shall be
         self.events: list[Event] = []
-        self._joints = Joints([0.0, 0.0], [0.0, 0.0])
+        self._reading = Reading()
+        self._held = Held()
         self._contacts = [Contact(), Contact()]
         self._pose = ObjectPose()
         self._goal_q = [0.0, 0.0]  # where the ramps have come to
@@ -119,7 +122,7 @@ class Control:
         else:
             self._hold_here()
             self._touching = [False, False]
-            self._grip.force_target = force
+            self._force = force
         self._enter(Mode.GRASPING)
 
     def _rotate(self, numbers: dict[str, float]) -> None:
@@ -153,14 +156,17 @@ class Control:
             self._gripping = False
 
     def _hold_here(self) -> None:
-        self._goal_q = list(self._joints.q)
-        self._target_q = list(self._joints.q)
+        self._goal_q = list(self._reading.q)
+        self._target_q = list(self._reading.q)
 
     # One tick
 
-    def observe(self, reading: Reading, contacts: list[Contact], pose: ObjectPose) -> None:
+    def observe(
+        self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: Held
+    ) -> None:
         """Take in what the servos and sensors said. Commands are carried out on this picture."""
-        self._joints = Joints(reading.q, reading.dq)
+        self._reading = reading
+        self._held = held
         self._contacts = contacts
         self._pose = pose
 
@@ -179,8 +185,8 @@ class Control:
             self._hold(dt, goal)
         else:
             closing = mode is Mode.GRASPING
-            control, safety = self._settings.control, self._settings.safety
-            bound = control.approach_current if closing else safety.current_move
+            safety = self._settings.safety
+            bound = self._approach_current() if closing else safety.current_move
             for index in self._fingers:
                 goal.q[index] = self._goal_q[index]
                 goal.current[index] = bound
@@ -190,7 +196,7 @@ class Control:
         if self._ramp(step):
             return
         self._waiting += dt
-        off = max(abs(self._joints.q[i] - self._target_q[i]) for i in self._fingers)
+        off = max(abs(self._reading.q[i] - self._target_q[i]) for i in self._fingers)
         if off < _ARRIVED or self._waiting > _GRACE:
             if off >= _ARRIVED:
                 text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
@@ -214,7 +220,7 @@ class Control:
             contact = self._contacts[index]
             touches = contact.contact and contact.force > law.contact_force
             if touches and not self._touching[index]:
-                self._goal_q[index] = self._joints.q[index]
+                self._goal_q[index] = self._reading.q[index]
             self._touching[index] = touches
             if not touches:
                 self._target_q[index] = self._settings.hand.q_max[index]
@@ -223,11 +229,17 @@ class Control:
         if all(self._touching[index] for index in self._fingers):
             felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
             self._gripping = True
-            self._grip.start(self._taking_part(), felt, self._grip.force_target)
+            self._grip.start(self._held, felt, self._force)
         elif not self._ramp(law.approach_speed * dt) and self._waited(dt) > _GRACE:
             self.events.append(("warning", "grasp", "nothing to grasp within the joints' limits"))
             self._hold_here()
             self._enter(Mode.ARMED)
+
+    def _approach_current(self) -> float:
+        """A tip that meets the object before it is felt shall not press beyond the force wanted."""
+        law = self._settings.control
+        pressed = 0.5 * self._force * self._settings.hand.finger_length + law.joint_friction
+        return min(law.approach_current, pressed / law.torque_constant)
 
     def _waited(self, dt: float) -> float:
         self._waiting += dt
@@ -235,11 +247,10 @@ class Control:
 
     def _hold(self, dt: float, goal: Goal) -> None:
         contacts = [self._contacts[index] for index in self._fingers]
-        joints = self._taking_part()
-        torques = self._grip.torques(dt, joints, contacts, self._pose)
-        for index, q, torque in zip(self._fingers, joints.q, torques, strict=True):
-            current = torque / self._settings.control.torque_constant
-            goal.q[index] = q + math.copysign(_REACH, current)
+        torques = self._grip.torques(self._reading, self._contacts, self._pose, self._held)
+        for index in self._fingers:
+            current = torques[index] / self._settings.control.torque_constant
+            goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
             goal.current[index] = abs(current)
         self._watch_contact(dt, contacts)
         self._watch_settling(dt, contacts)
@@ -260,8 +271,6 @@ class Control:
             settled = abs(self._pose.angle - self._grip.angle_target) < _SETTLED_ANGLE
         self._waiting = self._waiting + dt if settled else 0.0
         if self._waiting > _SETTLED_FOR:
+            if self._pose.valid and not self._grip.steering:
+                self._grip.steer(self._pose.angle, self._pose.angle)
             self._enter(Mode.HOLDING)
-
-    def _taking_part(self) -> Joints:
-        q, dq = self._joints
-        return Joints([q[i] for i in self._fingers], [dq[i] for i in self._fingers])

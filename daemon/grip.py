@@ -1,115 +1,159 @@
-"""The grip law: forces and the object's angle to joint torques, once both tips touch.
+"""The grip laws: forces and the object's angle to joint torques, once both tips touch.
 
-Holds the law and its memory; modes and limits are elsewhere. Two fingers have one motion that
-changes the grip (both close) and one that moves the object (q1 + δ, q2 − δ), so the law has two
-parts, the 'serial two-phased' one of the soft-fingertip literature:
+Holds the laws and their memory; modes and limits are elsewhere. Two fingers have one motion that
+changes the grip (both close) and one that moves the object (q1 + δ, q2 − δ), so every law has two
+parts:
 
-1. the object's angle error is integrated and fed antisymmetrically to the joints' goal. The object
-   turns by dφ/dδ = 2 (a − d + L sin q + e cos q) / W, against the fingers' own sense;
-2. joint PD holds that goal on the antisymmetric motion, and the grip is a bias torque: the lever
-   arm times the force wanted, plus an integral of the tactile force error.
+1. *grip*: a bias torque, lever times force wanted, with what the joints' friction takes on the way;
+   a proportional and an integral part on the force felt; damping to the stiffness of the tips;
+2. *steering*, the 'serial two-phased' law of the soft-fingertip literature: the object's angle
+   error is integrated and fed antisymmetrically to the joints' goal, joint PD follows that goal.
+   The object turns by φ̇ = turn1 q̇1 − turn2 q̇2, against the fingers' own sense.
+
+``control.law`` says where the levers come from: ``two_phase`` takes the force's arm about the
+pivot, ``energy`` the gradient of the tables' energy along the rolling increments, in which the
+tips' moments and shear forces are counted, too.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-from daemon.records import Contact, ObjectPose
+from daemon.prediction import Held
+from daemon.records import Contact, ObjectPose, Reading
+from daemon.reference import Reference
 from daemon.settings import Settings
 
-_RAMP = 0.4  # s in which the force goes from what is felt to what is wanted
-_TORQUE_SHARE = 0.5  # the integral's bound, as a share of the feed-forward torque
-
-
-class Joints(NamedTuple):
-    """Angles and velocities of the fingers that take part, as plain floats."""
-
-    q: list[float]
-    dq: list[float]
+_INTEGRAL_SHARE = 0.3  # the integral's bound, as a share of the force wanted
+_STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
 
 
 class Grip:
     """Force control from the tactile estimate, and steering by the antisymmetric joint motion."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, fingers: list[int]) -> None:
+        """``fingers`` take part, left first."""
         self._hand = settings.hand
-        self._law = settings.control
-        self._radius = settings.tip.radius
-        self._width = settings.object.width
-        self.force_target = 0.0
-        self.angle_target = 0.0
+        self._law = law = settings.control
+        self._fingers = fingers
+        self._dt = 1.0 / settings.loop.rate
+        self._by_energy = law.law == "energy" and len(fingers) == 2
+        self._current_max = settings.safety.current_max
+        self.joint_stiffness = law.joint_stiffness
+        self.force = Reference(self._dt, law.smooth_time)
+        self.angle = Reference(self._dt, law.smooth_time)
         self.steering = False
-        self._force = 0.0  # the ramped force
-        self._ramp = 0.0  # its rate [N/s]
-        self._integral = 0.0  # [N]
-        self._angle = 0.0  # the ramped angle
-        self._offset = 0.0  # goal of (q1 − q2)/2
+        self._force_rate = 0.0  # N/s
+        self._integral = 0.0  # N
+        self._offset = 0.0  # goal of (q1 − q2)/2 [rad]
+        self._torques = [0.0, 0.0]
 
-    def start(self, joints: Joints, felt: float, force: float) -> None:
+    @property
+    def force_target(self) -> float:
+        """The grip force that is gone to [N]."""
+        return self.force.target
+
+    @property
+    def angle_target(self) -> float:
+        """The object's angle that is gone to [rad]."""
+        return self.angle.target
+
+    def start(self, held: Held, felt: float, force: float) -> None:
         """Take over from the approach with ``felt`` N on the tips."""
-        self._force = felt
+        self.force.reset(felt)
         self._integral = 0.0
-        self._offset = _antisymmetric(joints.q)
+        self._offset = 0.5 * (held.q[0] - held.q[1])
         self.steering = False
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
         """Go to another grip force [N]."""
-        self.force_target = force
-        self._ramp = max(abs(force - self._force), 0.1 * force) / _RAMP
+        self.force.target = force
+        self._force_rate = max(abs(force - self.force.value), 0.1 * force) / self._law.force_time
 
     def steer(self, present: float, angle: float) -> None:
-        """Turn the object from its present angle to ``angle`` [rad]."""
+        """Turn the object from its ``present`` angle to ``angle`` [rad], and keep it there."""
         if not self.steering:
-            self._angle = present
-        self.angle_target = angle
+            self.angle.reset(present)
+        self.angle.target = angle
         self.steering = True
 
     def torques(
-        self, dt: float, joints: Joints, contacts: list[Contact], pose: ObjectPose
+        self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: Held
     ) -> list[float]:
-        """Joint torques [N·m], positive closing, for the fingers that take part."""
-        felt = sum(contact.force for contact in contacts) / len(contacts)
-        self._force = _toward(self._force, self.force_target, self._ramp * dt)
-        self._integral += 2.0 * math.pi * self._law.force_bandwidth * (self._force - felt) * dt
-        bound = _TORQUE_SHARE * self.force_target
+        """Joint torques [N·m], positive closing; pairs, of which the fingers' places are filled."""
+        torques = self._torques
+        wanted = self.force.step(self._force_rate)
+        push = wanted + self._correction(wanted, contacts)
+        if len(self._fingers) == 1:
+            return self._press(push, reading, held)
+        arm1, arm2 = held.arm
+        stiffness = max(0.5 * (held.stiffness[0] + held.stiffness[1]), _STIFFNESS_MIN)
+        lean = self._steer(pose, held) if self.steering else 0.0
+        # The closing that changes the force as wanted, and that keeps it while the object turns.
+        close = 2.0 * self.force.speed / stiffness
+        close -= (arm1 - arm2) * lean + held.slide * (held.turn[0] + held.turn[1]) * lean
+        close /= arm1 + arm2
+        dq1, dq2 = reading.dq
+        arm = 0.5 * (arm1 + arm2)
+        calm = self._damping(stiffness * arm * arm) * (close - 0.5 * (dq1 + dq2))
+        error = self._offset - 0.5 * (held.q[0] - held.q[1])
+        turn = self.joint_stiffness * error
+        turn += self._damping(self.joint_stiffness) * (lean - 0.5 * (dq1 - dq2))
+        lever1, lever2 = held.lever if self._by_energy else held.arm
+        torques[0] = lever1 * push + calm + turn + self._friction(close + lean)
+        torques[1] = lever2 * push + calm - turn + self._friction(close - lean)
+        return torques
+
+    def _press(self, push: float, reading: Reading, held: Held) -> list[float]:
+        """One finger on an object that stands by itself."""
+        index = self._fingers[0]
+        arm = held.arm[index]
+        stiffness = max(held.stiffness[index], _STIFFNESS_MIN)
+        close = self.force.speed / (stiffness * arm)
+        calm = self._damping(stiffness * arm * arm) * (close - reading.dq[index])
+        self._torques[index] = arm * push + calm + self._friction(close)
+        return self._torques
+
+    def _correction(self, wanted: float, contacts: list[Contact]) -> float:
+        """What the force felt asks for beyond the feed-forward [N]."""
+        law = self._law
+        felt = sum(contacts[i].force for i in self._fingers) / len(self._fingers)
+        error = wanted - felt
+        proportional = law.force_gain * error
+        # Beyond what the servos may give, more error must not be stored.
+        most = self._current_max * law.torque_constant
+        if max(abs(self._torques[i]) for i in self._fingers) < most or error < 0.0:
+            self._integral += 2.0 * math.pi * law.force_bandwidth * error * self._dt
+        bound = _INTEGRAL_SHARE * self.force.target
         self._integral = min(max(self._integral, -bound), bound)
-        grip = self._force + self._integral
-        arms = [self._lever(q) for q in joints.q]
-        if len(arms) == 1:
-            return [grip * arms[0] - self._law.joint_damping * joints.dq[0]]
-        if self.steering and pose.valid:
-            self._steer(dt, joints, contacts, pose)
-        error = self._offset - _antisymmetric(joints.q)
-        rate = _antisymmetric(joints.dq)
-        turn = self._law.joint_stiffness * error - self._law.joint_damping * rate
-        close = -self._law.joint_damping * 0.5 * (joints.dq[0] + joints.dq[1])
-        return [grip * arms[0] + close + turn, grip * arms[1] + close - turn]
+        return proportional + self._integral
 
-    def _steer(self, dt: float, joints: Joints, contacts: list[Contact], pose: ObjectPose) -> None:
-        last = self._angle
-        self._angle = _toward(last, self.angle_target, self._law.rotate_speed * dt)
-        bandwidth = 2.0 * math.pi * self._law.rotate_bandwidth
-        turn = (self._angle - last) + bandwidth * (self._angle - pose.angle) * dt
-        self._offset += turn / self._gain(joints, contacts)
+    def _steer(self, pose: ObjectPose, held: Held) -> float:
+        """Move the antisymmetric goal; returns its rate [rad/s]."""
+        law = self._law
+        angle = self.angle.step(law.rotate_speed)
+        turn = max(held.turn[0] + held.turn[1], 0.1)
+        lean = self.angle.speed / turn
+        if pose.valid:
+            error = angle - pose.angle
+            if self.angle.arrived:
+                error = _beyond(error, held.angle_std)
+            self._offset += 2.0 * math.pi * law.rotate_bandwidth * error / turn * self._dt
+        self._offset += lean * self._dt
+        return lean
 
-    def _gain(self, joints: Joints, contacts: list[Contact]) -> float:
-        """dφ/dδ at the present posture."""
-        hand = self._hand
-        q = 0.5 * (joints.q[0] + joints.q[1])
-        d = 0.5 * (contacts[0].d + contacts[1].d)
-        reach = hand.finger_length * math.sin(q) + hand.finger_offset * math.cos(q)
-        return 2.0 * max(self._radius - d + reach, 0.1 * self._radius) / self._width
+    def _damping(self, stiffness: float) -> float:
+        """N·m·s/rad that damp the joint's inertia on ``stiffness`` [N·m/rad]."""
+        law = self._law
+        return 2.0 * law.damping_ratio * math.sqrt(stiffness * law.joint_inertia)
 
-    def _lever(self, q: float) -> float:
-        """Arm of the normal force about the finger's pivot [m]."""
-        return self._hand.finger_length * math.cos(q) - self._hand.finger_offset * math.sin(q)
+    def _friction(self, rate: float) -> float:
+        """What the joint's friction takes [N·m] at the ``rate`` [rad/s] that is wanted."""
+        law = self._law
+        return law.joint_friction * min(max(rate / law.friction_speed, -1.0), 1.0)
 
 
-def _antisymmetric(pair: list[float]) -> float:
-    return 0.5 * (pair[0] - pair[1]) if len(pair) == 2 else 0.0
-
-
-def _toward(value: float, target: float, step: float) -> float:
-    return min(value + step, target) if value < target else max(value - step, target)
+def _beyond(error: float, noise: float) -> float:
+    """What of an error is more than noise: at rest the joints shall not follow that."""
+    return error - min(max(error, -noise), noise)

@@ -14,8 +14,9 @@ from daemon.clock import Clock
 from daemon.commands import CommandServer, Refused
 from daemon.control import Control
 from daemon.modes import Lease, parse
-from daemon.perception import FingerPerception, JointHistory, ObjectPerception
-from daemon.records import FINGERS, State
+from daemon.perception import FingerPerception
+from daemon.prediction import Held, Prediction
+from daemon.records import FINGERS, Contact, State
 from daemon.safety import Safety
 from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
@@ -37,7 +38,7 @@ class Loop:
         clock: Clock,
         servos: Servos | None,
         perceptions: list[FingerPerception],
-        objects: ObjectPerception | None,
+        prediction: Prediction | None,
         publisher: Publisher | None,
         server: CommandServer | None,
         on_event: EventSink | None = None,
@@ -48,7 +49,8 @@ class Loop:
         self._clock = clock
         self.servos = servos
         self.perceptions = perceptions
-        self._objects = objects
+        self._prediction = prediction
+        self._held = Held() if prediction is None else prediction.held
         self._publisher = publisher
         self._server = server
         self._on_event = on_event
@@ -56,7 +58,7 @@ class Loop:
         self._safety = Safety(settings, servos is not None, bool(perceptions))
         self._lease = Lease(settings.commands.lease)
         self._task = Task.named(settings.task)
-        self._history = JointHistory(0.5, self.period)
+        self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
         self._fingers = ("left" in settings.scene.fingers, "right" in settings.scene.fingers)
         rate = settings.loop.rate
         self._state_every = max(round(rate / settings.stream.state_rate), 1)
@@ -147,20 +149,24 @@ class Loop:
         except ServoError as error:
             reading.valid = False
             self._fail(str(error))
-        if reading.valid:
-            self._history.append(reading.t, reading.q)
+        if reading.valid and self._prediction is not None:
+            self._prediction.advance(reading)
 
     def _feel(self) -> None:
-        new = False
+        contacts, prediction = self.state.contacts, self._prediction
+        if prediction is None:
+            for perception in self.perceptions:
+                perception.update(contacts[perception.finger])
+            return
         for perception in self.perceptions:
-            contact = self.state.contacts[perception.finger]
-            new |= perception.update(contact, self._history)
-        if new and self._objects is not None:
-            self._objects.update(self.state.contacts, self.state.object)
+            finger = perception.finger
+            if perception.update(self._frames[finger]):
+                prediction.correct(finger, self._frames[finger], contacts[finger])
+        prediction.fill(contacts, self.state.object)
 
     def _decide(self) -> None:
         state, control = self.state, self._control
-        control.observe(state.reading, state.contacts, state.object)
+        control.observe(state.reading, state.contacts, state.object, self._held)
         if self._stopping:
             self._stopping = False
             self.command({"command": "stop"})

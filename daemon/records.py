@@ -45,7 +45,7 @@ class Frame:
 
 @dataclass(slots=True)
 class Contact:
-    """What one fingertip feels: the estimate from its newest frame and the table's answer to it."""
+    """What one fingertip feels: the newest frame's estimate, carried on by the joints."""
 
     seq: int = 0  # of the frame
     t: float = 0.0  # when that frame was sampled [s]
@@ -61,7 +61,6 @@ class Contact:
     force: float = 0.0  # F(d, θ) [N]
     energy: float = 0.0  # U(d, θ) [J]
     inside: bool = True  # (d, θ) lies inside the model's domain
-    q: float = 0.0  # the finger's joint angle when the frame was sampled [rad]
 
 
 @dataclass(slots=True)

@@ -86,8 +86,8 @@ def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(
         daemon.loop.advance(0.1)
         assert (state.mode, state.fault) == ("holding", "")
         for finger, contact in enumerate(state.contacts):
-            assert contact.force == pytest.approx(10.0, rel=0.05)
-            assert contact.force == pytest.approx(daemon.hand.force[finger], rel=0.05)
+            assert contact.force == pytest.approx(10.0, rel=0.02)
+            assert contact.force == pytest.approx(daemon.hand.force[finger], rel=0.02)
 
 
 def test_rotate_turns_the_object_to_the_angle_and_keeps_the_grip(make: Make) -> None:
@@ -97,10 +97,10 @@ def test_rotate_turns_the_object_to_the_angle_and_keeps_the_grip(make: Make) -> 
         command(daemon, "rotate", angle=angle)
         advance_to(daemon, "holding", 5.0)
         daemon.loop.advance(1.0)
-        assert daemon.loop.state.object.angle == pytest.approx(angle, abs=math.radians(1.0))
-        assert daemon.hand.object_pose[2] == pytest.approx(angle, abs=math.radians(1.0))
-        assert all(c.force == pytest.approx(8.0, rel=0.15) for c in daemon.loop.state.contacts)
-    assert daemon.loop.state.object.width == pytest.approx(0.040, abs=5e-4)
+        assert daemon.loop.state.object.angle == pytest.approx(angle, abs=math.radians(0.2))
+        assert daemon.hand.object_pose[2] == pytest.approx(angle, abs=math.radians(0.2))
+        assert all(c.force == pytest.approx(8.0, rel=0.1) for c in daemon.loop.state.contacts)
+    assert daemon.loop.state.object.width == pytest.approx(0.040, abs=1e-4)
 
 
 def test_release_opens_the_hand_and_lets_go(make: Make) -> None:
@@ -147,8 +147,7 @@ def test_too_much_force_latches_a_fault_that_waits_for_clear(make: Make) -> None
     advance_to(daemon, "holding", 3.0)
     assert daemon.hand is not None
     # Something squeezes the fingers together, harder than the limit allows.
-    daemon.loop._control._grip.force_target = 9.0
-    daemon.loop._control._grip._force = 9.0
+    daemon.loop._control._grip.retarget(9.0)
     advance_to(daemon, "fault", 3.0)
     state = daemon.loop.state
     assert "above 6 N" in state.fault

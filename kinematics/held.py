@@ -1,0 +1,122 @@
+"""An object held by two rotational fingers: how joint motions move it, and what holds it.
+
+Pure kernels on the coordinates and signs of :mod:`kinematics.fingers`; the tips stick and roll. No
+forces from outside but the fingers' own.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from kinematics.fingers import tip_position, tip_velocity
+from kinematics.kernels import kernel
+from kinematics.table import lookup
+
+_SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
+
+
+@kernel
+def total_tilt(tilt_x: float, tilt_y: float) -> float:
+    """Angle between the object's normal and the tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
+    return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
+
+
+@kernel
+def held_motion(
+    q1: float,
+    q2: float,
+    d1: float,
+    d2: float,
+    angle: float,
+    half_separation: float,
+    length: float,
+    offset: float,
+    radius: float,
+) -> tuple[float, float, float, float, float, float, float]:
+    """(arm1, arm2, turn1, turn2, slide, width, apart) of a held object.
+
+    Rolling without slip gives, with the tips' velocities v_i by q_i,
+
+        φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t
+        ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇      arm1 = v1·n, arm2 = −v2·n
+
+    arm [m] is also the lever of the normal force about the pivot; in the symmetric grasp turn1 +
+    turn2 is 2 (a − d + L sin q + e cos q)/W. ``width`` W [m] is the object's by both contacts, and
+    ``apart`` = (O1 − O2)·t [m].
+    """
+    nx = math.cos(angle)
+    ny = math.sin(angle)
+    x1, y1 = tip_position(q1, 1.0, half_separation, length, offset)
+    x2, y2 = tip_position(q2, -1.0, half_separation, length, offset)
+    vx1, vy1 = tip_velocity(q1, 1.0, length, offset)
+    vx2, vy2 = tip_velocity(q2, -1.0, length, offset)
+    width = d1 + d2 - 2.0 * radius + (x2 - x1) * nx + (y2 - y1) * ny
+    apart = (y1 - y2) * nx - (x1 - x2) * ny
+    bounded = max(width, 0.1 * radius)
+    turn1 = (radius - d1 - (vy1 * nx - vx1 * ny)) / bounded
+    turn2 = (radius - d2 - (vy2 * nx - vx2 * ny)) / bounded
+    return vx1 * nx + vy1 * ny, -(vx2 * nx + vy2 * ny), turn1, turn2, apart, width, apart
+
+
+@kernel
+def sheared_gradient(
+    contact: tuple[float, float, float, float, float, float, bool],
+    d: float,
+    theta: float,
+    tangential: float,
+) -> tuple[float, float]:
+    """(∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N]; ``contact`` as looked up."""
+    force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
+    sine = math.sin(theta)
+    cosine = math.cos(theta)
+    # T = F (sin θ + 2 cos θ d_t/d), solved for d_t/d
+    bend = 0.5 * (tangential / force - sine) / cosine
+    shear = bend * d
+    stretch = shear * (sine + cosine * bend)
+    return (
+        energy_d + force_d * stretch - force * cosine * bend * bend,
+        energy_theta + force_theta * stretch + force * shear * (cosine - sine * bend),
+    )
+
+
+@kernel
+def holding_levers(
+    data: NDArray[float64],
+    d1: float,
+    d2: float,
+    theta1: float,
+    theta2: float,
+    motion: tuple[float, float, float, float, float, float, float],
+) -> tuple[float, float, float]:
+    """(τ1/F, τ2/F, |T|/N): what holds the object in balance, by the energy of a table's ``data``.
+
+    The torques are the energy's gradient along the rolling increments, ``motion`` as
+    :func:`held_motion` gives it,
+
+        τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
+
+    and the object's balance gives one shear force for both tips: T W = N (s1 − s2) + ∂U1/∂θ1 +
+    ∂U2/∂θ2. F is the mean of both tips' forces, so that the levers τ/F [m] don't depend on the
+    modulus. All zero without two contacts.
+    """
+    if not (d1 > 0.0 and d2 > 0.0):
+        return 0.0, 0.0, 0.0
+    arm1, arm2, turn1, turn2, _, width, apart = motion
+    contact1 = lookup(data, d1, theta1)
+    contact2 = lookup(data, d2, theta2)
+    tangential = normal = turning1 = turning2 = 0.0
+    for _ in range(_SHEAR_STEPS):
+        by_d1, turning1 = sheared_gradient(contact1, d1, theta1, tangential)
+        by_d2, turning2 = sheared_gradient(contact2, d2, theta2, tangential)
+        normal = 0.5 * (by_d1 + by_d2 - tangential * (math.tan(theta1) + math.tan(theta2)))
+        tangential = (normal * apart + turning1 + turning2) / width
+    force = 0.5 * (contact1[0] + contact2[0])
+    moment = tangential * width
+    return (
+        (normal * arm1 + turning1 + moment * turn1) / force,
+        (normal * arm2 - turning2 - moment * turn2) / force,
+        abs(tangential) / normal,
+    )
