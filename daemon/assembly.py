@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import zmq
 
+from daemon.calibration import Converter, calibration_for
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.loop import EventSink, Loop
@@ -64,7 +65,7 @@ class Daemon:
 
             self.hand = SimulatedHand(settings, self.clock.now(), self.table)
         self.servos = make_servos(settings, self.clock, self.hand)
-        perceptions = self._make_perceptions()
+        perceptions = self._make_perceptions(cache)
         prediction = None
         if perceptions and self.servos is not None:
             prediction = Prediction(settings, self.table)
@@ -88,7 +89,7 @@ class Daemon:
         self._closers.append(server.close)
         return publisher, server
 
-    def _make_perceptions(self) -> list[FingerPerception]:
+    def _make_perceptions(self, cache: Path | None) -> list[FingerPerception]:
         settings = self.settings
         tactile = settings.tactile
         made = []
@@ -96,12 +97,17 @@ class Daemon:
             sensor = make_sensor(settings, self.clock, self.hand, finger)
             if sensor is None:
                 continue
-            estimator = make_estimator(
-                settings, self.material, finger, getattr(sensor, "live", None)
-            )
-            made.append(
-                FingerPerception(finger, sensor, estimator, self.table, tactile.pascal_per_count)
-            )
+            calibration = calibration_for(settings, finger)
+            material, table, converter = self.material, self.table, None
+            if calibration is not None:
+                converter = Converter(calibration, tactile.pascal_per_count)
+                if calibration.modulus is not None:
+                    material = calibration.modulus.material()
+                    table = make_table(settings, material, cache)
+            live = getattr(sensor, "live", None)  # of a recording that lacks cells
+            estimator = make_estimator(settings, material, finger, live, calibration)
+            scale = tactile.pascal_per_count
+            made.append(FingerPerception(finger, sensor, estimator, table, scale, converter))
         return made
 
     def _connect(self, servos: Servos) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.calibration import Calibration, Converter
 from daemon.settings import MaterialLaw, Settings, SettingsError
 from daemon.table_files import load_or_build
 from kinematics.contact import Fingertip
@@ -42,15 +43,22 @@ def make_table(settings: Settings, material: Material, cache: Path | None) -> Co
     return load_or_build(cache, tip, material, tolerance)
 
 
-def make_grid(settings: Settings, finger: int = 0) -> SensorGrid:
-    """The sensor's cells under one finger."""
+def make_grid(
+    settings: Settings, finger: int = 0, calibration: Calibration | None = None
+) -> SensorGrid:
+    """The sensor's cells under one finger, where the calibration says if there is one."""
     tactile = settings.tactile
+    centre, rotation = tactile.centre, tactile.rotation[finger]
+    if calibration is not None and calibration.centre is not None:
+        centre = calibration.centre.centre
+        if calibration.centre.rotation is not None:
+            rotation = calibration.centre.rotation
     return SensorGrid(
         rows=tactile.rows,
         cols=tactile.cols,
         pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
-        centre=tactile.centre,
-        rotation=tactile.rotation[finger],
+        centre=centre,
+        rotation=rotation,
     )
 
 
@@ -67,20 +75,32 @@ def make_estimator(
     material: Material,
     finger: int = 0,
     live: NDArray[np.bool_] | None = None,
+    calibration: Calibration | None = None,
 ) -> ContactEstimator:
     """An estimator of its own for each finger, since it starts from its last estimate.
 
-    ``live`` tells the cells that there are, beside the settings' dead ones.
+    ``live`` tells the cells that there are, beside the settings' dead ones. With a ``calibration``
+    its frames are the pressures [Pa] of a :class:`Converter`, without one they are counts.
     """
+    tactile = settings.tactile
     alive = live_cells(settings, finger)
+    alive = alive if live is None else alive & live
+    saturation, threshold, quantum = float(tactile.full_count), float(tactile.threshold), 0.0
+    if calibration is not None:
+        converter = Converter(calibration, tactile.pascal_per_count)
+        alive = alive & converter.live
+        saturation, quantum = converter.saturation, converter.quantum
+        # The estimator takes half a count off a threshold, in the frame's unit.
+        threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
     return ContactEstimator(
         make_tip(settings),
         material,
-        make_grid(settings, finger),
+        make_grid(settings, finger, calibration),
         noise=settings.tactile.noise,
         method=settings.estimator.method,
         free_gain=settings.estimator.free_gain,
-        live=alive if live is None else alive & live,
-        saturation=settings.tactile.full_count,
-        threshold=settings.tactile.threshold,
+        live=alive,
+        saturation=saturation,
+        threshold=threshold,
+        quantum=quantum,
     )

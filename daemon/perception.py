@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.calibration import Converter
 from daemon.records import Contact, Frame
 from daemon.tactile.base import TactileSensor
 from kinematics.estimator import ContactEstimator
@@ -28,13 +29,16 @@ class FingerPerception:
         estimator: ContactEstimator,
         table: ContactTable,
         pascal_per_count: float,
+        converter: Converter | None = None,
     ) -> None:
+        """``converter``, where the sensor is calibrated, stands for ``pascal_per_count``."""
         self.finger = finger
         self.sensor = sensor
         self.frame: Frame | None = None
         self._estimator = estimator
         self._table = table.data
-        self._scale = pascal_per_count
+        self._converter = converter
+        self._scale = pascal_per_count if converter is None else 1.0
         self._zero: NDArray[np.uint16] | None = None
         self._tare_sum: NDArray[np.uint32] | None = None
         self._tare_left = 0
@@ -59,13 +63,16 @@ class FingerPerception:
         counts = frame.data
         if self._tare_left:
             self._learn_zero(counts)
+        if self._converter is not None:
+            self.estimate(self._converter(counts), contact)
+            return True
         if self._zero is not None:
             counts = np.maximum(counts, self._zero) - self._zero
         self.estimate(counts, contact)
         return True
 
-    def estimate(self, counts: NDArray[np.uint16], contact: Contact) -> None:
-        """Fill ``contact`` from the counts alone."""
+    def estimate(self, counts: NDArray[np.uint16] | NDArray[np.float64], contact: Contact) -> None:
+        """Fill ``contact`` from counts, or from the pressure [Pa] of a calibrated sensor, alone."""
         estimate = self._estimator.update(counts, self._scale)
         contact.valid = estimate.valid
         contact.contact = estimate.contact
@@ -95,5 +102,10 @@ class FingerPerception:
             self._tare_sum = np.zeros(counts.shape, np.uint32)
         self._tare_sum += counts
         self._tare_left -= 1
-        if not self._tare_left:
-            self._zero = np.round(self._tare_sum / _TARE_FRAMES).astype(np.uint16)
+        if self._tare_left:
+            return
+        mean = self._tare_sum / _TARE_FRAMES
+        if self._converter is not None:
+            self._converter.zero[:] = mean
+        else:
+            self._zero = np.round(mean).astype(np.uint16)

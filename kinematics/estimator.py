@@ -84,9 +84,11 @@ class ContactEstimator:
     modelled pressure; otherwise ``gain`` is taken. ``live`` [rows, cols] bool masks dead cells.
     ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; by
     default an integer type's largest value. ``threshold`` is the smallest count the board sends,
-    0 stands for all below; for integer frames. ``tolerance`` stops the iteration once the squared
-    step, in units of the noise floor, is below it (below 1 where it started from the frame alone):
-    a step leaves an error of its square's order, so one of 4 σ ends well inside the noise.
+    0 stands for all below; for integer frames. ``quantum`` [Pa] is the width of a count where float
+    frames are made of counts, which end at 0; 0 where they are not. ``tolerance`` stops the
+    iteration once the squared step, in units of the noise floor, is below it (below 1 where it
+    started from the frame alone): a step leaves an error of its square's order, so one of 4 σ ends
+    well inside the noise.
     ``peak_level`` and ``patch_level`` set the activity test, see
     :func:`kinematics.activity.activity`; ``explained_min`` is the share of the frame's squared
     pressure below which an estimate is not valid.
@@ -107,6 +109,7 @@ class ContactEstimator:
         live: NDArray[np.bool_] | None = None,
         saturation: float | None = None,
         threshold: float = 0.0,
+        quantum: float = 0.0,
         tolerance: float = 16.0,
         iterations: int = 20,
         peak_level: float = 3.0,
@@ -123,12 +126,15 @@ class ContactEstimator:
             raise ValueError(f"saturation must be positive, got {saturation}")
         if not 0.0 <= threshold < math.inf:
             raise ValueError(f"threshold must not be negative, got {threshold}")
+        if not 0.0 <= quantum < math.inf:
+            raise ValueError(f"quantum must not be negative, got {quantum}")
         if live is not None and np.shape(live) != grid.shape:
             raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
         self.grid = grid
         geometry = grid.geometry(tip)
         rows, cols = grid.shape
         self._saturation = saturation
+        self._quantum = quantum
         self._cells = np.zeros((rows, CELL_PLANES, cols))
         face_integrals(geometry, self._cells)
         self._cells[:, LIVE] = 1.0 if live is None else np.asarray(live, dtype=bool)
@@ -214,7 +220,7 @@ class ContactEstimator:
         ladder.estimate_frame(
             self._frame,
             float(pascal_per_count),
-            0.0 if full == math.inf else float(pascal_per_count),
+            self._quantum if full == math.inf else float(pascal_per_count),
             self._plan,
             self._cells,
             self._tables,

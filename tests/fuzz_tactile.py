@@ -46,17 +46,10 @@ Frame 2
 3,4,5
 @@
 """
-WORDS = tuple(", B Frame @@ nan inf -1 1e999 1e300 é mm3".split()) + (
-    "Frame 9",
-    "ROWS 0",
-    "ROWS 7",
-    "UNITS x",
-    "UNITS RAW",
-    "\n",
-    "\x00",
-    "9" * 30,
-    "ASCII_DATA @@",
-    " ",
+WORDS = (
+    *[",", "B", "Frame", "@@", "nan", "inf", "-1", "1e999", "1e300", "é", "mm3"],
+    *("Frame 9", "ROWS 0", "ROWS 7", "UNITS x", "UNITS RAW"),
+    *("\n", "\x00", "9" * 30, "ASCII_DATA @@", " "),
 )
 
 

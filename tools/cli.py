@@ -18,6 +18,7 @@ SUBCOMMANDS = {
     "monitor": "live terminal page of the running daemon",
     "doctor": "check ports, servos, boards and this machine, and tell what mends them",
     "scan": "find the servos on a port, at any rate",
+    "calibrate": "calibrate the pressure sensor under a tip, step by step",
     "figures": "the paper's figures from this model, as CSV and PNG",
     "bench": "measure run time, beside what a user would otherwise pick",
 }

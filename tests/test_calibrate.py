@@ -1,0 +1,265 @@
+"""`softfinger calibrate`: a made-up sensor, step by step, into a file that the daemon applies."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.calibration import (
+    CalibrationFileError,
+    Converter,
+    load_calibration,
+    save_calibration,
+)
+from daemon.settings import Settings, load
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+from tools.cli import main
+
+TIP = Fingertip(0.020)
+E = 0.25e6
+N = 32
+PITCH = 0.058 / N
+CENTRE = (0.9e-3, -0.6e-3)
+ROTATION = 0.35
+EXPONENT, FACTOR = 1.25, 6.0  # p = FACTOR · x^EXPONENT [Pa]
+NOISE = 1.0  # counts
+PROFILE = f"""
+servos.backend = "none"
+scene.fingers = ["left"]
+loop.clock = "virtual"
+[material]
+law = "constant"
+modulus = {E}
+[tactile]
+backend = "simulated"
+rows = {N}
+cols = {N}
+pitch = {PITCH!r}
+pascal_per_count = 20.0
+full_count = 4095
+noise = 300.0
+sensor = ["A17", "A18"]
+"""
+
+
+class MadeUp:
+    """A sensor whose every property is known."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(5)
+        self.zero = self.rng.uniform(10, 40, (N, N))
+        self.gain = np.clip(1 + 0.1 * self.rng.standard_normal((N, N)), 0.6, 1.4)
+        self.gain[5, 6] = 0.0
+        self.grid = SensorGrid(N, N, PITCH, CENTRE, ROTATION)
+
+    def counts(self, pressure, frames=1):
+        x = (np.maximum(pressure, 0.0) / FACTOR) ** (1 / EXPONENT)
+        noise = NOISE * self.rng.standard_normal((frames, N, N))
+        reading = self.zero + self.gain * x + noise
+        return np.clip(np.round(reading), 0, 4095).astype(np.uint16)
+
+    def press(self, d, theta=0.0, frames=1):
+        return self.counts(self.grid.pressure(TIP, Material.constant(E), d, theta), frames)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """The whole calibration from recordings; the folder with profile.toml and sensor.json."""
+    folder = tmp_path_factory.mktemp("calibration")
+    (folder / "profile.toml").write_text(PROFILE)
+    sensor = MadeUp()
+
+    def keep(name, frames, **truths):
+        np.savez(folder / name, frames=frames, **truths)
+        return str(folder / name)
+
+    def step(name, *words):
+        arguments = ["calibrate", name, str(folder / "sensor.json")]
+        arguments += ["--config", str(folder / "profile.toml"), *words]
+        assert main(arguments) == 0
+
+    rest = keep("rest.npz", sensor.counts(np.zeros((N, N)), 200))
+    step("tare", "--recording", rest, "--plot", str(folder / "tare.png"))
+    loads = [
+        keep(f"air{k}.npz", sensor.counts(np.full((N, N), p), 60))
+        for k, p in enumerate((2e3, 8e3, 15e3))
+    ]
+    step("equilibrate", "--recording", *loads, "--plot", str(folder / "equilibrate.png"))
+    depths = (0.0015, 0.002, 0.003, 0.004)
+    weights = [keep(f"weight{d}.npz", sensor.press(d, frames=60)) for d in depths]
+    forces = [f"{math.pi * E * d * d:.6f}" for d in depths]
+    step("curve", "--recording", *weights, "--force", *forces, "--plot", str(folder / "curve.png"))
+    tilts = (-15.0, -5.0, 5.0, 15.0)
+    presses = [keep(f"tilt{t}.npz", sensor.press(0.003, math.radians(t), 20)) for t in tilts]
+    step(
+        "centre", "--recording", *presses, "--theta", *map(str, tilts),
+        "--plot", str(folder / "centre.png"),
+    )  # fmt: skip
+    d = np.linspace(-0.001, 0.006, 57)
+    frames = np.concatenate([sensor.press(max(x, 0.0)) for x in d])
+    run = keep("run.npz", frames, d=d + 1e-4)  # the run's zero is 0.1 mm off
+    step("modulus", "--recording", run, "--law", "--plot", str(folder / "modulus.png"))
+    return folder, sensor
+
+
+def test_each_step_finds_what_the_sensor_was_made_with(bench):
+    folder, sensor = bench
+    found = load_calibration(folder / "sensor.json")
+    assert found.sensor.label == "A17"
+    assert np.abs(np.array(found.tare.zero) - sensor.zero).max() < 0.5
+    assert found.tare.noise == pytest.approx(math.sqrt(NOISE**2 + 1 / 12), rel=0.05)
+    assert found.equilibrate.dead == 1
+    assert found.equilibrate.gain[5][6] == 0.0
+    assert found.equilibrate.residual < 0.01 < 0.08 < found.equilibrate.spread
+    assert found.curve.coefficients[0] == pytest.approx(EXPONENT, abs=0.01)
+    assert found.curve.residual < 0.005
+    assert found.centre.centre == pytest.approx(CENTRE, abs=3e-5)
+    assert found.centre.rotation == pytest.approx(ROTATION, abs=0.01)
+    assert found.modulus.modulus == pytest.approx(E, rel=0.02)
+    assert found.modulus.offset == pytest.approx(1e-4, abs=2e-5)
+    assert found.modulus.material().stress(0.2) == pytest.approx(0.2 * E, rel=0.02)
+    assert all((folder / f"{step}.png").stat().st_size > 5000 for step in ("tare", "modulus"))
+
+
+def test_counts_become_the_pressure_that_made_them(bench):
+    folder, sensor = bench
+    converter = Converter(load_calibration(folder / "sensor.json"), 20.0)
+    pressure = sensor.grid.pressure(TIP, Material.constant(E), 0.004, 0.2)
+    found = converter(sensor.press(0.004, 0.2)[0]).copy()
+    live = converter.live & (pressure > 5e3)
+    assert np.abs(found[live] / pressure[live] - 1).max() < 0.05
+    assert np.abs(found[~live & (pressure == 0)]).mean() < 50.0
+
+
+def daemon_settings(folder, recording, **tactile) -> Settings:
+    settings = load(folder / "profile.toml")
+    tactile = {
+        "backend": "replay",
+        "recording": (str(recording), ""),
+        "calibration": (str(folder / "sensor.json"), ""),
+        **tactile,
+    }
+    raw = settings.model_dump()
+    raw["tactile"].update(tactile)
+    return Settings.model_validate(raw)
+
+
+def test_the_daemon_applies_the_file(bench, tmp_path):
+    folder, sensor = bench
+    path = tmp_path / "held.npz"
+    np.savez(path, frames=sensor.press(0.003, 0.15, frames=10))
+    with Daemon(daemon_settings(folder, path), wire=False) as daemon:
+        daemon.loop.advance(0.05)
+        contact = daemon.loop.state.contacts[0]
+        assert contact.valid
+        assert contact.d == pytest.approx(0.003, rel=0.02)
+        assert contact.theta == pytest.approx(0.15, abs=0.01)
+        assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
+        assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
+        for perception in daemon.loop.perceptions:
+            perception.tare()  # a new zero is taken in counts, and the converter knows it
+        daemon.loop.advance(0.3)
+        assert daemon.loop.state.contacts[0].d == 0.0
+
+
+@pytest.mark.parametrize(
+    ("tactile", "told"),
+    [
+        ({"sensor": ("B2", "")}, "sensor A17, here B2"),
+        ({"pitch": 0.001}, "pitch 1.812 × 1.812 mm, here 1 × 1 mm"),
+        ({"full_count": 255}, "full_count 4095, here 255"),
+    ],
+)
+def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, told):
+    folder, sensor = bench
+    path = tmp_path / "held.npz"
+    np.savez(path, frames=sensor.press(0.003))
+    with pytest.raises(CalibrationFileError, match=f"another sensor: {told}"):
+        Daemon(daemon_settings(folder, path, **tactile), wire=False)
+
+
+def test_the_tool_refuses_another_sensors_file_and_leaves_it(bench, capsys):
+    folder, _ = bench
+    before = (folder / "sensor.json").read_bytes()
+    words = ["--config", str(folder / "profile.toml"), "--finger", "right"]
+    words += ["--recording", str(folder / "rest.npz")]
+    assert main(["calibrate", "tare", str(folder / "sensor.json"), *words]) == 1
+    assert "finger left, here right" in capsys.readouterr().err
+    assert (folder / "sensor.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["curve", "--recording", "rest.npz"], "expected --force or --d"),
+        (["curve", "--recording", "rest.npz", "--force", "1", "2"], "2 values for 1 loads"),
+        (["modulus", "--recording", "rest.npz"], "expected --d"),
+        (["centre", "--recording", "rest.npz"], "press 1 is no clean contact"),
+        (["tare", "--recording", "none.npz"], "No such file"),
+    ],
+)
+def test_what_cannot_be_done_is_told_and_changes_nothing(bench, capsys, words, told):
+    folder, _ = bench
+    before = (folder / "sensor.json").read_bytes()
+    words = [str(folder / word) if word.endswith(".npz") else word for word in words]
+    step = [words[0], str(folder / "sensor.json"), *words[1:]]
+    assert main(["calibrate", *step, "--config", str(folder / "profile.toml")]) == 1
+    assert told in capsys.readouterr().err
+    assert (folder / "sensor.json").read_bytes() == before
+
+
+def test_frames_may_come_live_from_the_profiles_sensor(tmp_path, capsys):
+    profile = tmp_path / "live.toml"
+    profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
+    file = tmp_path / "sensor.json"
+    words = ["--config", str(profile), "--frames", "8"]
+    assert main(["calibrate", "tare", str(file), *words]) == 0
+    assert load_calibration(file).tare.frames == 8
+    assert "8 frames" in capsys.readouterr().out
+
+
+def spoilt(content, change):
+    content = json.loads(json.dumps(content))
+    change(content)
+    return json.dumps(content)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda c: c.update(format=2), "format"),
+        (lambda c: c.update(colour="red"), "colour"),
+        (lambda c: c["tare"].update(zero=[[1.0]]), "expected 32 rows"),
+        (lambda c: c["tare"]["zero"][3].__setitem__(4, -1.0), "below 0"),
+        (lambda c: c["tare"]["zero"][3].__setitem__(4, float("nan")), "tare"),
+        (lambda c: c["curve"].update(coefficients=[1.0, 5.0, -1.0, 0.0]), "doesn't rise"),
+        (lambda c: c["curve"].update(coefficients=[1.2, -5.0, 0.0, 0.0]), "doesn't rise"),
+        (lambda c: c["modulus"].update(stress=[1.0]), "modulus"),
+        (lambda c: c["sensor"].pop("rows"), "sensor.rows"),
+    ],
+)
+def test_a_spoilt_file_is_refused_with_the_place(bench, tmp_path, change, told):
+    content = json.loads((bench[0] / "sensor.json").read_text())
+    path = tmp_path / "bad.json"
+    path.write_text(spoilt(content, change))
+    with pytest.raises(CalibrationFileError, match=told):
+        load_calibration(path)
+
+
+def test_a_file_is_written_whole_or_not_at_all(bench, tmp_path):
+    calibration = load_calibration(bench[0] / "sensor.json")
+    path = tmp_path / "sensor.json"
+    save_calibration(path, calibration)
+    assert load_calibration(path) == calibration
+    assert [each.name for each in tmp_path.iterdir()] == ["sensor.json"]
+    (tmp_path / "taken.json").mkdir()
+    (tmp_path / "taken.json" / "x").write_text("")
+    with pytest.raises(CalibrationFileError, match="can't be written"):
+        save_calibration(tmp_path / "taken.json", calibration)
+    assert not (tmp_path / "taken.json.new").exists()

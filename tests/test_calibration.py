@@ -1,0 +1,167 @@
+"""The mathematics of calibration: each step recovers what a sensor was made with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kinematics.calibration import (
+    CalibrationError,
+    cleared,
+    equilibrate,
+    fit_centre,
+    fit_curve,
+    fit_law,
+    fit_modulus,
+    tare,
+    to_pressure,
+)
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+
+TIP = Fingertip(0.020)
+E = 0.304e6
+LINEAR = Material.constant(E)
+GRID = SensorGrid(32, 32, 0.058 / 32)
+AREA = (0.058 / 32) ** 2
+RNG = np.random.default_rng(11)
+
+
+def force(d: float, theta: float = 0.0) -> float:
+    return math.pi * E * d * d / math.cos(theta)
+
+
+def test_tare_is_the_mean_of_each_cell():
+    zero = RNG.uniform(0, 20, (4, 5))
+    noise = RNG.uniform(0.5, 2.0, (4, 5))
+    found = tare(zero + noise * RNG.standard_normal((4000, 4, 5)))
+    np.testing.assert_allclose(found.zero, zero, atol=0.2)
+    np.testing.assert_allclose(found.noise, noise, rtol=0.08)
+
+
+def test_equilibration_makes_cells_alike_and_finds_the_dead():
+    gain = 1.0 + 0.2 * RNG.standard_normal((8, 8))
+    gain[2, 3] = 0.0
+    loads = [5.0 + gain * level + 0.5 * RNG.standard_normal((50, 8, 8)) for level in (40, 90, 160)]
+    found = equilibrate(loads, np.full((8, 8), 5.0))
+    assert found.gain[2, 3] == 0.0
+    made = found.gain * gain
+    live = gain > 0
+    assert np.ptp(made[live] / made[live].mean()) < 0.01
+    assert found.spread == pytest.approx(np.std(gain[live]) / gain[live].mean(), rel=0.05)
+    assert found.residual < 2e-3
+
+
+@pytest.mark.parametrize("kind", ["power", "cubic"])
+def test_the_curve_is_found_from_known_weights(kind):
+    # The sensor answers p = p(x); x is found from the model's pressure by interpolation.
+    x = np.linspace(0, 1000, 4001)
+    true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
+    depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
+    readings = [np.interp(GRID.pressure(TIP, LINEAR, d), true, x) for d in depths]
+    # The stiffest scale would overflow the table.
+    if kind == "power":
+        readings = [(GRID.pressure(TIP, LINEAR, d) / 0.9) ** (1 / 1.4) for d in depths]
+    found = fit_curve(kind, readings, [force(d) for d in depths], AREA, 4000.0)
+    assert found.residual < 1e-4
+    if kind == "power":
+        assert found.coefficients[:2] == pytest.approx((1.4, 0.9), rel=1e-3)
+    else:
+        assert found.coefficients == pytest.approx((1.0, 60, 0.08, 5e-5), rel=0.02)
+    out = np.empty((1, 4))
+    probe = np.array([[0, 100, 400, 900]], np.uint16)
+    to_pressure(probe, np.zeros((1, 4)), np.ones((1, 4)), np.array(found.coefficients), out)
+    expected = 0.9 * probe**1.4 if kind == "power" else 60 * probe + 0.08 * probe**2.0
+    expected = expected if kind == "power" else expected + 5e-5 * probe**3.0
+    np.testing.assert_allclose(out, expected, rtol=2e-3)
+
+
+def test_to_pressure_equals_its_plain_twin():
+    counts = RNG.integers(0, 4000, (6, 7)).astype(np.uint16)
+    zero, gain = RNG.uniform(0, 900, (6, 7)), RNG.uniform(0, 2, (6, 7))
+    x = np.maximum(counts - zero, 0) * gain
+    for curve in ((1.0, 3.0, 0.02, -1e-6), (0.7, 5.0, 0.0, 0.0)):
+        out = np.empty((6, 7))
+        to_pressure(counts, zero, gain, np.array(curve), out)
+        b, c1, c2, c3 = curve
+        plain = c1 * x + c2 * x**2 + c3 * x**3 if b == 1 else c1 * x**b
+        np.testing.assert_allclose(out, plain, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.3, -2.0])
+def test_centre_and_rotation_are_found_from_tilted_presses(rotation):
+    true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=rotation)
+    tilts = np.radians([-15.0, -5.0, 0.0, 10.0, 20.0])
+    noise = 600.0
+    frames = [
+        true.pressure(TIP, LINEAR, 0.004, t) + noise * RNG.standard_normal((32, 32)) for t in tilts
+    ]
+    found = fit_centre(frames, tilts, TIP, LINEAR, GRID, noise)
+    assert found.centre == pytest.approx(true.centre, abs=2e-5)
+    assert found.rotation == pytest.approx(rotation, abs=5e-3)
+    assert found.scale == pytest.approx(1.0, abs=5e-3)
+    assert found.residual < 3e-5
+
+
+def test_upright_presses_tell_the_centre_and_no_rotation():
+    true = SensorGrid(32, 32, 0.058 / 32, centre=(-2e-3, 1e-3))
+    frames = [true.pressure(TIP, LINEAR, d) for d in (0.002, 0.004)]
+    found = fit_centre(frames, [0.0, 0.0], TIP, LINEAR, GRID, 600.0)
+    assert found.centre == pytest.approx(true.centre, abs=2e-6)
+    assert found.rotation is None
+
+
+def test_the_modulus_of_a_compression_run_with_an_unknown_zero():
+    d = np.linspace(0.001, 0.008, 15)
+    theta = np.where(np.arange(15) % 2, 0.3, 0.0)
+    load = math.pi * E * (d - 2e-4) ** 2 / np.cos(theta)
+    found = fit_modulus(d, theta, load)
+    assert found.modulus == pytest.approx(E, rel=1e-9)
+    assert found.offset == pytest.approx(2e-4, rel=1e-6)
+    assert found.residual < 1e-9
+    rough = fit_modulus(d, theta, load, free_offset=False)
+    assert rough.residual > 0.02
+
+
+def test_the_law_of_a_compression_run_is_that_of_the_tip():
+    true = Material.table_i()
+    d = np.linspace(0.002, 0.010, 9)
+    frames = [GRID.pressure(TIP, true, x) + 200.0 * RNG.standard_normal((32, 32)) for x in d]
+    found = fit_law(frames, d, np.zeros(9), TIP, GRID)
+    at = np.linspace(0.05, 0.48, 20)
+    np.testing.assert_allclose(found.material.stress(at), true.stress(at), rtol=0.01)
+    assert found.residual < 400.0
+
+
+def test_clipped_noise_far_from_the_contact_is_cleared():
+    noise = np.full((32, 32), 3.0)
+    reading = np.maximum(3.0 * RNG.standard_normal((16, 32, 32)).mean(axis=0), 0.0)
+    assert cleared(reading, noise, 16).sum() <= 0.01 * reading.sum() + 8.0
+    reading[4, 4] = 50.0
+    assert cleared(reading, noise, 16)[4, 4] == 50.0
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: tare(np.zeros((1, 4, 4))), "too few"),
+        (lambda: tare(np.zeros((4, 4))), r"\[n, rows, cols\]"),
+        (lambda: tare(np.full((3, 4, 4), np.nan)), "not finite"),
+        (lambda: equilibrate([], np.zeros((4, 4))), "no uniform"),
+        (lambda: equilibrate([np.zeros((2, 4, 4))], np.zeros((4, 4))), "read nothing"),
+        (lambda: fit_curve("cubic", np.ones((2, 4, 4)), [1, 2], 1e-6, 10), "at least 3"),
+        (lambda: fit_curve("power", np.ones((2, 4, 4)), [1, -2], 1e-6, 10), "above 0"),
+        (lambda: fit_curve("power", np.zeros((2, 4, 4)), [1, 2], 1e-6, 10), "reads nothing"),
+        (lambda: fit_curve("cubic", np.ones((3, 4, 4)), [1, 2, 3], 1e-6, 10), "too alike"),
+        (lambda: fit_centre(np.zeros((1, 32, 32)), [0], TIP, LINEAR, GRID, 600), "press 1"),
+        (lambda: fit_modulus([0.001, 0.002], [0, 0], [1, 2]), "at least three"),
+        (lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1]), "does not rise"),
+        (lambda: fit_law(np.zeros((1, 32, 32)), [0.004], [0], TIP, GRID), "no stress-strain law"),
+    ],
+)
+def test_data_that_do_not_tell_are_refused(call, told):
+    with pytest.raises(CalibrationError, match=told):
+        call()

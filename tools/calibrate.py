@@ -1,0 +1,345 @@
+"""``softfinger calibrate``: one step of calibrating the sensor under one tip, and its file.
+
+Arguments, and the way from frames to a step's result. The mathematics is in
+`kinematics.calibration`, the file in `daemon.calibration`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daemon.settings import Settings, SettingsError, load
+
+if TYPE_CHECKING:
+    from daemon.calibration import Calibration, Converter
+    from tools.calibration_frames import Loads
+
+STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
+_EPILOG = """\
+steps, in this order; each goes into FILE, where the others stay:
+  tare         unloaded: the zero of each cell
+  equilibrate  several uniform pressures: what makes the cells alike, which are dead
+  curve        known weights upright on the tip (--force), or a run of known displacement (--d)
+  centre       presses upright or of known tilt (--theta): where the tip stands, the rotation
+  modulus      a run of known displacement (--d): E, or with --law the curve stress over strain
+
+Frames come live from the sensor of the profile, load by load, or from recordings: one for each
+load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
+A new equilibrate drops curve and modulus, a new curve drops modulus: they were made with the old.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``calibrate``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("step", choices=STEPS)
+    parser.add_argument("file", type=Path, metavar="FILE", help="the calibration; made if absent")
+    parser.add_argument("--finger", choices=("left", "right"), default="left")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    parser.add_argument(
+        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
+    )
+    parser.add_argument(
+        "--recording", type=Path, nargs="+", default=[], metavar="R", help="instead of the sensor"
+    )
+    parser.add_argument("--frames", type=int, default=64, help="live frames a load (default 64)")
+    parser.add_argument(
+        "--loads", type=int, default=0, help="equilibrate: how many pressures, live"
+    )
+    for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
+        parser.add_argument(
+            f"--{name}",
+            type=float,
+            nargs="+",
+            default=[],
+            metavar="X",
+            help=f"of the loads [{unit}]",
+        )
+    parser.add_argument("--kind", choices=("power", "cubic"), default="power", help="of the curve")
+    parser.add_argument("--law", action="store_true", help="modulus: the whole stress-strain curve")
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="draw the residuals (extra 'plot')"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Do one step; 1 with one line when it can't be done, and then the file is as it was."""
+    try:
+        settings = load(arguments.config, arguments.dir)
+    except SettingsError as error:
+        print(error, file=sys.stderr)
+        return 2
+    from daemon.calibration import save_calibration
+    from daemon.tactile.base import TactileError
+    from daemon.tactile.recording import RecordingError
+    from kinematics.calibration import CalibrationError
+    from tools.calibration_frames import gather
+
+    try:
+        draw = _drawer(arguments.plot)
+        calibration = _begin(arguments, settings)
+        loads = gather(arguments, settings, calibration.sensor)
+        calibration, line, picture = _STEP[arguments.step](arguments, settings, calibration, loads)
+        save_calibration(arguments.file, calibration)
+        print(f"{arguments.step}: {line}; written to {arguments.file}")
+        if draw is not None:
+            draw(arguments.step, picture, arguments.plot)
+    except (SettingsError, TactileError, RecordingError, CalibrationError, _NoPlot) as error:
+        print(f"calibrate: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+class _NoPlot(Exception):
+    """The picture can't be drawn."""
+
+
+def _drawer(path: Path | None) -> Any:
+    """The function that draws, known to work before anything is measured; None without --plot."""
+    if path is None:
+        return None
+    from tools.calibration_plot import draw
+    from tools.figure_pages.style import NoMatplotlib, settings
+
+    try:
+        settings()
+    except NoMatplotlib as error:
+        raise _NoPlot(f"--plot: {error}") from None
+    return draw
+
+
+def _begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
+    """The file's calibration, or a new one; refuses the file of another sensor."""
+    from daemon.calibration import (
+        Calibration,
+        CalibrationFileError,
+        difference,
+        load_calibration,
+        now,
+        sensor_of,
+    )
+
+    sensor = sensor_of(settings, 0 if arguments.finger == "left" else 1)
+    if not arguments.file.exists():
+        return Calibration(sensor=sensor, date=now())
+    calibration = load_calibration(arguments.file)
+    wrong = difference(calibration.sensor, sensor)
+    if wrong:
+        raise CalibrationFileError(
+            f"{arguments.file}: this is the calibration of another sensor: {wrong}"
+        )
+    return calibration
+
+
+def _put(calibration: Calibration, **steps: Any) -> Calibration:
+    from daemon.calibration import now
+
+    return calibration.model_copy(update={"date": now(), **steps})
+
+
+def _converter(settings: Settings, calibration: Calibration) -> Converter:
+    from daemon.calibration import Converter
+
+    return Converter(calibration, settings.tactile.pascal_per_count)
+
+
+_Done = tuple["Calibration", str, dict[str, Any]]
+
+
+def _tare(_: Any, settings: Settings, calibration: Calibration, loads: Loads) -> _Done:
+    import numpy as np
+
+    from daemon.calibration import TareStep, now
+    from kinematics.calibration import tare
+
+    found = tare(np.concatenate(loads.frames))
+    noise = float(np.median(found.noise))
+    count = sum(map(len, loads.frames))
+    step = TareStep(date=now(), zero=found.zero.tolist(), noise=noise, frames=count)
+    line = f"{count} frames, zero up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
+    return _put(calibration, tare=step), line, {"zero": found.zero, "noise": found.noise}
+
+
+def _equilibrate(_: Any, settings: Settings, calibration: Calibration, loads: Loads) -> _Done:
+    import numpy as np
+
+    from daemon.calibration import EquilibrateStep, now
+    from kinematics.calibration import equilibrate
+
+    zero = _converter(settings, calibration).zero
+    found = equilibrate(loads.frames, zero)
+    dead = int(np.count_nonzero(found.gain == 0.0))
+    step = EquilibrateStep(
+        date=now(),
+        gain=found.gain.tolist(),
+        dead=dead,
+        spread=found.spread,
+        residual=found.residual,
+    )
+    line = (
+        f"{len(loads.frames)} pressures, cells differ by {found.spread:.2%} rms, after it by "
+        f"{found.residual:.2%}; {dead} dead"
+    )
+    done = _put(calibration, equilibrate=step, curve=None, modulus=None)
+    return done, line, {"gain": found.gain}
+
+
+def _readings(settings: Settings, calibration: Calibration, loads: Loads) -> list[Any]:
+    """Each load's mean reading, cleared of noise far from the contact."""
+    import numpy as np
+
+    from kinematics.calibration import cleared
+
+    converter = _converter(settings, calibration)
+    noise = calibration.tare.noise if calibration.tare else 0.0
+    spread = np.full(converter.zero.shape, noise)
+    return [
+        cleared(converter.readings(frames.mean(axis=0)), spread, len(frames))
+        for frames in loads.frames
+    ]
+
+
+def _curve(
+    arguments: argparse.Namespace, settings: Settings, calibration: Calibration, loads: Loads
+) -> _Done:
+    import numpy as np
+
+    from daemon.calibration import CurveStep, now
+    from daemon.model import make_material, make_tip
+    from kinematics.calibration import CalibrationError, fit_curve
+    from kinematics.pressure import SensorGrid
+
+    sensor = calibration.sensor
+    area = sensor.pitch[0] * sensor.pitch[1]
+    force = loads.truths.get("force")
+    if force is None:
+        d = loads.truths.get("d")
+        if d is None:
+            raise CalibrationError("curve: expected --force or --d, or a run that has them")
+        # The force that the profile's material makes, over all of its footprint.
+        grid = SensorGrid(sensor.rows, sensor.cols, sensor.pitch)
+        tip, material = make_tip(settings), make_material(settings.material)
+        theta = loads.truths.get("theta", np.zeros(len(d)))
+        force = np.array(
+            [grid.pressure(tip, material, float(x), float(t)).sum() * area
+             for x, t in zip(d, theta, strict=True)]
+        )  # fmt: skip
+    readings = _readings(settings, calibration, loads)
+    full = float(sensor.full_count) * max(
+        map(max, calibration.equilibrate.gain) if calibration.equilibrate else [1.0]
+    )
+    found = fit_curve(arguments.kind, readings, force, area, full)
+    step = CurveStep(
+        date=now(), kind=found.kind, coefficients=found.coefficients, residual=found.residual
+    )
+    line = f"{found.kind} from {len(force)} loads, their forces met within {found.residual:.2%} rms"
+    picture = {"force": force, "errors": found.errors}
+    return _put(calibration, curve=step, modulus=None), line, picture
+
+
+def _pressures(settings: Settings, calibration: Calibration, loads: Loads) -> Any:
+    """Each load's mean pressure [Pa], [loads, rows, cols]."""
+    import numpy as np
+
+    converter = _converter(settings, calibration)
+    return np.stack(
+        [np.mean([converter(frame) for frame in frames], axis=0) for frames in loads.frames]
+    )
+
+
+def _centre(_: Any, settings: Settings, calibration: Calibration, loads: Loads) -> _Done:
+    import math
+
+    import numpy as np
+
+    from daemon.calibration import CentreStep, now
+    from daemon.model import make_material, make_tip
+    from kinematics.calibration import fit_centre
+    from kinematics.pressure import SensorGrid
+
+    sensor, tactile = calibration.sensor, settings.tactile
+    theta = loads.truths.get("theta", np.zeros(len(loads.frames)))
+    found = fit_centre(
+        _pressures(settings, calibration, loads),
+        theta,
+        make_tip(settings),
+        make_material(settings.material),
+        SensorGrid(sensor.rows, sensor.cols, sensor.pitch),
+        tactile.noise,
+        _converter(settings, calibration).live,
+    )
+    step = CentreStep(
+        date=now(),
+        centre=found.centre,
+        rotation=found.rotation,
+        scale=found.scale,
+        residual=found.residual,
+    )
+    x, y = found.centre
+    turned = (
+        "rotation not measured: no press was tilted"
+        if found.rotation is None
+        else f"rotation {math.degrees(found.rotation):.2f}°, travel {found.scale:.3f} of the model"
+    )
+    line = f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) mm; {turned}; {found.residual * 1e6:.0f} µm rms"
+    return _put(calibration, centre=step), line, {"theta": theta, "centre": found}
+
+
+def _modulus(
+    arguments: argparse.Namespace, settings: Settings, calibration: Calibration, loads: Loads
+) -> _Done:
+    import numpy as np
+
+    from daemon.calibration import ModulusStep, now
+    from daemon.model import make_grid, make_tip
+    from kinematics.calibration import CalibrationError, fit_law, fit_modulus
+
+    d = loads.truths.get("d")
+    if d is None:
+        raise CalibrationError("modulus: expected --d, or a run that has d")
+    theta = loads.truths.get("theta", np.zeros(len(d)))
+    finger = 0 if calibration.sensor.finger == "left" else 1
+    area = calibration.sensor.pitch[0] * calibration.sensor.pitch[1]
+    readings = _readings(settings, calibration, loads)
+    converter = _converter(settings, calibration)
+    pressure = _pressures(settings, calibration, loads)
+    force = np.array(
+        [each[reading > 0.0].sum() for each, reading in zip(pressure, readings, strict=True)]
+    )
+    force *= area
+    found = fit_modulus(d, theta, force)
+    line = (
+        f"E = {found.modulus / 1e6:.4f} MPa from {len(d)} frames, zero of d at "
+        f"{found.offset * 1e3:.3f} mm, force met within {found.residual:.2%} rms"
+    )
+    strain: list[float] = []
+    stress: list[float] = []
+    if arguments.law:
+        grid = make_grid(settings, finger, calibration)
+        pressure[:, ~converter.live] = 0.0
+        law = fit_law(pressure, d - found.offset, theta, make_tip(settings), grid)
+        strain, stress = law.strain.tolist(), law.stress.tolist()
+        line += f"; law of {len(strain)} points, cells {law.residual:.0f} Pa rms from it"
+    step = ModulusStep(
+        date=now(),
+        modulus=found.modulus,
+        strain=strain,
+        stress=stress,
+        offset=found.offset,
+        residual=found.residual,
+    )
+    picture = {"d": d, "theta": theta, "force": force, "fit": found, "law": (strain, stress)}
+    return _put(calibration, modulus=step), line, picture
+
+
+_STEP = {
+    "tare": _tare,
+    "equilibrate": _equilibrate,
+    "curve": _curve,
+    "centre": _centre,
+    "modulus": _modulus,
+}
