@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,7 +45,7 @@ class Fingertip:
 
 
 class Closed(NamedTuple):
-    """Closed forms of a constant modulus; arrays of the broadcast shape of d and θ."""
+    """Closed forms; arrays of the broadcast shape of d and θ, NumPy numbers for floats."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
@@ -53,6 +53,10 @@ class Closed(NamedTuple):
     force_theta: FloatArray  # ∂F/∂θ [N/rad]
     energy_d: FloatArray  # ∂U/∂d [N], the push along the face's normal
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
+
+
+# For numbers, which the fields' types do not name; a call's overhead counts there.
+_closed: Any = Closed
 
 
 class Seconds(NamedTuple):
@@ -256,6 +260,8 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
 
     Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
     """
+    if type(d) is float and type(theta) is float:
+        return cast(Closed, _closed(*map(np.float64, closed_form(float(modulus), d, theta))))
     return Closed(*_mapped(_closed_forms, 6, float(modulus), d, theta))
 
 

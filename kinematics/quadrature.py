@@ -29,6 +29,7 @@ from kinematics.material import Material
 FloatArray = NDArray[np.float64]
 
 _NODES = 18  # Gauss points a piece: 14 leave 1e-10 in ∂F/∂θ, 18 only rounding
+_MORE_NODES = 26  # for laws of a degree above 8, where 18 may leave 1e-11 in ∂F/∂θ
 _DEEPEST = 2.0**-14  # where grading stops, over the singular point's own scale
 
 
@@ -43,6 +44,11 @@ def circle_rule(degree: int) -> FloatArray:
     count = max(1, degree // 2 + 1)
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
+
+
+def nodes_for(degree: int) -> int:
+    """Gauss points a piece for a law of this ``degree``."""
+    return _NODES if degree <= 8 else _MORE_NODES
 
 
 @kernel
@@ -209,7 +215,7 @@ def integrate(tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike
     shape, (depth, tilt) = flatten(d, theta)
     out = np.empty((6, depth.size))
     _exacts(
-        gauss_rule(),
+        gauss_rule(nodes_for(material.degree)),
         circle_rule(material.degree),
         material.expansions(),
         tip.radius,

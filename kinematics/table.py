@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -158,7 +158,8 @@ class ContactTable:
         """
         if type(d) is float and type(theta) is float:
             *six, inside = lookup(self.data, d, theta)
-            return _contact(*map(np.float64, six), np.bool_(inside), self.max_error)
+            numbers = map(np.float64, six)
+            return cast(Contact, _contact(*numbers, np.bool_(inside), self.max_error))
         shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)

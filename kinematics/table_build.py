@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -36,13 +37,13 @@ from kinematics.lookup import (
     lookup,
 )
 from kinematics.material import Material
-from kinematics.quadrature import circle_rule, exact, gauss_rule, ratios
+from kinematics.quadrature import circle_rule, exact, gauss_rule, nodes_for, ratios
 from kinematics.table import TableError, aligned
 
 FloatArray = NDArray[np.float64]
 
 MEMORY_LIMIT = 256 * 1024  # bytes of a table
-_SAFETY = 0.9  # of the tolerance that the fit's own estimate may use up
+_HOPE = 3.0  # times the tolerance: a fit's estimate above it is not worth certifying
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
 
 
@@ -59,7 +60,7 @@ class Law:
     def of(cls, material: Material) -> Law:
         """Rules and expansions for ``material``."""
         return cls(
-            gauss_rule(),
+            gauss_rule(nodes_for(material.degree)),
             circle_rule(material.degree),
             material.expansions(),
             material.reference_modulus,
@@ -130,14 +131,14 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
         if data.nbytes > MEMORY_LIMIT:
             continue
         estimate = _fit(data, law, number, tolerance) if number != CLOSED else 0.0
-        if estimate <= _SAFETY * tolerance:
+        if estimate <= _HOPE * tolerance:
             estimate = certify(data, law)
             if estimate <= tolerance:
                 return data
         best = min(best, estimate)
     raise TableError(
         f"no table within {MEMORY_LIMIT // 1024} KiB reaches {tolerance:.3g} for this material; "
-        f"the best reached {best:.3g}"
+        f"the best reached {best:.4g}"
     )
 
 
@@ -189,7 +190,7 @@ def _fit(data: FloatArray, law: Law, number: int, tolerance: float) -> float:
             size[3] = np.maximum(size[3], size[0])
             lost = (np.abs(terms) * ~kept).sum(axis=(1, 2)) / size.min(axis=(1, 2))
             estimate = max(estimate, float(lost.max()))
-            if estimate > _SAFETY * tolerance:
+            if estimate > _HOPE * tolerance:
                 return estimate
             numbers = _powers(terms * kept, columns)
             data[at : at + numbers.size] = numbers
@@ -202,6 +203,7 @@ def _fit(data: FloatArray, law: Law, number: int, tolerance: float) -> float:
     return estimate
 
 
+@cache
 def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
     """Chebyshev nodes on [−1, 1] and the matrix from values there to Chebyshev coefficients."""
     nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
@@ -261,6 +263,7 @@ def _corner(law: Law, piece: int) -> tuple[FloatArray, float]:
     return np.concatenate([_powers(part, shape) for part in terms]), misfit
 
 
+@cache
 def _to_powers(count: int) -> FloatArray:
     """Matrix from ``count`` Chebyshev coefficients to those of rising powers."""
     columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]

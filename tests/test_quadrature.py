@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -126,6 +127,35 @@ def test_scaling_evenness_and_identities(
     np.testing.assert_allclose(
         integrate(TIP, stiffer, d, theta).force, int(modulus * 1e6) * c.force, rtol=1e-13
     )
+
+
+@given(
+    slopes=st.lists(st.floats(0.05, 20.0), min_size=2, max_size=7),
+    depth=st.floats(5e-8, 0.999),
+    share=st.floats(-1.0, 1.0).map(lambda share: share * (1 - 1e-9)),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_admissible_material_has_its_least_energy_upright(
+    slopes: list[float], depth: float, share: float
+) -> None:
+    """Tangent moduli that are any positive Bernstein polynomial: laws of all curvatures."""
+    n = len(slopes) - 1
+    modulus = np.polynomial.Polynomial([0.0])
+    for k, slope in enumerate(slopes):
+        rise, fall = np.polynomial.Polynomial([0, 1]), np.polynomial.Polynomial([1, -1])
+        modulus = modulus + 1e5 * slope * math.comb(n, k) * rise**k * fall ** (n - k)
+    material = Material(tuple(Fraction(value) for value in modulus.integ().coef[1:]))
+    d = depth * TIP.radius
+    tilts = float(TIP.theta_limit(d)) * np.array([0.0, 0.5 * share, share])
+    c = integrate(TIP, material, d, tilts)
+    assert np.all(c.energy > 0)
+    assert np.all(c.force_d > 0)
+    assert np.all(np.diff(c.energy) >= -1e-13 * c.energy[0])
+    assert np.all(c.energy_theta * tilts >= 0)
+    assert c.energy_theta[0] == 0.0
+    np.testing.assert_allclose(c.energy_d, c.force / np.cos(tilts), rtol=1e-13)
+    deeper = integrate(TIP, material, min(d * (1 + 1e-6), TIP.radius), 0.0)
+    assert deeper.force > c.force[0]
 
 
 def test_small_displacements_tend_to_the_first_modulus() -> None:

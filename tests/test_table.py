@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -145,15 +146,29 @@ def test_properties(table: ContactTable, depth: float, share: float) -> None:
     assert c.energy_theta * theta >= 0
 
 
-@pytest.mark.parametrize("scale", [5e-3, 50.0])
-def test_other_radii_and_moduli_scale(scale: float) -> None:
-    hard = Material(tuple(value * 5000 for value in TABLE_I.coefficients))
-    large = ContactTable.build(Fingertip(scale * 0.02), hard, 1e-9)
-    small = ContactTable.build(TIP, TABLE_I, 1e-9)
-    d, theta = np.meshgrid([1e-5, 4e-3, 8e-3, 0.015], [-0.2, 0.0, 0.1])
-    a, b = large(scale * d, theta), small(d, theta)
-    np.testing.assert_allclose(a.force, 5000 * scale**2 * b.force, rtol=2e-12)
-    np.testing.assert_allclose(a.energy, 5000 * scale**3 * b.energy, rtol=2e-12)
+@pytest.mark.parametrize("modulus", [1.0, 1e9])
+@pytest.mark.parametrize("radius", [1e-4, 1.0])
+def test_other_radii_and_moduli_scale(table: ContactTable, radius: float, modulus: float) -> None:
+    """From 0.1 mm to 1 m and from 1 Pa to 1 GPa at zero strain."""
+    scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
+    other = Material(tuple(value * share for value in TABLE_I.coefficients))
+    large = ContactTable.build(Fingertip(radius), other, 1e-9)
+    assert large.max_error <= 1e-9
+    d, theta = np.meshgrid([1e-9, 1e-5, 4e-3, 8e-3, 0.0149], [-0.2, 0.0, 0.1])
+    a, b = large(scale * d, theta), table(d, theta)
+    assert np.all(a.inside)
+    ratio = float(share) * scale**2
+    for value, expected, power in zip(a, b[:6], (0, 1, -1, 0, 0, 1), strict=False):
+        np.testing.assert_allclose(value, ratio * scale**power * expected, rtol=3e-12)
+
+
+def test_small_displacements_have_the_exponents_two_and_three(table: ContactTable) -> None:
+    d = TIP.radius * 10.0 ** np.arange(-8.0, -5.0)
+    c = table(d, 0.4)
+    np.testing.assert_allclose(d * c.force_d, 2 * c.force, rtol=1e-7)
+    np.testing.assert_allclose(d * c.energy_d, 3 * c.energy, rtol=1e-7)
+    np.testing.assert_allclose(np.diff(np.log10(c.force)), 2.0, rtol=1e-7)
+    np.testing.assert_allclose(np.diff(np.log10(c.energy)), 3.0, rtol=1e-7)
 
 
 def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
@@ -236,6 +251,13 @@ def test_lookup_never_reads_outside_its_array(table: ContactTable) -> None:
 
 def test_shapes_and_types(table: ContactTable) -> None:
     assert table(0.004, 0.1).force.shape == ()
+    nought = table(np.array(0.004), np.array(0.1))
+    assert (nought.force.shape, nought.inside.shape) == ((), ())
+    assert nought.force == pytest.approx(table(0.004, 0.1).force, rel=1e-15)
+    halves = np.linspace(-1e-3, 8e-3, 9, dtype=np.float32)
+    np.testing.assert_array_equal(
+        table(halves, np.float32(0.25)).force, table(halves.astype(float), 0.25).force
+    )
     assert table(np.empty(0), 0.0).force.shape == (0,)
     assert table(np.full((3, 1), 0.004), np.zeros(4)).inside.shape == (3, 4)
     c = table(np.float32(0.004), np.float32(0.25))
