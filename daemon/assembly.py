@@ -58,14 +58,14 @@ class Daemon:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
         self.material = make_material(settings.material)
-        self.table = make_table(settings, self.material, cache)
+        self.table = make_table(settings, self.material, cache, on_event)
         self.hand = None
         if "simulated" in (settings.servos.backend, settings.tactile.backend):
             from daemon.simulation.hand import SimulatedHand
 
             self.hand = SimulatedHand(settings, self.clock.now(), self.table)
         self.servos = make_servos(settings, self.clock, self.hand)
-        perceptions = self._make_perceptions(cache)
+        perceptions = self._make_perceptions(cache, on_event)
         prediction = None
         if perceptions and self.servos is not None:
             prediction = Prediction(settings, self.table)
@@ -89,7 +89,9 @@ class Daemon:
         self._closers.append(server.close)
         return publisher, server
 
-    def _make_perceptions(self, cache: Path | None) -> list[FingerPerception]:
+    def _make_perceptions(
+        self, cache: Path | None, on_event: EventSink | None
+    ) -> list[FingerPerception]:
         settings = self.settings
         tactile = settings.tactile
         made = []
@@ -103,7 +105,7 @@ class Daemon:
                 converter = Converter(calibration, tactile.pascal_per_count)
                 if calibration.modulus is not None:
                     material = calibration.modulus.material()
-                    table = make_table(settings, material, cache)
+                    table = make_table(settings, material, cache, on_event)
             live = getattr(sensor, "live", None)  # of a recording that lacks cells
             estimator = make_estimator(settings, material, finger, live, calibration)
             scale = tactile.pascal_per_count

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from kinematics.contact import Fingertip
 from kinematics.estimator import ContactEstimator
 from kinematics.material import Material
 from kinematics.pressure import SensorGrid
-from kinematics.table import ContactTable
+from kinematics.table import ContactTable, TableError
 
 
 def make_tip(settings: Settings) -> Fingertip:
@@ -34,13 +36,26 @@ def make_material(law: MaterialLaw) -> Material:
         raise SettingsError(f"material.strain, material.stress: {error}") from None
 
 
-def make_table(settings: Settings, material: Material, cache: Path | None) -> ContactTable:
-    """The contact table, from its file in ``cache`` where one fits."""
+def make_table(
+    settings: Settings,
+    material: Material,
+    cache: Path | None,
+    on_event: Callable[[str, str, str], None] | None = None,
+) -> ContactTable:
+    """The contact table, from its file in ``cache`` where one fits.
+
+    What is wrong with that file is told to ``on_event``. Raises SettingsError when no table of this
+    material reaches the tolerance.
+    """
     tip = make_tip(settings)
     tolerance = settings.table.tolerance
-    if cache is None:
-        return ContactTable.build(tip, material, tolerance=tolerance)
-    return load_or_build(cache, tip, material, tolerance)
+    warn = None if on_event is None else partial(on_event, "warning", "table")
+    try:
+        if cache is None:
+            return ContactTable.build(tip, material, tolerance=tolerance)
+        return load_or_build(cache, tip, material, tolerance, warn)
+    except TableError as error:
+        raise SettingsError(f"table.tolerance: {error}") from None
 
 
 def make_grid(

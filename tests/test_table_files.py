@@ -9,7 +9,7 @@ import pytest
 
 from daemon import table_files
 from daemon.model import make_table
-from daemon.settings import Settings
+from daemon.settings import Settings, SettingsError
 from daemon.table_files import load_or_build, load_table, save_table, table_file
 from kinematics import ContactTable, Fingertip, Material
 from kinematics.table import TableError
@@ -105,3 +105,19 @@ def test_the_daemon_keeps_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     table = make_table(settings, CONSTANT, tmp_path)
     assert asked == [(tmp_path, Fingertip(settings.tip.radius), CONSTANT, settings.table.tolerance)]
     assert (tmp_path / "one.table").read_bytes()[-table.data.nbytes :] == table.data.tobytes()
+
+
+def test_what_is_wrong_becomes_an_event_or_a_settings_error(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    events: list[tuple[str, ...]] = []
+    make_table(Settings(), CONSTANT, blocked, lambda *words: events.append(words))
+    ((level, kind, text),) = events
+    assert (level, kind) == ("warning", "table")
+    assert "can't be kept" in text
+    finer = Settings.model_validate({"table": {"tolerance": 1e-13}})
+    strain = np.linspace(0.0, 0.8, 30)
+    hard = Material.from_points(strain, 2e4 * np.expm1(5 * strain))
+    for cache in (None, tmp_path):
+        with pytest.raises(SettingsError, match=r"table\.tolerance: no table .* reaches 1e-13"):
+            make_table(finer, hard, cache)
