@@ -256,6 +256,8 @@ class Loop:
         control = self._control
         command = parse(request, control.mode)
         self._lease.take(command, self.state.t)
+        if command.name == "clear":
+            self._reconnect()
         if command.name in ("arm", "clear"):
             cause = self._safety.cause(self.state)
             if cause:
@@ -269,6 +271,26 @@ class Loop:
         if command.name == "status":
             reply |= self._status()
         return reply
+
+    def _reconnect(self) -> None:
+        """Servos that have gone silent are connected anew, as after an unplug: only on command.
+
+        Raises Refused with all that is wrong with them.
+        """
+        state, servos = self.state, self.servos
+        silent = state.t - state.reading.t > self._settings.servos.fault_after
+        if servos is None or not silent:
+            return
+        try:
+            servos.connect()
+            servos.read(state.reading)
+            if state.torque:
+                # It may still be on where the port went away before it could be turned off.
+                servos.set_torque(False)
+                state.torque = False
+        except ServoError as error:
+            raise Refused(f"clear: {error}") from None
+        self.emit("info", "servos", "connected anew")
 
     def _status(self) -> dict[str, Any]:
         state = self.state

@@ -536,3 +536,19 @@ def test_factory_new_servos(tmp_path):
         assert servos.read(2, 9, 1) == 250
         servos.close()
         assert process.end() == (0, "", "")
+
+
+def test_an_adapters_latency_timer(tmp_path, capsys):
+    with Process("--dir", tmp_path, "--baud", "2000000", "--latency", "20").ready() as process:
+        servos = Servos(tmp_path)
+        assert servos.ping(1) == 1020
+        start = time.monotonic()
+        for _ in range(5):
+            assert servos.ping(1) == 1020
+        # Each reply waits for the timer, and so for the one after it.
+        assert time.monotonic() - start > 4 * 0.020
+        servos.close()
+        assert process.end() == (0, "", "")
+    with pytest.raises(SystemExit):
+        main(["emulate", "--dir", str(tmp_path), "--latency", "-1"])
+    assert "expected 0 to 255 ms" in capsys.readouterr().err

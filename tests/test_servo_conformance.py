@@ -314,3 +314,13 @@ def test_position_limits_that_the_joint_does_not_fit_in_are_told():
         assert sum("nothing bounds its current" in n for n in rig.servos.notices) == 2
     finally:
         rig.close()
+
+
+@pytest.mark.parametrize("mode", BOUNDED)
+def test_each_joints_own_current_limit_binds(make, mode):
+    rig = make(mode, servos={"current_limit": (0.15, 0.08)})
+    armed(rig)
+    readings = ticks(rig, Goal(q=[0.1, -0.3], current=[1.0, 1.0]), 0.2)
+    for finger, limit in enumerate((0.15, 0.08)):
+        greatest = max(abs(reading.current[finger]) for reading in readings)
+        assert 0.6 * limit < greatest <= limit + CURRENT_UNIT

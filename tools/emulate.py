@@ -48,6 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "0 answers at once and at any rate (default)",
     )
     parser.add_argument(
+        "--latency",
+        type=_milliseconds,
+        default=0.0,
+        metavar="MS",
+        help="a USB adapter's latency timer, which holds replies up; with --baud",
+    )
+    parser.add_argument(
         "--factory",
         action="store_true",
         help="servos as they leave the factory: position mode, 500 µs return delay",
@@ -60,6 +67,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
     )
+
+
+def _milliseconds(text: str) -> float:
+    """Seconds."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value <= 255.0:
+        raise argparse.ArgumentTypeError(f"expected 0 to 255 ms, found {text}")
+    return value / 1000.0
 
 
 def _ids(text: str) -> tuple[int, ...]:
@@ -91,6 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
             settings,
             arguments.dir,
             baud=arguments.baud,
+            latency=arguments.latency,
             prepared=not arguments.factory,
             faults=arguments.fault,
             table_cache=cache_folder(),

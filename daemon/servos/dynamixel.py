@@ -117,7 +117,9 @@ class DynamixelServos:
             notices += each.findings.notices
             if each.table:
                 self._fast = self._fast and model.fast_read(each.table[reg.FIRMWARE_VERSION])
-                self._bounds[each.finger] = each.word(reg.CURRENT_LIMIT)
+                limit = self._settings.current_limit[each.finger]
+                counts = self._scales[each.finger].bound_counts(limit)
+                self._bounds[each.finger] = min(each.word(reg.CURRENT_LIMIT), counts)
                 ends = each.long(reg.MIN_POSITION_LIMIT), each.long(reg.MAX_POSITION_LIMIT)
                 self._ends[each.finger] = ends
         if silent and len(silent) == len(self._ids):
@@ -133,8 +135,8 @@ class DynamixelServos:
             )
         if errors:
             raise ServoError("\n".join(errors))
-        counts = {each.finger: each.position for each in found}
-        notices += [f"{text}; torque is refused there" for text in self._strayed(counts) if text]
+        strayed = self._strayed({each.finger: each.position for each in found})
+        notices += [f"{text}; torque is refused there" for text in strayed if text]
         self.notices = tuple(notices)
         for notice in notices:
             _log.warning(notice)

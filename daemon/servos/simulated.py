@@ -93,7 +93,8 @@ class SimulatedServos:
         for joint in self._joints:
             scale = self._scales[joint]
             self._goal_q[joint] = scale.angle(scale.position_counts(goal.q[joint]))
-            bound = scale.bound_counts(goal.current[joint])
+            limit = self._settings.servos.current_limit[joint]
+            bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
             if self._mode == reg.CURRENT_MODE:
                 self._goal_current[joint] = self._loop(joint, goal.q[joint], bound)
             else:

@@ -86,14 +86,16 @@ class Emulator:
         folder: Path,
         *,
         baud: int = 0,
+        latency: float = 0.0,
         prepared: bool = True,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
-        ``baud`` 0: servos answer at once and at any rate. ``prepared`` False: servos as they leave
-        the factory but for their IDs and rate. ``faults``: see :class:`Faults`.
+        ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
+        with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
+        rate. ``faults``: see :class:`Faults`.
         ``table_cache``: a folder where the contact table is kept. Raises EmulatorError, and
         SettingsError when the settings' material is no stress-strain law.
         """
@@ -102,7 +104,9 @@ class Emulator:
         self._closers.append(self._close_wake)
         self._stopping = False
         try:
-            self._build(with_board(settings), folder, baud, prepared, faults, table_cache)
+            self._build(
+                with_board(settings), folder, (baud, latency), prepared, faults, table_cache
+            )
         except (FolderError, FaultError) as error:
             self.close()
             raise EmulatorError(str(error)) from None
@@ -114,7 +118,7 @@ class Emulator:
         self,
         settings: Settings,
         folder: Path,
-        baud: int,
+        pace: tuple[int, float],
         prepared: bool,
         words: Iterable[str],
         table_cache: Path | None,
@@ -130,7 +134,7 @@ class Emulator:
         self.hand = SimulatedHand(settings, 0.0, table)
         self._servos: PtyServoBus | None = None
         if settings.servos.backend != "none":
-            self._servos = self._make_servos(settings, links, baud, prepared)
+            self._servos = self._make_servos(settings, links, pace, prepared)
             self._closers.append(self._servos.close)
         self._boards: dict[str, TactileBoard] = {}
         self._sources: list[SimulatedTactile] = []
@@ -153,15 +157,17 @@ class Emulator:
         self._advance_due = 0.0
 
     def _make_servos(
-        self, settings: Settings, links: LinkFolder, baud: int, prepared: bool
+        self, settings: Settings, links: LinkFolder, pace: tuple[int, float], prepared: bool
     ) -> PtyServoBus:
+        baud, latency = pace
         try:
             bus = ServoBus.from_settings(settings, self.hand, baud=baud, prepared=prepared)
         except KeyError as error:
             raise EmulatorError(f"servos.model: {error.args[0]}") from None
         except ValueError as error:
             raise EmulatorError(str(error)) from None
-        return PtyServoBus(bus, links.path / "servos", baud=baud, clock=self.clock.now)
+        link = links.path / "servos"
+        return PtyServoBus(bus, link, baud=baud, latency=latency, clock=self.clock.now)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Answer until :meth:`stop`. ``on_ready`` is called once everything answers."""
