@@ -72,12 +72,14 @@ _CHECK = 32  # bytes of a SHA-256
 class ContactTable:
     """Force, energy and first partials of one tip of one material, by lookup.
 
-    ``data`` is the flat float64 array that :func:`lookup` takes. The domain is 0 < d ≤ a and
+    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the certificate's
+    largest relative error of any output. The domain is 0 < d ≤ a and
     |θ| ≤ asin((a − d)/a).
     """
 
     def __init__(self, data: FloatArray) -> None:
         self.data = data
+        self.max_error = float(data[MAX_ERROR])
 
     @classmethod
     def build(
@@ -130,11 +132,6 @@ class ContactTable:
     def tolerance(self) -> float:
         """The tolerance it was built to."""
         return float(self.data[TOLERANCE])
-
-    @property
-    def max_error(self) -> float:
-        """The certificate's largest relative error of any output."""
-        return float(self.data[MAX_ERROR])
 
     @property
     def certificate(self) -> Certificate:

@@ -14,9 +14,9 @@ from kinematics import ContactTable, Fingertip, Material
 from kinematics.contact import closed_forms
 from kinematics.kernels import kernel
 from kinematics.lanes import SHAPES
-from kinematics.lookup import FORM, FORMS, LOWEST, MODULUS, RADIUS, START
+from kinematics.lookup import FORM, FORMS, MODULUS, RADIUS, START
 from kinematics.quadrature import integrate
-from kinematics.table import TableError, aligned, lookup
+from kinematics.table import TableError, aligned, lookup, lookups
 from kinematics.table_build import MEMORY_LIMIT, hard_points
 
 TIP = Fingertip(0.020)
@@ -237,14 +237,22 @@ def forms() -> list[ContactTable]:
     ]
 
 
-def test_lookup_never_reads_outside_its_array(table: ContactTable) -> None:
+@pytest.mark.parametrize("form", [form.name for form in FORMS[1:]])
+def test_lookup_never_reads_outside_its_array(form: str) -> None:
     # Fences of NaN on both sides: a read beyond either end would show in the result.
-    fenced = np.full(table.data.size + 2048, math.nan)
-    fenced[1024:-1024] = table.data
-    inner = fenced[1024:-1024]
-    d, theta = hard_points(TIP.radius, 3000, np.random.default_rng(8))
-    d = np.concatenate([d, TIP.radius * (1 - LOWEST * (1 + np.array([-1e-16, 0, 1e-16])))])
-    theta = np.concatenate([theta, np.zeros(3)])
+    data = ContactTable.build(TIP, TABLE_I, 0.02, form).data
+    fenced = np.full(data.size + 4096, math.nan)
+    fenced[2048:-2048] = data
+    inner = fenced[2048:-2048]
+    d, theta = hard_points(TIP.radius, 1000, np.random.default_rng(8))
+    edges = [part * 0.5**octave for octave in range(4) for part in (0.5, 0.5625, 0.75, 1.0)]
+    rounding = 1 + np.array([-2e-16, 0.0, 2e-16])
+    near = TIP.radius * (1 - np.outer(edges, rounding).ravel())
+    tilts = TIP.theta_limit(near) * (np.arange(near.size) % 3) / 2
+    d, theta = np.concatenate([d, near]), np.concatenate([theta, tilts])
+    out, inside = np.empty((6, d.size)), np.empty(d.size, np.bool_)
+    lookups(inner, d, theta, out, inside)
+    assert np.all(np.isfinite(out))
     for one, tilt in zip(d, theta, strict=True):
         assert all(math.isfinite(value) for value in lookup(inner, one, tilt)[:6])
 
