@@ -89,7 +89,7 @@ class ServoSettings(Section):
     direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
     zero: tuple[int, int] = (2048, 2048)  # counts at q = 0
     gear_ratio: Positive = 1.0  # servo turns for one joint turn
-    current_limit: tuple[Positive, Positive] = (3.0, 3.0)  # A; the servo's own limit binds too
+    current_limit: tuple[Positive, Positive] = (6.0, 6.0)  # A; the servo's own limit binds too
     mode: ServoMode = "current-based position"  # or "current", or "position" (can't grasp)
     stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
     damping: NonNegative = 0.4  # A·s/rad, likewise
