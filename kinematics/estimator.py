@@ -205,6 +205,16 @@ class ContactEstimator:
         """Compile, or load from the cache, all that :meth:`update` needs, on an empty frame."""
         self(np.zeros(self.grid.shape))
 
+    def compiled_arguments(
+        self,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
+        """What :func:`kinematics.ladder.estimate_frame` takes behind the frame and its scale.
+
+        For callers that are compiled themselves. Options, cells, tables, state, scratch, integers;
+        the arrays are the estimator's own. Saturation is as for the last frame of :meth:`update`.
+        """
+        return self._plan, self._cells, self._tables, self._state, self._floats, self._integers
+
     def _run(self, frame: NDArray[Any], pascal_per_count: float) -> None:
         full = _FULL.get(frame.dtype) if isinstance(frame, np.ndarray) else None
         if full is None:

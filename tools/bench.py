@@ -13,6 +13,7 @@ from types import ModuleType
 
 MEASUREMENTS = {
     "contact": "the contact model, run time against error",
+    "estimator": "pressure grid to d and tilt, run time against error",
     "tick": "one tick without serial",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
     "hil": "one tick over the stand-in hand's ptys",
@@ -64,7 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
             print(module.table(own), end="\n\n")
         if own and arguments.plot:
             module.plot(own, arguments.plot)
-    print(table(plain))
+    if plain:
+        print(table(plain))
     if arguments.json:
         content = {
             "machine": platform.machine(),
