@@ -15,6 +15,7 @@ from daemon.grip import Grip
 from daemon.modes import Command, Mode
 from daemon.prediction import Held
 from daemon.records import FINGERS, Contact, Goal, ObjectPose, Reading
+from daemon.reference import Reference
 from daemon.settings import Settings
 
 Event = tuple[str, str, str]  # level, kind, text
@@ -37,6 +38,7 @@ class Control:
         self._has_servos = has_servos
         self._has_sensors = has_sensors
         self._grip = Grip(settings, self._fingers)
+        self._by_position = settings.control.law == "position" and len(self._fingers) == 2
         self._force = settings.control.force_default  # N that the next grip goes to
         self.mode = Mode.DISARMED
         self.torque = False  # what the servos' torque shall be
@@ -45,8 +47,8 @@ class Control:
         self._held = Held()
         self._contacts = [Contact(), Contact()]
         self._pose = ObjectPose()
-        self._goal_q = [0.0, 0.0]  # where the ramps have come to
-        self._target_q = [0.0, 0.0]  # where they go
+        dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
+        self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
         self._touching = [False, False]
         self._gripping = False
         self._since = 0.0  # time in the present mode [s]
@@ -103,9 +105,10 @@ class Control:
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
                 raise Refused(f"move: {name}: found {q:g} rad, expected {low:g} to {high:g}")
-        self._hold_here()
+        if self.mode is not Mode.MOVING:
+            self._hold_here()
         for name, q in numbers.items():
-            self._target_q[FINGERS.index(name)] = q
+            self._ways[FINGERS.index(name)].target = q
         self._enter(Mode.MOVING)
 
     def _grasp(self, numbers: dict[str, float]) -> None:
@@ -140,10 +143,19 @@ class Control:
         self._grip.steer(self._pose.angle, angle)
         self._enter(Mode.ROTATING)
 
+    def _set(self, numbers: dict[str, float]) -> None:
+        compliance = numbers["compliance"]
+        low, high = 0.01, 1.0
+        if not low <= compliance <= high:
+            raise Refused(
+                f"set: compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
+            )
+        self._grip.joint_stiffness = 1.0 / compliance
+
     def _release(self, _: dict[str, float]) -> None:
         self._hold_here()
         for index in self._fingers:
-            self._target_q[index] = self._settings.hand.open_angle[index]
+            self._ways[index].target = self._settings.hand.open_angle[index]
         self._gripping = False
         self._enter(Mode.RELEASING)
 
@@ -156,8 +168,8 @@ class Control:
             self._gripping = False
 
     def _hold_here(self) -> None:
-        self._goal_q = list(self._reading.q)
-        self._target_q = list(self._reading.q)
+        for way, q in zip(self._ways, self._reading.q, strict=True):
+            way.reset(q)
 
     # One tick
 
@@ -188,30 +200,25 @@ class Control:
             safety = self._settings.safety
             bound = self._approach_current() if closing else safety.current_move
             for index in self._fingers:
-                goal.q[index] = self._goal_q[index]
+                goal.q[index] = self._ways[index].value
                 goal.current[index] = bound
 
     def _travel(self, dt: float) -> None:
-        step = self._settings.control.move_speed * dt
-        if self._ramp(step):
+        if self._ramp(self._settings.control.move_speed):
             return
         self._waiting += dt
-        off = max(abs(self._reading.q[i] - self._target_q[i]) for i in self._fingers)
+        off = max(abs(self._reading.q[i] - self._ways[i].target) for i in self._fingers)
         if off < _ARRIVED or self._waiting > _GRACE:
             if off >= _ARRIVED:
                 text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
                 self.events.append(("warning", "short", text))
             self._enter(Mode.ARMED)
 
-    def _ramp(self, step: float) -> bool:
-        """Move the goals one step toward their targets; False when all are there."""
-        going = False
+    def _ramp(self, speed: float) -> bool:
+        """Move the goals one tick toward their targets; False when all are there."""
         for index in self._fingers:
-            left = self._target_q[index] - self._goal_q[index]
-            if left != 0.0:
-                going = True
-                self._goal_q[index] += min(max(left, -step), step)
-        return going
+            self._ways[index].step(speed)
+        return not all(self._ways[index].arrived for index in self._fingers)
 
     def _approach(self, dt: float) -> None:
         """Close until every finger touches; a finger that touches waits for the other."""
@@ -220,17 +227,15 @@ class Control:
             contact = self._contacts[index]
             touches = contact.contact and contact.force > law.contact_force
             if touches and not self._touching[index]:
-                self._goal_q[index] = self._reading.q[index]
+                self._ways[index].reset(self._reading.q[index])
             self._touching[index] = touches
             if not touches:
-                self._target_q[index] = self._settings.hand.q_max[index]
-            else:
-                self._target_q[index] = self._goal_q[index]
+                self._ways[index].target = self._settings.hand.q_max[index]
         if all(self._touching[index] for index in self._fingers):
             felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
             self._gripping = True
             self._grip.start(self._held, felt, self._force)
-        elif not self._ramp(law.approach_speed * dt) and self._waited(dt) > _GRACE:
+        elif not self._ramp(law.approach_speed) and self._waited(dt) > _GRACE:
             self.events.append(("warning", "grasp", "nothing to grasp within the joints' limits"))
             self._hold_here()
             self._enter(Mode.ARMED)
@@ -247,11 +252,17 @@ class Control:
 
     def _hold(self, dt: float, goal: Goal) -> None:
         contacts = [self._contacts[index] for index in self._fingers]
-        torques = self._grip.torques(self._reading, self._contacts, self._pose, self._held)
-        for index in self._fingers:
-            current = torques[index] / self._settings.control.torque_constant
-            goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
-            goal.current[index] = abs(current)
+        grip = self._grip
+        if self._by_position:
+            goal.q[:] = grip.angles(self._contacts, self._pose, self._held)
+            goal.current[0] = goal.current[1] = self._settings.safety.current_max
+        else:
+            torques = grip.torques(self._reading, self._contacts, self._pose, self._held)
+            for index in self._fingers:
+                current = torques[index] / self._settings.control.torque_constant
+                goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
+                goal.current[index] = abs(current)
+        self._watch_slip()
         self._watch_contact(dt, contacts)
         self._watch_settling(dt, contacts)
 
@@ -262,11 +273,23 @@ class Control:
             self._hold_here()
             self._enter(Mode.ARMED)
 
+    def _watch_slip(self) -> None:
+        """Turning shears the tips, however firm the grip: it ends where they would slip."""
+        law = self._settings.control
+        most = law.tip_friction * (1.0 - law.slip_margin)
+        grip = self._grip
+        if self.mode is Mode.ROTATING and self._held.shear > most and grip.turning_away:
+            text = f"turning ended at {math.degrees(self._pose.angle):.1f}°: the tips would slip"
+            self.events.append(("warning", "slip", text))
+            grip.steer(self._pose.angle, grip.angle.value)
+
     def _watch_settling(self, dt: float, contacts: list[Contact]) -> None:
         if self.mode not in (Mode.GRASPING, Mode.ROTATING):
             return
-        target = self._grip.force_target
-        settled = all(abs(c.force - target) < _SETTLED_FORCE * target for c in contacts)
+        # The mean, since what the object rubs on may take some force between the tips.
+        target = self._grip.force.target
+        felt = sum(contact.force for contact in contacts) / len(contacts)
+        settled = abs(felt - target) < _SETTLED_FORCE * target
         if self.mode is Mode.ROTATING:
             settled = abs(self._pose.angle - self._grip.angle_target) < _SETTLED_ANGLE
         self._waiting = self._waiting + dt if settled else 0.0

@@ -12,7 +12,8 @@ parts:
 
 ``control.law`` says where the levers come from: ``two_phase`` takes the force's arm about the
 pivot, ``energy`` the gradient of the tables' energy along the rolling increments, in which the
-tips' moments and shear forces are counted, too.
+tips' moments and shear forces are counted, too. ``position`` commands angles and no torques; it is
+there to be compared with.
 """
 
 from __future__ import annotations
@@ -44,31 +45,34 @@ class Grip:
         self.angle = Reference(self._dt, law.smooth_time)
         self.steering = False
         self._force_rate = 0.0  # N/s
+        self.force_target = 0.0  # N that was asked for
         self._integral = 0.0  # N
+        self._closed = 0.0  # goal of (q1 + q2)/2 in pure position control [rad]
         self._offset = 0.0  # goal of (q1 − q2)/2 [rad]
         self._torques = [0.0, 0.0]
-
-    @property
-    def force_target(self) -> float:
-        """The grip force that is gone to [N]."""
-        return self.force.target
 
     @property
     def angle_target(self) -> float:
         """The object's angle that is gone to [rad]."""
         return self.angle.target
 
+    @property
+    def turning_away(self) -> bool:
+        """The object is being turned away from upright."""
+        return self.angle.speed * self.angle.value > 0.0
+
     def start(self, held: Held, felt: float, force: float) -> None:
         """Take over from the approach with ``felt`` N on the tips."""
         self.force.reset(felt)
         self._integral = 0.0
         self._offset = 0.5 * (held.q[0] - held.q[1])
+        self._closed = 0.5 * (held.q[0] + held.q[1])
         self.steering = False
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
         """Go to another grip force [N]."""
-        self.force.target = force
+        self.force_target = self.force.target = force
         self._force_rate = max(abs(force - self.force.value), 0.1 * force) / self._law.force_time
 
     def steer(self, present: float, angle: float) -> None:
@@ -83,19 +87,15 @@ class Grip:
     ) -> list[float]:
         """Joint torques [N·m], positive closing; pairs, of which the fingers' places are filled."""
         torques = self._torques
-        wanted = self.force.step(self._force_rate)
+        wanted = self._wanted(held)
         push = wanted + self._correction(wanted, contacts)
         if len(self._fingers) == 1:
             return self._press(push, reading, held)
-        arm1, arm2 = held.arm
-        stiffness = max(0.5 * (held.stiffness[0] + held.stiffness[1]), _STIFFNESS_MIN)
         lean = self._steer(pose, held) if self.steering else 0.0
-        # The closing that changes the force as wanted, and that keeps it while the object turns.
-        close = 2.0 * self.force.speed / stiffness
-        close -= (arm1 - arm2) * lean + held.slide * (held.turn[0] + held.turn[1]) * lean
-        close /= arm1 + arm2
+        close = self._closing(lean, held)
         dq1, dq2 = reading.dq
-        arm = 0.5 * (arm1 + arm2)
+        arm = 0.5 * (held.arm[0] + held.arm[1])
+        stiffness = _mean_stiffness(held)
         calm = self._damping(stiffness * arm * arm) * (close - 0.5 * (dq1 + dq2))
         error = self._offset - 0.5 * (held.q[0] - held.q[1])
         turn = self.joint_stiffness * error
@@ -104,6 +104,40 @@ class Grip:
         torques[0] = lever1 * push + calm + turn + self._friction(close + lean)
         torques[1] = lever2 * push + calm - turn + self._friction(close - lean)
         return torques
+
+    def angles(self, contacts: list[Contact], pose: ObjectPose, held: Held) -> list[float]:
+        """Joint goals [rad] of pure position control: both references moved into angles.
+
+        What it can't do is why the other laws exist: its finest step is one count of the joints.
+        """
+        law = self._law
+        wanted = self._wanted(held)
+        error = wanted - 0.5 * (contacts[0].force + contacts[1].force)
+        arm = 0.5 * (held.arm[0] + held.arm[1])
+        lean = self._steer(pose, held) if self.steering else 0.0
+        way = 2.0 * math.pi * law.force_bandwidth * error / (_mean_stiffness(held) * arm)
+        self._closed += (self._closing(lean, held) + way) * self._dt
+        return [self._closed + self._offset, self._closed - self._offset]
+
+    def _wanted(self, held: Held) -> float:
+        """The force [N] at this tick: the target, raised where the tips would be near to slipping.
+
+        Of the shear force one part grows with the grip, the rolling's; the load is borne by both.
+        """
+        law = self._law
+        if law.object_load > 0.0:
+            spare = law.tip_friction * (1.0 - law.slip_margin) - held.shear
+            most = self.force_target + law.grip_raise_max
+            needed = 0.5 * law.object_load / spare if spare > 0.0 else most
+            self.force.target = min(max(self.force_target, needed), most)
+        return self.force.step(self._force_rate)
+
+    def _closing(self, lean: float, held: Held) -> float:
+        """Closing [rad/s] that changes the force as wanted and keeps it while the object turns."""
+        arm1, arm2 = held.arm
+        way = 2.0 * self.force.speed / _mean_stiffness(held)
+        way -= (arm1 - arm2 + held.slide * (held.turn[0] + held.turn[1])) * lean
+        return way / (arm1 + arm2)
 
     def _press(self, push: float, reading: Reading, held: Held) -> list[float]:
         """One finger on an object that stands by itself."""
@@ -152,6 +186,10 @@ class Grip:
         """What the joint's friction takes [N·m] at the ``rate`` [rad/s] that is wanted."""
         law = self._law
         return law.joint_friction * min(max(rate / law.friction_speed, -1.0), 1.0)
+
+
+def _mean_stiffness(held: Held) -> float:
+    return max(0.5 * (held.stiffness[0] + held.stiffness[1]), _STIFFNESS_MIN)
 
 
 def _beyond(error: float, noise: float) -> float:

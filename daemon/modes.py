@@ -42,6 +42,7 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     ),
     "rotate": (_GRIPPED, {"angle": True}),
     "release": (_ON, {}),
+    "set": (_ON, {"compliance": True}),
     "stop": (_ANY, {}),
     "clear": (frozenset({Mode.FAULT}), {}),
     "status": (_ANY, {}),

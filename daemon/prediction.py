@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.records import FINGERS, Contact, ObjectPose, Reading
-from daemon.servos.registers import COUNTS_PER_TURN
+from daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
 from daemon.settings import Settings
 from kinematics.held import held_motion, holding_levers, total_tilt
 from kinematics.kernels import kernel
@@ -41,11 +41,13 @@ _VAR = 13  # variances of d, d, φ just after a frame, drift added
 _WAY = 16  # sums of predicted motion of d, d, φ
 _SINCE = 19  # their lengths since the last frame's instant
 _GAIN, _TILT, _LIVE = 22, 24, 26
-_MEMORY = 28
+_UNSEEN = 28  # motion of the joints since the last frame that the velocity can't show [rad]
+_SLOW = 30  # half a count of velocity [rad/s]
+_MEMORY = 31
 
 # Columns of the history, and of what a tick gives out.
 _H_T, _H_WAY, _H_Q, _H_SIZE = 0, 1, 4, 6
-_OUT = 24
+_OUT = 25
 
 
 @kernel
@@ -58,6 +60,21 @@ def _variance(m: FloatArray, which: int) -> float:
         step = m[_COUNT] * (1.0 if which == 2 else m[_L])
         variance += min(since * since, _STEP_VARIANCE * step * step)
     return variance
+
+
+@kernel
+def _credited(m: FloatArray, finger: int, way: float, shown: float, dt: float) -> float:
+    """What of a tracked joint's ``way`` the estimates have not felt yet.
+
+    A joint that creeps through its count comes up by a whole one at the edge; frames have seen most
+    of that on the way. Beyond the motion ``shown`` by the velocity only so much is new as may have
+    stayed below half a count of velocity since the last frame.
+    """
+    unseen = m[_UNSEEN + finger] + m[_SLOW] * dt
+    more = min(max(way - shown, -unseen), unseen)
+    m[_UNSEEN + finger] = unseen - abs(more)
+    credited: float = shown + more
+    return credited
 
 
 @kernel
@@ -76,18 +93,20 @@ def _advance(
     half = 0.5 * m[_COUNT]
     way1 = min(max(m[_Q] + dq1 * dt, q1 - half), q1 + half) - m[_Q]
     way2 = min(max(m[_Q + 1] + dq2 * dt, q2 - half), q2 + half) - m[_Q + 1]
+    seen1 = _credited(m, 0, way1, dq1 * dt, dt)
+    seen2 = _credited(m, 1, way2, dq2 * dt, dt)
     both = m[_LIVE] > 0.0 and m[_LIVE + 1] > 0.0
     if both or m[_ALONE] > 0.0:
         arm1, arm2, turn1, turn2, slide, _, _ = held_motion(
             m[_Q], m[_Q + 1], m[_D], m[_D + 1], m[_ANGLE], m[_B], m[_L], m[_E], m[_A]
         )
         if both:
-            turn = turn1 * way1 - turn2 * way2
-            deeper1 = deeper2 = 0.5 * (arm1 * way1 + arm2 * way2 + slide * turn)
+            turn = turn1 * seen1 - turn2 * seen2
+            deeper1 = deeper2 = 0.5 * (arm1 * seen1 + arm2 * seen2 + slide * turn)
         else:
             turn = 0.0
-            deeper1 = arm1 * way1 if m[_LIVE] > 0.0 else 0.0
-            deeper2 = arm2 * way2 if m[_LIVE + 1] > 0.0 else 0.0
+            deeper1 = arm1 * seen1 if m[_LIVE] > 0.0 else 0.0
+            deeper2 = arm2 * seen2 if m[_LIVE + 1] > 0.0 else 0.0
         m[_D] += deeper1
         m[_D + 1] += deeper2
         m[_ANGLE] += turn
@@ -161,6 +180,7 @@ def _correct(
     q = _between(history, row, later, share, _H_Q + finger)
     angle = theta - q if finger == 0 else theta + q
     step = m[_COUNT]
+    m[_UNSEEN + finger] = min(m[_UNSEEN + finger], m[_SLOW] * max(m[_T] - t, 0.0))
     if m[_LIVE + finger] == 0.0:
         m[_D + finger] = d + moved
         m[_GAIN + finger] = gain
@@ -214,9 +234,10 @@ def _tell(m: FloatArray, table: FloatArray, out: FloatArray) -> None:
     out[19] = motion[2]
     out[20] = motion[3]
     out[21] = motion[4]
-    lever1, lever2, _ = holding_levers(table, m[_D], m[_D + 1], theta1, theta2, motion)
+    lever1, lever2, shear = holding_levers(table, m[_D], m[_D + 1], theta1, theta2, motion)
     out[22] = lever1
     out[23] = lever2
+    out[24] = shear
 
 
 def _pair() -> list[float]:
@@ -233,6 +254,7 @@ class Held:
     slide: float = 0.0  # ∂(d1 + d2)/∂φ [m/rad]
     lever: list[float] = field(default_factory=_pair)  # torque over force by the energy [m]
     stiffness: list[float] = field(default_factory=_pair)  # ∂F/∂d [N/m]
+    shear: float = 0.0  # shear over normal force, by the balance of the object without a load
     angle_std: float = 0.0  # of the object's angle [rad]
 
 
@@ -252,6 +274,7 @@ class Prediction:
             2.0 * math.pi / (COUNTS_PER_TURN * settings.servos.gear_ratio),
             float(len(settings.scene.fingers) == 1),
         )
+        self._m[_SLOW] = 0.5 * VELOCITY_UNIT / settings.servos.gear_ratio
         self._m[_T] = -math.inf
         self._history = np.full((round(_HISTORY * settings.loop.rate) + 2, _H_SIZE), -math.inf)
         self._out = np.zeros(_OUT)
@@ -313,4 +336,5 @@ class Prediction:
         held.slide = out[21]
         held.lever[:] = out[22:24]
         held.stiffness[:] = out[4], out[11]
+        held.shear = out[24]
         held.angle_std = out[14]

@@ -164,18 +164,22 @@ class Control(Section):
     move_speed: Positive = 1.0  # rad/s
     contact_force: Positive = 0.5  # N at which a finger counts as touching
     force_default: Positive = 5.0  # N, grasp without force=
-    law: Literal["energy", "two_phase"] = "energy"  # where the grip's levers come from
-    force_time: Positive = 0.3  # s in which the force goes from what is felt to what is wanted
+    law: Literal["energy", "two_phase", "position"] = "energy"  # "position" is for comparison
+    force_time: Positive = 0.2  # s in which the force goes from what is felt to what is wanted
     smooth_time: Positive = 0.1  # s over which references are averaged: bounds their jerk
     force_gain: NonNegative = 1.0  # N a N of force error
-    force_bandwidth: Positive = 1.0  # Hz of the force integral
-    rotate_speed: Positive = 0.45  # rad/s of the object's angle
-    rotate_bandwidth: Positive = 1.0  # Hz of the angle integral
-    joint_stiffness: Positive = 30.0  # N·m/rad, on the antisymmetric motion
+    force_bandwidth: NonNegative = 1.0  # Hz of the force integral
+    rotate_speed: Positive = 0.65  # rad/s of the object's angle
+    rotate_bandwidth: NonNegative = 1.5  # Hz of the angle integral
+    joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
     joint_inertia: Positive = 0.010  # kg·m², finger and rotor: what is damped
     damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
     joint_friction: NonNegative = 0.05  # N·m of Coulomb friction, given where motion is wanted
     friction_speed: Positive = 0.02  # rad/s wanted from which on all of it is given
+    tip_friction: Positive = 0.6  # Coulomb, tip on object, that is counted on
+    slip_margin: Fraction = 0.2  # share of that friction which is kept unused
+    object_load: NonNegative = 0.0  # N along the tips' faces, the object's weight as a rule
+    grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin
 
 
 class Safety(Section):

@@ -15,6 +15,7 @@ MEASUREMENTS = {
     "contact": "the contact model, run time against error",
     "estimator": "pressure grid to d and tilt, run time against error",
     "tick": "one tick without serial",
+    "control": "grasping, turning and holding on the simulated hand",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
     "hil": "one tick over the stand-in hand's ptys",
     "startup": "start to the first published state",

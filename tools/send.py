@@ -13,7 +13,8 @@ from daemon.settings import CommandSettings
 
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
-stop, clear, status. Numbers are SI; an angle may carry its unit, as in angle=10deg.
+set compliance=RAD/NM, stop, clear, status. Numbers are SI; an angle may carry its unit, as in
+angle=10deg.
 Exit status: 0 done, 1 refused, 2 no answer or not understood here."""
 
 
