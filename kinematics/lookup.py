@@ -233,13 +233,8 @@ def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: 
 
 
 @kernel
-def _outside(p: Pointer, d: float, theta: float) -> Six:
-    """What :func:`lookup` gives where d or θ is no number, not positive, or past the domain."""
-    if math.isnan(d) or math.isnan(theta):
-        nan = math.nan
-        return nan, nan, nan, nan, nan, nan, False
-    if d <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
+def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, float, float, bool]:
+    """d, h, sin θ, cos θ, gap and ``inside`` at any d > 0 and θ, clamped to the domain."""
     radius = p[RADIUS]
     inside = d <= radius
     d = min(d, radius)
@@ -248,12 +243,12 @@ def _outside(p: Pointer, d: float, theta: float) -> Six:
         s, c = _sine_cosine(theta)
         gap = c * c - d * p[INVERSE_RADIUS] * (1.0 + h)
         if gap >= 0.0:
-            return _at(p, d, h, s, c, gap, inside)
+            return d, h, s, c, gap, inside
     limit = theta_limit(radius, d)
     # At the limit itself, rounding may have led here.
     inside = inside and abs(theta) <= limit
     s, c = _sine_cosine(min(max(theta, -limit), limit))
-    return _at(p, d, h, s, c, 0.0, inside)
+    return d, h, s, c, 0.0, inside
 
 
 @inlined_kernel
@@ -262,9 +257,15 @@ def _lookup(p: Pointer, d: float, theta: float) -> Six:
     rho2 = d * p[INVERSE_RADIUS] * (1.0 + h)
     s, c = _near_sine_cosine(theta)
     gap = c * c - rho2
-    if d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= _NEAR:
-        return _at(p, d, h, s, c, gap, True)
-    return _outside(p, d, theta)
+    inside = True
+    if not (d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= _NEAR):
+        if math.isnan(d) or math.isnan(theta):
+            nan = math.nan
+            return nan, nan, nan, nan, nan, nan, False
+        if d <= 0.0:
+            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
+        d, h, s, c, gap, inside = _slowly(p, d, theta)
+    return _at(p, d, h, s, c, gap, inside)
 
 
 @inlined_kernel
