@@ -46,6 +46,7 @@ class Control:
         self._reading = Reading()
         self._held = Held()
         self._contacts = [Contact(), Contact()]
+        self._touched: list[Contact] = []  # those of the fingers that take part
         self._pose = ObjectPose()
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
         self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
@@ -179,7 +180,9 @@ class Control:
         """Take in what the servos and sensors said. Commands are carried out on this picture."""
         self._reading = reading
         self._held = held
-        self._contacts = contacts
+        if contacts is not self._contacts:
+            self._contacts = contacts
+            self._touched = [contacts[index] for index in self._fingers]
         self._pose = pose
 
     def step(self, dt: float, goal: Goal) -> None:
@@ -251,7 +254,7 @@ class Control:
         return self._waiting
 
     def _hold(self, dt: float, goal: Goal) -> None:
-        contacts = [self._contacts[index] for index in self._fingers]
+        contacts = self._touched
         grip = self._grip
         if self._by_position:
             goal.q[:] = grip.angles(self._contacts, self._pose, self._held)
@@ -267,7 +270,10 @@ class Control:
         self._watch_settling(dt, contacts)
 
     def _watch_contact(self, dt: float, contacts: list[Contact]) -> None:
-        self._lost = 0.0 if all(contact.contact for contact in contacts) else self._lost + dt
+        lost = False
+        for contact in contacts:
+            lost = lost or not contact.contact
+        self._lost = self._lost + dt if lost else 0.0
         if self._lost > _LOST_AFTER:
             self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
             self._hold_here()

@@ -39,7 +39,7 @@ class Grip:
         self._fingers = fingers
         self._dt = 1.0 / settings.loop.rate
         self._by_energy = law.law == "energy" and len(fingers) == 2
-        self._current_max = settings.safety.current_max
+        self._torque_max = settings.safety.current_max * law.torque_constant  # N·m
         self.joint_stiffness = law.joint_stiffness
         self.force = Reference(self._dt, law.smooth_time)
         self.angle = Reference(self._dt, law.smooth_time)
@@ -152,15 +152,17 @@ class Grip:
     def _correction(self, wanted: float, contacts: list[Contact]) -> float:
         """What the force felt asks for beyond the feed-forward [N]."""
         law = self._law
-        felt = sum(contacts[i].force for i in self._fingers) / len(self._fingers)
-        error = wanted - felt
+        felt = 0.0
+        full = False  # beyond what the servos may give, more error must not be stored
+        for index in self._fingers:
+            felt += contacts[index].force
+            full = full or abs(self._torques[index]) >= self._torque_max
+        error = wanted - felt / len(self._fingers)
         proportional = law.force_gain * error
-        # Beyond what the servos may give, more error must not be stored.
-        most = self._current_max * law.torque_constant
-        if max(abs(self._torques[i]) for i in self._fingers) < most or error < 0.0:
-            self._integral += 2.0 * math.pi * law.force_bandwidth * error * self._dt
-        bound = _INTEGRAL_SHARE * self.force.target
-        self._integral = min(max(self._integral, -bound), bound)
+        if not full or error < 0.0:
+            integral = self._integral + 2.0 * math.pi * law.force_bandwidth * error * self._dt
+            bound = _INTEGRAL_SHARE * self.force.target
+            self._integral = min(max(integral, -bound), bound)
         return proportional + self._integral
 
     def _steer(self, pose: ObjectPose, held: Held) -> float:

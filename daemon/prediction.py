@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.records import FINGERS, Contact, ObjectPose, Reading
+from daemon.records import Contact, ObjectPose, Reading
 from daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
 from daemon.settings import Settings
 from kinematics.held import held_motion, holding_levers, total_tilt
@@ -47,7 +47,7 @@ _MEMORY = 31
 
 # Columns of the history, and of what a tick gives out.
 _H_T, _H_WAY, _H_Q, _H_SIZE = 0, 1, 4, 6
-_OUT = 25
+_OUT = 27
 
 
 @kernel
@@ -238,6 +238,8 @@ def _tell(m: FloatArray, table: FloatArray, out: FloatArray) -> None:
     out[22] = lever1
     out[23] = lever2
     out[24] = shear
+    out[25] = m[_Q]
+    out[26] = m[_Q + 1]
 
 
 def _pair() -> list[float]:
@@ -318,23 +320,29 @@ class Prediction:
             return
         _tell(self._m, self._table, self._out)
         out = self._out.tolist()
-        for finger in range(len(FINGERS)):
-            if not self._live[finger]:
-                continue
-            contact = contacts[finger]
-            at = 7 * finger
-            contact.d, contact.theta, contact.force, contact.energy = out[at : at + 4]
-            contact.d_std = out[at + 5]
-            contact.theta_std = out[14]
-            contact.inside = out[at + 6] > 0.0
-        pose.valid = self._with_object and left and right
-        pose.angle, pose.width = out[15:17] if pose.valid else (0.0, 0.0)
+        angle_std = out[14]
+        if left:
+            _fill_one(contacts[0], out[0:7], angle_std)
+        if right:
+            _fill_one(contacts[1], out[7:14], angle_std)
+        if left and right and self._with_object:
+            pose.valid = True
+            pose.angle = out[15]
+            pose.width = out[16]
+        else:
+            pose.angle = pose.width = 0.0
         held = self.held
-        held.q[:] = self._m[_Q : _Q + 2].tolist()
-        held.arm[:] = out[17:19]
-        held.turn[:] = out[19:21]
+        held.arm = out[17:19]
+        held.turn = out[19:21]
         held.slide = out[21]
-        held.lever[:] = out[22:24]
-        held.stiffness[:] = out[4], out[11]
+        held.lever = out[22:24]
+        held.q = out[25:27]
+        held.stiffness = [out[4], out[11]]
         held.shear = out[24]
-        held.angle_std = out[14]
+        held.angle_std = angle_std
+
+
+def _fill_one(contact: Contact, told: list[float], angle_std: float) -> None:
+    contact.d, contact.theta, contact.force, contact.energy, _, contact.d_std, inside = told
+    contact.theta_std = angle_std
+    contact.inside = inside > 0.0

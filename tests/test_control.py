@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from daemon.assembly import Daemon
 from daemon.commands import Refused
 from daemon.reference import Reference
-from daemon.settings import Settings
+from daemon.settings import Settings, load
 from tools.benchmarks.control import Watched
 
 PAPER: dict[str, dict[str, Any]] = {
@@ -253,3 +254,16 @@ def test_a_step_of_the_reference_never_overshoots() -> None:
     assert way[-1] == 1.0
     arrival = next(k for k, value in enumerate(way) if value == 1.0)
     assert arrival * 0.002 == pytest.approx(0.25 + 0.15, abs=0.006)
+
+
+def test_the_small_hand_grasps_and_turns() -> None:
+    profile = Path(__file__).parent.parent / "config" / "small.toml"
+    with Watched(load(profile).model_dump()) as hand:
+        seen = grasped(hand, force=1.0)
+        assert seen.force.max() < 1.1
+        assert seen.force[-250:].mean() == pytest.approx(1.0, rel=0.02)
+        hand.command("rotate", angle=ANGLE)
+        seen = hand.watch(1.5)
+        assert np.abs(seen.angle - ANGLE)[-250:].max() < math.radians(0.2)
+        assert np.abs(seen.force - 1.0).max() < 0.1
+        assert hand.mode == "holding"

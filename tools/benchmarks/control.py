@@ -113,7 +113,7 @@ def _one_trial(hand: Watched, trials: Trials) -> None:
     hand.grasp(_FORCE)
     seen = hand.watch(_WATCHED)
     touched = np.flatnonzero((seen.force > 0.3).all(axis=1))
-    if not len(touched) or hand.mode != "holding":
+    if not len(touched):
         trials.lost += 1
         return
     seen = seen.since(int(touched[0]))
@@ -122,6 +122,9 @@ def _one_trial(hand: Watched, trials: Trials) -> None:
     trials.settled.append(seen.settled(np.abs(mean - _FORCE) > _NEAR_FORCE * _FORCE))
     last = mean[seen.t > seen.t[-1] - _STEADY]
     trials.steady.append(100.0 * abs(float(last.mean()) / _FORCE - 1.0))
+    if hand.mode != "holding":
+        trials.lost += 1
+        return
     for angle, far in ((_ANGLE, False), (-_ANGLE, True)):
         hand.command("rotate", angle=angle)
         seen = hand.watch(_WATCHED)
