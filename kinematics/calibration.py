@@ -128,7 +128,8 @@ def fit_curve(kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, fu
 
     ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
     the contact (see :func:`cleared`); ``force`` [n] N; ``area`` of a cell [m²]; ``full`` the
-    largest x there is, up to which a cubic has to rise. Least squares of the relative errors. Raises CalibrationError for too few forces or a curve that falls.
+    largest x there is, up to which a cubic has to rise. Least squares of the relative errors.
+    Raises CalibrationError for too few forces or a curve that falls.
     """
     x = _stack(readings, "curve")
     x = x.reshape(len(x), -1)

@@ -1,14 +1,19 @@
 """Cells that the footprint's outline cuts, integrated for the likelihood, as kernels.
 
 A cut cell falls into strips in y where the outline enters or leaves through a side; a strip has two
-Gauss lines in y, a line two Gauss points in x, doubled near the rim. That keeps the bias it causes
-in d below 2 % of the noise floor at a noise of 0.1 % of the modulus, at a third of the cost of the
-forward model's integrals. Lines of many cells are gathered first and integrated in SIMD lanes.
+Gauss lines in y, a line two Gauss points in x, doubled towards the rim; where the outline all but
+meets the rim more of them, in parts that shorten towards it, since there g grows like one over a
+square root. At a noise of 0.1 % of the modulus that keeps the bias it causes below a fifth of the
+noise floor up to 6° from the domain's limit, mostly far below, and below a third up to 3°, at a
+third of the cost of the forward model's integrals. Lines of many cells are gathered first and
+integrated in SIMD lanes.
 """
 
 from __future__ import annotations
 
 import math
+
+import numpy as np
 
 from kinematics.footprint import GAUSS_NODES, GAUSS_WEIGHTS, Crossings, FloatArray, IntArray
 from kinematics.kernels import fast_kernel, kernel
@@ -21,9 +26,17 @@ PLANES = 7
 # Rows of the scratch for lines across cut cells.
 Y, CELL_X, STRIP, PART_FROM, PART, AREA, LINE_G, LINE_X, LINE_Y, LINE_SQUARE = range(10)
 LINE_ROWS = 10
-LINES_A_CELL = 5 * 4 * 2  # five strips, four lines, two parts
+LINES_A_CELL = 5 * 6 * 4  # five strips, six lines, four parts
 LINES = 512 + LINES_A_CELL
 OWNERS = 256
+
+# How near the rim a cell is, and where a line's parts start and how long they are by that: rows are
+# levels, then parts; first for cells with the rim on their right.
+COARSE, FINE, FINEST = range(3)
+_ENDS = ((0.0, 1.0, 1.0, 1.0, 1.0), (0.0, 0.5, 1.0, 1.0, 1.0), (0.0, 0.5, 0.75, 0.9, 1.0))
+_PARTS = np.diff(_ENDS, axis=1)
+PART_LENGTHS = np.stack([_PARTS, _PARTS])
+PART_STARTS = np.stack([np.array(_ENDS)[:, :4], 1.0 - np.array(_ENDS)[:, 1:]])
 
 # The two-point Gauss rule on [0, 1].
 NEAR = 0.5 - 0.5 / math.sqrt(3.0)
@@ -140,13 +153,12 @@ def push_lines(
     low: float,
     high: float,
     crossings: Crossings,
-    fine: bool,
+    level: int,
 ) -> int:
     """Cut a cell into strips where the outline crosses its sides; adds the strips' lines.
 
     ``low``, ``high`` bound the footprint in y; ``crossings`` are the four y where the outline
-    crosses the cell's left and right side. ``fine`` doubles the nodes both ways, for cells near the
-    rim.
+    crosses the cell's left and right side. ``level`` says how near the rim the cell is.
     """
     start = max(y0, low)
     stop = min(y1, high)
@@ -162,25 +174,21 @@ def push_lines(
     b1, b3 = min(b1, b3), max(b1, b3)
     b1, b2 = min(b1, b2), max(b1, b2)
     ends = (b0, b1, b2, b3, stop)
-    n = 4 if fine else 2
+    n = 2 * level + 2  # 2, 4, 6 lines a strip
+    parts = 1 << level  # 1, 2, 4 parts a line
+    side = 1 if x0 < 0.0 else 0
     for piece in range(5):
         length = ends[piece] - start
         if length > 1e-6 * (y1 - y0):
             for k in range(n):
                 y = start + length * GAUSS_NODES[n, k]
                 weight = length * GAUSS_WEIGHTS[n, k]
-                if fine:
+                for m in range(parts):
                     lines[Y, count] = y
                     lines[CELL_X, count] = x0
                     lines[STRIP, count] = weight
-                    lines[PART_FROM, count] = 0.5
-                    lines[PART, count] = 0.5
+                    lines[PART_FROM, count] = PART_STARTS[side, level, m]
+                    lines[PART, count] = PART_LENGTHS[side, level, m]
                     count += 1
-                lines[Y, count] = y
-                lines[CELL_X, count] = x0
-                lines[STRIP, count] = weight
-                lines[PART_FROM, count] = 0.0
-                lines[PART, count] = 0.5 if fine else 1.0
-                count += 1
             start = ends[piece]
     return count

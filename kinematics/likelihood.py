@@ -28,6 +28,9 @@ from kinematics.cells import (
 from kinematics.cut_cells import (
     ALONG_X,
     ALONG_Y,
+    COARSE,
+    FINE,
+    FINEST,
     LINES_A_CELL,
     PLAIN,
     READING,
@@ -113,6 +116,10 @@ def pack(
     for j in range(j0, j1 + 1):
         columns[j, 0], columns[j, 1] = line_span(u, w, v, a, x_first + j * pitch_x)
     capacity = lines.shape[1] - LINES_A_CELL
+    # The outline's lowest point over the base plane: where it comes near to the rim.
+    cosine2 = 1.0 / (1.0 + v * v + w * w)
+    rho2 = max(a * a - u * u * cosine2, 0.0)
+    low = u * cosine2 - math.sqrt(rho2 * (1.0 - cosine2)) < 0.2 * a
     count = 0
     line = 0
     waiting = 0
@@ -134,9 +141,12 @@ def pack(
             for j in range(begin, stop):
                 x0 = x_first + j * pitch_x
                 x_far = max(-x0, x0 + pitch_x)
-                fine = x_far * x_far + y_far * y_far > 0.81 * a * a
+                far2 = x_far * x_far + y_far * y_far
+                level = COARSE
+                if far2 > 0.81 * a * a:
+                    level = FINEST if low and far2 > 0.97 * a * a else FINE
                 crossings = (columns[j, 0], columns[j, 1], columns[j + 1, 0], columns[j + 1, 1])
-                line = push_lines(lines, line, x0, y0, y1, ends[0], ends[1], crossings, fine)
+                line = push_lines(lines, line, x0, y0, y1, ends[0], ends[1], crossings, level)
                 live = cells[i, LIVE, j]
                 packed[READING, count] = frame[i, j] * scale if live > 0.0 else 0.0
                 packed[WEIGHT, count] = live

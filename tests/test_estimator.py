@@ -88,6 +88,24 @@ def test_without_noise_the_bias_stays_far_below_the_noise_floor(material, free_g
 
 @pytest.mark.parametrize("free_gain", [True, False])
 @pytest.mark.parametrize(
+    ("d", "degrees", "share"), [(0.008, 30.0, 0.2), (0.008, 33.5, 0.45), (0.006, 40.0, 0.25)]
+)
+def test_the_bias_stays_small_where_the_outline_all_but_meets_the_rim(d, degrees, share, free_gain):
+    # Half the noise of the aim; here g of the outermost cells rises like one over a square root.
+    rng = np.random.default_rng(1)
+    noise = 0.001 * E
+    for _ in range(25):
+        grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
+        truth = (d, *tilts(math.radians(degrees), rng.uniform(0, 7)), 1.0)
+        sigma = np.sqrt(np.diag(fisher(grid, LINEAR, truth, noise, free_gain)))
+        estimator = ContactEstimator(TIP, LINEAR, grid, noise, free_gain=free_gain, tolerance=1e-6)
+        e = estimator(grid.pressure(TIP, LINEAR, *truth[:3]))
+        assert e.valid
+        assert np.all(np.abs(errors(e, truth)[: len(sigma)]) < share * sigma)
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+@pytest.mark.parametrize(
     ("material", "d", "degrees", "azimuth", "percent"),
     [
         (LINEAR, 0.0005, 0.0, 0.0, 0.1),
