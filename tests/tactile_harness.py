@@ -64,7 +64,8 @@ class Rig:
         hand = None
         if backend in SERIAL:
             faults = (BoardFault.parse(fault),) if fault else ()
-            self.board = TactileBoard(_Images(), ENCODERS[backend], RATE, 0.0, faults)
+            self.images = _Images()
+            self.board = TactileBoard(self.images, ENCODERS[backend], RATE, 0.0, faults)
             self._stack.callback(self.board.close)
             tactile["port"] = ("/dev/none", self.board.path)
             thread = threading.Thread(target=self._serve, daemon=True)

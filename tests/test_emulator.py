@@ -19,6 +19,7 @@ import pytest
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler, PortHandler
 
 from daemon.clock import RealClock
+from daemon.model import make_estimator, make_material
 from daemon.settings import Settings, load
 from daemon.simulation import emulator as module
 from daemon.simulation.emulator import (
@@ -29,6 +30,7 @@ from daemon.simulation.emulator import (
     with_board,
 )
 from daemon.simulation.link_folder import LINKS, FolderError, LinkFolder
+from daemon.tactile import make_sensor
 from daemon.tactile.base import TactileError
 from daemon.tactile.flexitac import FlexiTac
 from tools.cli import main
@@ -363,6 +365,37 @@ def test_a_scene_has_only_the_ports_it_needs(tmp_path):
         assert names & set(LINKS) == {"tactile-right"}
         sensor = board(tmp_path / "hand", 1, rows=16, cols=8)
         sensor.open()
+        sensor.close()
+
+
+@pytest.mark.parametrize(("backend", "full"), [("glove", 1023), ("cobs", 65535)])
+def test_each_serial_framing_is_spoken(tmp_path, backend, full):
+    # Without servos the object is pressed on the tips to and fro.
+    (tmp_path / "one.toml").write_text(
+        f"""scene.fingers = ["left"]
+servos.backend = "none"
+[tactile]
+backend = "{backend}"
+port = ["{{dir}}/tactile-left", ""]
+rows = 32
+cols = 32
+pitch = 0.0018125
+pascal_per_count = 200.0
+full_count = {full}
+"""
+    )
+    settings = load(tmp_path / "one.toml", tmp_path / "hand")
+    with thread(tmp_path / "hand", settings=settings):
+        sensor = make_sensor(settings, RealClock(), None, 0)
+        sensor.open()
+        until(lambda: sensor.latest().data.max() > 40)
+        estimator = make_estimator(settings, make_material(settings.material))
+        estimate = estimator.update(sensor.latest().data, 200.0)
+        assert estimate.valid
+        assert estimate.contact
+        assert 3e-4 < estimate.d < 8e-3
+        assert abs(estimate.tilt_x) < 0.05
+        assert sensor.counters()["resyncs"] <= 1  # the first packet may be half a one
         sensor.close()
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.tactile.cobs import CobsDecoder, encode
 from kinematics.estimator import ContactEstimator
 from kinematics.pressure import SensorGrid
 from tools.benchmarks.estimator_bounds import (
@@ -41,6 +42,7 @@ FloatArray = NDArray[np.float64]
 _FRAMES = 32
 _SLOW_FRAMES = 4  # of methods that take milliseconds
 _NOISE = 0.002 * MODULUS
+_PASCAL_PER_COUNT = 4.0
 _TRUTH = (0.004, *tilts(math.radians(12.0), 0.7))
 _CENTRE = (0.31 * PITCH, -0.17 * PITCH)
 GRID = SensorGrid(SIZE, SIZE, PITCH, _CENTRE)
@@ -86,6 +88,7 @@ def measure(effort: Effort | None = None) -> list[Any]:
     frames = clean + _NOISE * random.standard_normal((_FRAMES, SIZE, SIZE))
     empty = _NOISE * random.standard_normal((_FRAMES, SIZE, SIZE))
     cases = {**_rungs(frames), **_steps(frames, empty)}
+    cases["decode of a 44 × 44 uint16 frame: call"] = _decode(frames)
     outside, missing = rivals(TIP, LINEAR, GRID, _NOISE)
     for name, method in outside.items():
         slow = "least_squares" in name
@@ -189,6 +192,20 @@ def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Case]:
         _kernel(_estimator(tolerance=1e-9), frames, False),
     )
     return cases
+
+
+def _decode(frames: FloatArray) -> _Case:
+    """Our framing's bytes, as a board sends them, to counts."""
+    counts = [np.maximum(frame / _PASCAL_PER_COUNT, 0.0).astype(np.uint16) for frame in frames]
+    packets = [encode(each, number, 0.01 * number) for number, each in enumerate(counts)]
+    decoder = CobsDecoder(SIZE, SIZE)
+
+    def run(repeat: int) -> None:
+        for _ in range(repeat):
+            for packet in packets:
+                decoder.feed(packet, 0.0)
+
+    return _Case(Subject(run, len(packets)), None, 10.0)
 
 
 def _outside(method: Method, frames: FloatArray) -> _Case:
