@@ -242,7 +242,7 @@ def test_a_killed_stand_in_hand_is_a_fault_and_no_crash(
     until(lambda: stream.newest()["fault"] != "")
     state = stream.newest()
     assert state["mode"] == "fault"
-    assert "servos" in state["fault"]
+    assert "servo" in state["fault"]
     refused = send(addresses[1], {"command": "clear"})
     assert not refused["ok"]
     process.send_signal(signal.SIGTERM)
