@@ -29,7 +29,7 @@ class CommandServer:
     """Answers at most one command a tick. Anything malformed gets a refusal, never an exception."""
 
     def __init__(self, context: zmq.Context[Any], address: str, max_bytes: int) -> None:
-        self._bound = Bound(context, zmq.ROUTER, address, "commands.address", _QUEUE)
+        self._bound = Bound(context, zmq.ROUTER, address, "commands.address", _QUEUE, 4 * max_bytes)
         self._socket = self._bound.socket
         self._max_bytes = max_bytes
 
@@ -41,6 +41,8 @@ class CommandServer:
         # A REQ socket sends [identity, empty, payload]. Without the empty frame, as from a DEALER,
         # the reply goes back in the same form.
         envelope, payload = frames[:-1], frames[-1]
+        if len(envelope) > 2:
+            return True  # not the form of any client; an answer would only send its frames back
         reply = self._answer(payload, handler)
         try:
             self._socket.send_multipart([*envelope, pack(reply)], zmq.NOBLOCK)
@@ -48,14 +50,11 @@ class CommandServer:
             pass  # the client has gone
         return True
 
-    def refuse_waiting(self, reason: str) -> None:
-        """Refuse all commands that have come so far, as those that came before the loop ran."""
-
-        def refuse(_: dict[str, Any]) -> dict[str, Any]:
-            raise Refused(reason)
-
-        while self.serve(refuse):
-            pass
+    def drain(self, handler: Handler) -> None:
+        """Answer all that wait, up to the queue's length."""
+        for _ in range(_QUEUE):
+            if not self.serve(handler):
+                return
 
     def _answer(self, payload: bytes, handler: Handler) -> dict[str, Any]:
         try:
@@ -95,10 +94,16 @@ def send(address: str, request: dict[str, Any], timeout: float = 2.0) -> dict[st
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
     try:
-        socket.connect(address)
+        try:
+            socket.connect(address)
+        except zmq.ZMQError as error:
+            raise NoAnswer(f"{address}: {error}") from None
         socket.send(pack(request))
         if not socket.poll(int(timeout * 1000)):
-            raise NoAnswer(f"no answer from {address} within {timeout:g} s; is softfinger running?")
+            raise NoAnswer(
+                f"no answer from {address} within {timeout:g} s; is softfinger running, "
+                "or still starting?"
+            )
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:
         socket.close()

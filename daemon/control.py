@@ -26,6 +26,7 @@ _GRACE = 1.0  # s after the ramp's end in which a joint that friction holds may 
 _SETTLED_FORCE = 0.03  # share of the force target
 _SETTLED_ANGLE = 0.5 * math.pi / 180.0
 _SETTLED_FOR = 0.2  # s
+_TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
 _LOST_AFTER = 0.1  # s without contact in a grip
 
 
@@ -133,14 +134,14 @@ class Control:
         if len(self._fingers) < 2 or not self._settings.scene.object_model:
             raise Refused("rotate: needs both fingers and the object model in the scene")
         angle = numbers["angle"]
-        bound = 0.5
-        if abs(angle) > bound:
-            raise Refused(
-                f"rotate: angle: found {angle:g} rad, expected −{bound:g} to {bound:g}"
-                " (a number with the unit, as 10deg, is taken in degrees by the command line)"
-            )
         if not self._pose.valid:
             raise Refused("rotate: the object's angle is not known")
+        low, high = self._turns()
+        if not low <= angle <= high:
+            raise Refused(
+                f"rotate: angle: found {angle:.4g} rad, "
+                f"expected {low:.2f} to {high:.2f} in this grip"
+            )
         self._grip.steer(self._pose.angle, angle)
         self._enter(Mode.ROTATING)
 
@@ -152,6 +153,26 @@ class Control:
                 f"set: compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
             )
         self._grip.joint_stiffness = 1.0 / compliance
+
+    def _turns(self) -> tuple[float, float]:
+        """The object's angles [rad] that this grip reaches within the tips' and joints' limits.
+
+        While the object turns by φ, each joint leans by φ over the sum of its turns, and each tip's
+        tilt changes by both.
+        """
+        settings, present = self._settings, self._pose.angle
+        lean = 1.0 / max(self._held.turn[0] + self._held.turn[1], 0.1)
+        low, high = -math.inf, math.inf
+        for index, sense in ((0, 1.0), (1, -1.0)):
+            contact, q = self._contacts[index], self._reading.q[index]
+            depth = 1.0 - contact.d / settings.tip.radius
+            reach = math.asin(max(depth, 0.0)) - settings.safety.theta_margin - _TURN_RESERVE
+            low = max(low, (-reach - contact.theta) / (1.0 + lean))
+            high = min(high, (reach - contact.theta) / (1.0 + lean))
+            down, up = settings.hand.q_min[index] - q, settings.hand.q_max[index] - q
+            ends = sorted((sense * down / lean, sense * up / lean))
+            low, high = max(low, ends[0]), min(high, ends[1])
+        return present + min(low, 0.0), present + max(high, 0.0)
 
     def _release(self, _: dict[str, float]) -> None:
         self._hold_here()
@@ -228,7 +249,7 @@ class Control:
         law = self._settings.control
         for index in self._fingers:
             contact = self._contacts[index]
-            touches = contact.contact and contact.force > law.contact_force
+            touches = contact.valid and contact.contact and contact.force > law.contact_force
             if touches and not self._touching[index]:
                 self._ways[index].reset(self._reading.q[index])
             self._touching[index] = touches

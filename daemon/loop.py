@@ -13,6 +13,7 @@ from typing import Any
 from daemon.clock import Clock
 from daemon.commands import CommandServer, Refused
 from daemon.control import Control
+from daemon.messages import Parts
 from daemon.modes import Lease, parse
 from daemon.perception import FingerPerception
 from daemon.prediction import Held, Prediction
@@ -21,12 +22,14 @@ from daemon.safety import Safety
 from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
 from daemon.stream import Publisher
-from daemon.task import Task
+from daemon.task import Task, TaskOver
 
 EventSink = Callable[[str, str, str], None]
 
 _REFRESH = 0.05  # s between two looks at who subscribes
 _RETRY = 0.5  # s between two tries to turn torque off
+_STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
+_LATE = 0.05  # s after its deadline from which a late tick is told
 
 
 class Loop:
@@ -59,7 +62,11 @@ class Loop:
         self._lease = Lease(settings.commands.lease)
         self._task = Task.named(settings.task)
         self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
-        self._fingers = ("left" in settings.scene.fingers, "right" in settings.scene.fingers)
+        self._scene = Parts(
+            fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
+            servos=servos is not None,
+            sensors=bool(perceptions),
+        )
         rate = settings.loop.rate
         self._state_every = max(round(rate / settings.stream.state_rate), 1)
         self._tactile_every = max(round(rate / settings.stream.tactile_rate), 1)
@@ -67,6 +74,7 @@ class Loop:
         self._published = [0, 0]  # newest frame of each finger that went out
         self._ending = False
         self._stopping = False
+        self._off_again = False  # torque off is asked for although the state says so already
         self._next_try = -math.inf  # when torque off may be tried again after it failed
 
     # What may be asked from outside the tick, a signal handler included
@@ -83,11 +91,9 @@ class Loop:
 
     def run(self, duration: float | None = None) -> None:
         """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
-        self.state.t = self.state.reading.t = self._clock.now()
+        self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
-        if self._server is not None:
-            # Whoever sent them has given up waiting: an old command must not move the hand.
-            self._server.refuse_waiting("came while the daemon was starting; send it again")
+        self._refuse_old()
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -96,7 +102,10 @@ class Loop:
             self._next_try = -math.inf
             if self.servos is not None and self.state.torque:
                 self._torque_off(self.servos)
-            self.emit("info", "end", "ended, torque off")
+            if self.state.torque:
+                self.emit("error", "end", "ended, torque MAY STILL BE ON")
+            else:
+                self.emit("info", "end", "ended, torque off")
 
     def advance(self, duration: float | None = None) -> None:
         """Tick for ``duration`` s, or until `end`, and leave the hand as it is then.
@@ -112,6 +121,10 @@ class Loop:
             now = clock.now()
             timing.wake_late_s = now - deadline
             timing.tick_s = now - last
+            if timing.wake_late_s > _LATE:
+                self.emit("warning", "late", f"a tick came {timing.wake_late_s:.3f} s late")
+            if timing.tick_s > _STALL:
+                self._refuse_old()
             last = now
             self.tick(now)
             done = clock.now()
@@ -124,6 +137,17 @@ class Loop:
             else:
                 self._safety.overruns_in_row = 0
         clock.sleep_until(deadline)
+
+    def _refuse_old(self) -> None:
+        """Refuse what waits: its sender has given up, and only an old stop is still right."""
+
+        def answer(request: dict[str, Any]) -> dict[str, Any]:
+            if request["command"] == "stop":
+                return self._by_person(request)
+            raise Refused(f"{request['command'][:40]}: came while the daemon stood still; again")
+
+        if self._server is not None:
+            self._server.drain(answer)
 
     # The tick
 
@@ -154,28 +178,26 @@ class Loop:
 
     def _feel(self) -> None:
         contacts, prediction = self.state.contacts, self._prediction
-        if prediction is None:
-            for perception in self.perceptions:
-                perception.update(contacts[perception.finger])
-            return
         for perception in self.perceptions:
             finger = perception.finger
-            if perception.update(self._frames[finger]):
+            if prediction is None:
+                perception.update(contacts[finger])
+            elif perception.update(self._frames[finger]):
                 prediction.correct(finger, self._frames[finger], contacts[finger])
-        prediction.fill(contacts, self.state.object)
+        if prediction is not None:
+            prediction.fill(contacts, self.state.object)
+        self._safety.mark_stale(self.state)
 
     def _decide(self) -> None:
         state, control = self.state, self._control
         control.observe(state.reading, state.contacts, state.object, self._held)
         if self._stopping:
             self._stopping = False
-            self.command({"command": "stop"})
+            self._by_person({"command": "stop"})
         if self._server is not None:
-            self._server.serve(self.command)
+            self._server.serve(self._by_person)
         if self._task is not None:
-            request = self._task.next(state, self.period)
-            if request is not None:
-                self._try(request)
+            self._follow(self._task)
         state.mode = control.mode
         if control.torque:
             cause = self._safety.cause(state)
@@ -196,7 +218,8 @@ class Loop:
         wanted = self._control.torque
         if wanted and not state.torque:
             self._torque_on(servos)
-        elif state.torque and not wanted:
+        elif not wanted and (state.torque or self._off_again):
+            self._off_again = False
             self._torque_off(servos)
         elif wanted and state.goal.valid:
             state.goal.seq = state.seq
@@ -220,6 +243,7 @@ class Loop:
         state = self.state
         if state.t < self._next_try:
             return
+        state.torque = True  # as far as is known, until they have answered
         try:
             servos.set_torque(False)
         except ServoError as error:
@@ -235,7 +259,7 @@ class Loop:
         if seq % self._refresh_every == 0:
             publisher.refresh()
         if publisher.wants_state and seq % self._state_every == 0:
-            publisher.state(self.state, self._fingers)
+            publisher.state(self.state, self._scene)
         if publisher.wants_tactile and seq % self._tactile_every == 0:
             for perception in self.perceptions:
                 self._publish_frame(publisher, perception)
@@ -255,14 +279,16 @@ class Loop:
         """Carry out one request at the present tick. Raises Refused with the reason."""
         control = self._control
         command = parse(request, control.mode)
-        self._lease.take(command, self.state.t)
+        self._lease.check(command, self.state.t)
         if command.name == "clear":
             self._reconnect()
-        if command.name in ("arm", "clear"):
-            cause = self._safety.cause(self.state)
-            if cause:
-                raise Refused(f"{command.name}: {cause}")
+        self._refuse_unsafe(command.name)
         reply = control.command(command)
+        self._lease.renew(command, self.state.t)
+        if command.name in ("stop", "disarm"):
+            # Whatever the state says: another program may have switched it on.
+            self._off_again = True
+            self._next_try = -math.inf
         if command.name == "tare":
             for perception in self.perceptions:
                 perception.tare()
@@ -292,6 +318,26 @@ class Loop:
             raise Refused(f"clear: {error}") from None
         self.emit("info", "servos", "connected anew")
 
+    def _refuse_unsafe(self, name: str) -> None:
+        """What neither the mode nor the control law knows, and still speaks against a command."""
+        state = self.state
+        if name in ("arm", "clear"):
+            if state.torque and not self._control.torque:
+                raise Refused(f"{name}: torque could not be turned off yet")
+            cause = self._safety.cause(state, gripping=name == "clear")
+            if cause:
+                raise Refused(f"{name}: {cause}")
+        if name == "arm" and self.servos is not None and not state.reading.valid:
+            raise Refused("arm: the servos were not read at this tick")
+        if name == "grasp":
+            cause = self._safety.cause(state, gripping=True)
+            if cause:
+                raise Refused(f"grasp: {cause}")
+            if any(perception.taring for perception in self.perceptions):
+                raise Refused("grasp: tare is still at work")
+        if name == "tare" and any(contact.contact for contact in state.contacts):
+            raise Refused("tare: something touches a tip")
+
     def _status(self) -> dict[str, Any]:
         state = self.state
         counters = {} if self.servos is None else {"servos": self.servos.counters()}
@@ -305,11 +351,24 @@ class Loop:
             "counters": counters,
         }
 
-    def _try(self, request: dict[str, Any]) -> None:
+    def _by_person(self, request: dict[str, Any]) -> dict[str, Any]:
+        reply = self.command(request)
+        if self._task is not None and request["command"] != "status":
+            self._end_task(f"ended by the command {request['command']}")
+        return reply
+
+    def _follow(self, task: Task) -> None:
+        """Carry out what the task says is due; a task that can't go on ends."""
         try:
-            self.command(request)
-        except Refused as refusal:
-            self.emit("warning", "task", str(refusal))
+            request = task.next(self.state, self.period)
+            if request is not None:
+                self.command(request)
+        except (TaskOver, Refused) as reason:
+            self._end_task(str(reason))
+
+    def _end_task(self, reason: str) -> None:
+        self._task = None
+        self.emit("warning", "task", f"task over: {reason}")
 
     def emit(self, level: str, kind: str, text: str) -> None:
         """Publish an event and hand it to the log."""

@@ -5,10 +5,11 @@ and fields are only ever added. SI units.
 
 ``hand/state``
     ``schema, seq, timestamp`` (Unix s), ``mono_ns, mode, fault, torque, tick_s, compute_s,
-    wake_late_s, overruns``; under ``left`` and ``right``: ``valid`` (the finger takes part and its
-    numbers are fresh), ``q`` [rad], ``dq`` [rad/s], ``current`` [A], ``goal_q`` [rad],
-    ``goal_current`` [A], ``d`` [m], ``theta`` [rad], ``tilt_y`` [rad], ``force`` [N],
-    ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq, frame_age_s``;
+    wake_late_s, overruns``; under ``left`` and ``right``: ``valid`` (the finger takes part and
+    what it has of servos and sensors gave fresh, sound numbers), ``q`` [rad], ``dq`` [rad/s],
+    ``current`` [A], ``goal_q`` [rad], ``goal_current`` [A], ``d`` [m], ``theta`` [rad], ``tilt_y``
+    [rad], ``force`` [N], ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq,
+    frame_age_s``;
     under ``object``: ``valid, angle`` [rad], ``width`` [m].
 ``hand/tactile``
     ``schema, seq, timestamp, finger, rows, cols, pitch`` [m], ``unit`` (``"count"``), ``scale``
@@ -19,7 +20,7 @@ and fields are only ever added. SI units.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 
@@ -33,8 +34,16 @@ EVENT = b"hand/event"
 pack = msgpack.Packer(use_bin_type=True).pack
 
 
-def state_message(state: State, fingers: tuple[bool, bool]) -> dict[str, Any]:
-    """The ``hand/state`` map. ``fingers``: which ones take part in the scene."""
+class Parts(NamedTuple):
+    """What the scene has: which fingers, and whether they have servos and sensors."""
+
+    fingers: tuple[bool, bool]
+    servos: bool
+    sensors: bool
+
+
+def state_message(state: State, scene: Parts) -> dict[str, Any]:
+    """The ``hand/state`` map."""
     timing = state.timing
     reading = state.reading
     joints = zip(
@@ -45,9 +54,10 @@ def state_message(state: State, fingers: tuple[bool, bool]) -> dict[str, Any]:
         state.goal.current,
         strict=True,
     )
+    read = state.reading.valid or not scene.servos
     left, right = (
-        _finger(state, contact, joint, taking_part)
-        for contact, joint, taking_part in zip(state.contacts, joints, fingers, strict=True)
+        _finger(state, contact, joint, part and read and (contact.valid or not scene.sensors))
+        for contact, joint, part in zip(state.contacts, joints, scene.fingers, strict=True)
     )
     return {
         "schema": SCHEMA,
@@ -75,11 +85,11 @@ def _finger(
     state: State,
     contact: Contact,
     joint: tuple[float, float, float, float, float],
-    taking_part: bool,
+    valid: bool,
 ) -> dict[str, Any]:
     q, dq, current, goal_q, goal_current = joint
     return {
-        "valid": taking_part and (state.reading.valid or contact.valid),
+        "valid": valid,
         "q": q,
         "dq": dq,
         "current": current,

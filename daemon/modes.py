@@ -100,22 +100,26 @@ def _number(name: str, key: str, value: Any) -> float:
 class Lease:
     """One commander at a time: a client keeps the hand for a while after its last command.
 
-    Clients that give no name share one. ``stop`` and ``status`` need no lease.
+    Clients that give no name share one. What can only make the hand safer needs no lease.
     """
 
-    FREE = frozenset({"stop", "status"})
+    FREE = frozenset({"stop", "disarm", "status"})
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self._owner = ""
         self._until = -math.inf
 
-    def take(self, command: Command, now: float) -> None:
-        """Take or renew the lease. Raises Refused while somebody else has it."""
+    def check(self, command: Command, now: float) -> None:
+        """Raises Refused while somebody else has the lease."""
         if command.name in self.FREE:
             return
         if now < self._until and command.client != self._owner:
             owner = self._owner or "an unnamed client"
             raise Refused(f"{command.name}: {owner} commands the hand ({self._until - now:.1f} s)")
-        self._owner = command.client
-        self._until = now + self._seconds
+
+    def renew(self, command: Command, now: float) -> None:
+        """Take or prolong the lease, once the command has been carried out."""
+        if command.name not in self.FREE:
+            self._owner = command.client
+            self._until = now + self._seconds

@@ -43,6 +43,11 @@ class FingerPerception:
         self._tare_sum: NDArray[np.uint32] | None = None
         self._tare_left = 0
 
+    @property
+    def taring(self) -> bool:
+        """The zero is being learnt: what is felt now is not yet right."""
+        return self._tare_left > 0
+
     def tare(self) -> None:
         """Take the mean of the next frames as zero, cell by cell."""
         self._tare_sum = None
@@ -69,6 +74,8 @@ class FingerPerception:
         if self._zero is not None:
             counts = np.maximum(counts, self._zero) - self._zero
         self.estimate(counts, contact)
+        if contact.valid:
+            contact.t_sound = frame.t_arrival
         return True
 
     def estimate(self, counts: NDArray[np.uint16] | NDArray[np.float64], contact: Contact) -> None:

@@ -290,10 +290,13 @@ class Prediction:
 
     def correct(self, finger: int, frame: Contact, contact: Contact) -> None:
         """Take in what was estimated from one finger's new ``frame``, and make it ``contact``."""
+        if not frame.valid:
+            # An unsound estimate is no news: the prediction goes on, and its age tells safety.
+            contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t, frame.t_arrival
+            contact.valid = False
+            return
         for name in Contact.__slots__:
             setattr(contact, name, getattr(frame, name))
-        if not frame.valid:
-            return
         self._live[finger] = frame.contact
         if not frame.contact:
             self._m[_LIVE + finger] = self._m[_D + finger] = 0.0

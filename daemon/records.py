@@ -7,6 +7,7 @@ angle closes. ``t`` is the clock's time in seconds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +25,7 @@ class Reading:
     """What the servos said. Filled in place by ``Servos.read``."""
 
     seq: int = 0
-    t: float = 0.0
+    t: float = -math.inf  # when the last good one was taken
     valid: bool = False
     q: list[float] = field(default_factory=_pair)  # joint angle [rad]
     dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
@@ -50,7 +51,8 @@ class Contact:
     seq: int = 0  # of the frame
     t: float = 0.0  # when that frame was sampled [s]
     t_arrival: float = 0.0  # and when it was complete here [s]
-    valid: bool = False  # a frame has come and its estimate is sound
+    t_sound: float = 0.0  # arrival of the last frame whose estimate was sound [s]
+    valid: bool = False  # a frame has come, its estimate is sound and it is not too old
     contact: bool = False  # something touches the tip
     d: float = 0.0  # maximum displacement [m]
     theta: float = 0.0  # the object's angle in the tip's frame, in the hand's plane [rad]

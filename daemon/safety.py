@@ -43,26 +43,42 @@ class Safety:
 
     def must_hold(self, state: State) -> bool:
         """Frames are late: the goals stay as they are until one comes or a fault latches."""
-        return self._has_sensors and self._frames_older(state, self._limits.frame_age_hold)
+        if not self._has_sensors or state.mode not in _GRIPPING:
+            return False
+        return self._frames_older(state, self._limits.frame_age_hold)
 
-    def cause(self, state: State) -> str:
-        """The first cause of a fault that stands in this state, or an empty text."""
+    def cause(self, state: State, gripping: bool = False) -> str:
+        """The first cause of a fault that stands in this state, or an empty text.
+
+        Old frames are one while the hand grips, or when ``gripping`` says to judge as if it did.
+        """
         for check in self._CAUSES:
             found = check(self, state)
             if found:
                 return found
-        return ""
+        return self._frames_silent(state) if gripping or state.mode in _GRIPPING else ""
+
+    def mark_stale(self, state: State) -> None:
+        """A contact whose last sound frame is older than a fault allows is not valid."""
+        if not self._has_sensors:
+            return
+        oldest = state.t - self._limits.frame_age_fault * self._frame_period
+        for index in self._fingers:
+            contact = state.contacts[index]
+            if contact.t_sound < oldest:
+                contact.valid = False
+                state.object.valid = False
 
     def _frames_older(self, state: State, periods: float) -> bool:
-        if state.mode not in _GRIPPING:
-            return False
         oldest = state.t - periods * self._frame_period
-        return any(state.contacts[index].t_arrival < oldest for index in self._fingers)
+        return any(state.contacts[index].t_sound < oldest for index in self._fingers)
 
     def _servos_silent(self, state: State) -> str:
         if not self._has_servos:
             return ""
         age = state.t - state.reading.t
+        if age == math.inf:
+            return "servos: no good reading yet"
         bound = self._settings.servos.fault_after
         return f"servos: no good reading for {age:.3f} s" if age > bound else ""
 
@@ -88,8 +104,12 @@ class Safety:
     def _frames_silent(self, state: State) -> str:
         if not self._has_sensors or not self._frames_older(state, self._limits.frame_age_fault):
             return ""
-        oldest = min(state.contacts[i].t_arrival for i in self._fingers)
-        return f"tactile: no frame for {state.t - oldest:.3f} s"
+        newest = min(
+            (state.contacts[i] for i in self._fingers), key=lambda contact: contact.t_sound
+        )
+        age = state.t - newest.t_sound
+        what = "frame" if newest.t_arrival == newest.t_sound else "sound estimate"
+        return f"tactile: no {what} for {age:.3f} s"
 
     def _too_deep(self, state: State) -> str:
         if not self._has_sensors:
@@ -121,7 +141,6 @@ class Safety:
         _servos_silent,
         _servo_alert,
         _joints_outside,
-        _frames_silent,
         _too_deep,
         _overrunning,
     )

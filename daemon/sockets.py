@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
+from pathlib import Path
 from typing import Any, cast
 
 import zmq
@@ -22,14 +24,24 @@ class Bound:
     """
 
     def __init__(
-        self, context: zmq.Context[Any], kind: int, address: str, key: str, queue: int
+        self,
+        context: zmq.Context[Any],
+        kind: int,
+        address: str,
+        key: str,
+        queue: int,
+        max_bytes: int,
     ) -> None:
         self._lock = -1
+        self._file = ""
         if address.startswith("ipc://"):
-            self._lock = _lock(address.removeprefix("ipc://"), address, key)
+            path = address.removeprefix("ipc://")
+            self._lock = _lock(path, address, key)
+            self._file = path
         self.socket: zmq.Socket[Any] = context.socket(kind)
         self.socket.setsockopt(zmq.LINGER, 200)
-        # A bound on the queues holds only for connections made after it was set, so before bind.
+        # These bounds hold only for connections made after they were set, so before bind.
+        self.socket.setsockopt(zmq.MAXMSGSIZE, max_bytes)
         self.socket.setsockopt(zmq.SNDHWM, queue)
         self.socket.setsockopt(zmq.RCVHWM, queue)
         try:
@@ -50,6 +62,9 @@ class Bound:
         """Close the socket and give the address back."""
         self.socket.close()
         if self._lock >= 0:
+            for path in (self._file, self._file + ".lock"):
+                with contextlib.suppress(OSError):
+                    Path(path).unlink()
             os.close(self._lock)
             self._lock = -1
 
@@ -58,10 +73,14 @@ def _lock(path: str, address: str, key: str) -> int:
     try:
         descriptor = os.open(path + ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise AddressError(f"{key}: can't bind {address}: {error}") from None
+        raise AddressError(f"{key}: can't bind {address}: {error.strerror}") from None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(descriptor)
         raise AddressError(f"{key}: {address} is in use; is another softfinger running?") from None
+    if Path(path).exists() and not Path(path).is_socket():
+        os.close(descriptor)
+        Path(path + ".lock").unlink()
+        raise AddressError(f"{key}: {path} is there already and is no socket")
     return descriptor

@@ -15,12 +15,15 @@ from daemon import messages
 from daemon.records import Frame, State
 from daemon.sockets import Bound
 
+_CHANGES = 16  # subscriptions taken in at a time; more wait for the next look
+_LONGEST_TOPIC = 64  # bytes; whoever subscribes to more gets nothing
+
 
 class Publisher:
     """Publishes state, tactile frames and events. One thread, the loop's, may call it."""
 
     def __init__(self, context: zmq.Context[Any], address: str, queue: int) -> None:
-        self._bound = Bound(context, zmq.XPUB, address, "stream.address", queue)
+        self._bound = Bound(context, zmq.XPUB, address, "stream.address", queue, 1024)
         self._socket = self._bound.socket
         self._subscriptions: set[bytes] = set()
         self.wants_state = False
@@ -29,8 +32,12 @@ class Publisher:
 
     def refresh(self) -> None:
         """Learn who came and went. XPUB tells a topic's first subscriber and its last one gone."""
-        while self._bound.readable():
+        for _ in range(_CHANGES):
+            if not self._bound.readable():
+                break
             change = self._socket.recv(zmq.NOBLOCK)
+            if len(change) > _LONGEST_TOPIC:
+                continue
             if change[:1] == b"\x01":
                 self._subscriptions.add(change[1:])
             else:
@@ -41,9 +48,9 @@ class Publisher:
     def _wanted(self, topic: bytes) -> bool:
         return any(topic.startswith(prefix) for prefix in self._subscriptions)
 
-    def state(self, state: State, fingers: tuple[bool, bool]) -> None:
+    def state(self, state: State, scene: messages.Parts) -> None:
         """Publish ``hand/state``."""
-        self._send(messages.STATE, messages.state_message(state, fingers))
+        self._send(messages.STATE, messages.state_message(state, scene))
 
     def tactile(self, frame: Frame, finger: int, pitch: float, scale: float, wall: float) -> None:
         """Publish one finger's frame on ``hand/tactile``."""

@@ -15,11 +15,15 @@ from daemon.settings import Task as TaskSettings
 
 Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, rest after it [s]
 
-_PATIENCE = 10.0  # s for a step; a step that a person has overtaken ends the task
+_PATIENCE = 10.0  # s for a step
+
+
+class TaskOver(Exception):
+    """The task can't go on. The message says why."""
 
 
 class Task:
-    """Issues one command after another; ends for good when a step does not come to its end."""
+    """Issues one command after another, each when the hand has come to where the last one led."""
 
     def __init__(self, steps: Iterator[Step]) -> None:
         self._steps = steps
@@ -27,7 +31,6 @@ class Task:
         self._rest = 0.5
         self._left = self._rest
         self._waited = 0.0
-        self._over = False
 
     @staticmethod
     def named(settings: TaskSettings) -> Task | None:
@@ -35,13 +38,18 @@ class Task:
         return Task(demo(settings.force, settings.angle)) if settings.name == "demo" else None
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
-        """The command that is due at this tick, if any."""
-        if self._over:
-            return None
+        """The command that is due at this tick, if any.
+
+        Raises TaskOver after a fault, when the hand was disarmed, or when a step did not come to
+        its end: then a person is at work, and the hand must not start by itself again.
+        """
         if state.mode != self._mode:
+            if state.mode in (Mode.FAULT, Mode.DISARMED):
+                raise TaskOver(f"the hand is in {state.mode}")
             self._left = self._rest
             self._waited += dt
-            self._over = state.mode == Mode.FAULT or self._waited > _PATIENCE
+            if self._waited > _PATIENCE:
+                raise TaskOver(f"still {state.mode} after {_PATIENCE:g} s")
             return None
         self._left -= dt
         if self._left > 0.0:

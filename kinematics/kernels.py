@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import re
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -50,12 +51,25 @@ def inlined_kernel(function: Function) -> Function:
 
 
 def _compile(function: Function, fastmath: bool | set[str], inline: bool = False) -> Function:
-    compiler = numba.njit(cache=True, error_model="numpy", fastmath=fastmath, forceinline=inline)
-    dispatcher: Any = compiler(function)
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": fastmath, "forceinline": inline}
+    try:
+        dispatcher: Any = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # neither beside the source nor in the user's cache can files be written
+        _warn_uncached()
+        return cast(Function, numba.njit(**options)(function))
     # Numba compares this stamp with the one it saved; it offers no public way to widen it.
     index = dispatcher._cache._cache_file
     index._source_stamp = source_digest(Path(inspect.getfile(function)))
     return cast(Function, dispatcher)
+
+
+@cache
+def _warn_uncached() -> None:
+    warnings.warn(
+        "compiled kernels can't be kept: no writable cache folder; every start compiles anew "
+        "(NUMBA_CACHE_DIR names a folder)",
+        stacklevel=2,
+    )
 
 
 def source_digest(path: Path) -> str:

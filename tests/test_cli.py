@@ -175,7 +175,7 @@ def test_garbage_on_the_command_socket_changes_nothing(
     running = start("--config", str(profile("")))
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    for payload in (b"\xc1" * 10, b"x" * 100_000, b"", msgpack.packb({"command": 3})):
+    for payload in (b"\xc1" * 10, b"x" * 10_000, b"", msgpack.packb({"command": 3})):
         socket.send_multipart([b"", payload])
         assert socket.poll(5000)
         assert msgpack.unpackb(socket.recv_multipart()[-1])["ok"] is False

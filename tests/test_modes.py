@@ -54,22 +54,34 @@ def test_a_bad_request_is_refused_with_found_and_expected(
     assert text in str(caught.value)
 
 
+def take(lease: Lease, command: Command, now: float) -> None:
+    lease.check(command, now)
+    lease.renew(command, now)
+
+
+def test_a_command_that_was_not_carried_out_takes_no_lease() -> None:
+    lease = Lease(2.0)
+    lease.check(Command("grasp", {}, "a"), 0.0)
+    take(lease, Command("grasp", {}, "b"), 0.1)
+
+
 def test_one_commander_at_a_time() -> None:
     lease = Lease(2.0)
-    lease.take(Command("arm", {}, "a"), 0.0)
+    take(lease, Command("arm", {}, "a"), 0.0)
     with pytest.raises(Refused, match=r"grasp: a commands the hand \(1\.0 s\)"):
-        lease.take(Command("grasp", {}, "b"), 1.0)
-    lease.take(Command("stop", {}, "b"), 1.0)
-    lease.take(Command("status", {}, ""), 1.0)
-    lease.take(Command("grasp", {}, "a"), 1.0)
+        take(lease, Command("grasp", {}, "b"), 1.0)
+    take(lease, Command("stop", {}, "b"), 1.0)
+    take(lease, Command("disarm", {}, "b"), 1.0)
+    take(lease, Command("status", {}, ""), 1.0)
+    take(lease, Command("grasp", {}, "a"), 1.0)
     with pytest.raises(Refused):
-        lease.take(Command("grasp", {}, "b"), 2.9)
-    lease.take(Command("grasp", {}, "b"), 3.0)
+        take(lease, Command("grasp", {}, "b"), 2.9)
+    take(lease, Command("grasp", {}, "b"), 3.0)
 
 
 def test_clients_without_a_name_share_one_lease() -> None:
     lease = Lease(2.0)
-    lease.take(Command("arm", {}, ""), 0.0)
-    lease.take(Command("grasp", {}, ""), 0.1)
+    take(lease, Command("arm", {}, ""), 0.0)
+    take(lease, Command("grasp", {}, ""), 0.1)
     with pytest.raises(Refused, match="an unnamed client commands"):
-        lease.take(Command("grasp", {}, "a"), 0.2)
+        take(lease, Command("grasp", {}, "a"), 0.2)

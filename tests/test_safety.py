@@ -25,7 +25,9 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
     state.reading.t = 5.0
     state.reading.valid = True
     state.contacts = [
-        Contact(seq=1, t=4.99, t_arrival=5.0, valid=True, contact=True, d=0.004, theta=0.1)
+        Contact(
+            seq=1, t=4.99, t_arrival=5.0, t_sound=5.0, valid=True, contact=True, d=0.004, theta=0.1
+        )
         for _ in range(2)
     ]
     return state
@@ -71,7 +73,15 @@ def too_fast(state: State) -> None:
 
 
 def silent_frames(state: State) -> None:
-    state.contacts[0].t_arrival = 5.0 - 11.0 / SETTINGS.tactile.rate
+    state.contacts[0].t_arrival = state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+
+
+def unsound_estimates(state: State) -> None:
+    state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+
+
+def never_read(state: State) -> None:
+    state.reading.t = -math.inf
 
 
 def too_much_force(state: State) -> None:
@@ -96,6 +106,8 @@ CAUSES: list[tuple[Callable[[State], None], str]] = [
     (past_the_limit, "left joint at 1.200 rad, outside its limits"),
     (too_fast, "right joint at -7.00 rad/s, too fast"),
     (silent_frames, "tactile: no frame for 0.110 s"),
+    (unsound_estimates, "tactile: no sound estimate for 0.110 s"),
+    (never_read, "servos: no good reading yet"),
     (too_much_force, "right tip at 31.0 N, above 30 N"),
     (too_deep, "right tip at 13.00 mm, above 12"),
     (near_the_rim, "left tip at -50.8°, past 50.3° at this depth"),
@@ -125,7 +137,7 @@ def test_what_the_scene_lacks_is_no_cause() -> None:
 
 def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
     state = sound()
-    state.contacts[0].t_arrival = 5.0 - 4.0 / SETTINGS.tactile.rate
+    state.contacts[0].t_sound = 5.0 - 4.0 / SETTINGS.tactile.rate
     assert safety().must_hold(state)
     assert safety().cause(state) == ""
     state.mode = Mode.ARMED

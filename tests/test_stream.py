@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon.messages import SCHEMA, state_message
+from daemon.messages import SCHEMA, Parts, state_message
 from daemon.records import Contact, Frame, State
 from daemon.stream import Publisher
 from tests.conftest import until
 
-BOTH = (True, True)
+BOTH = Parts((True, True), servos=True, sensors=False)
 FINGER_FLOATS = (
     *("q", "dq", "current", "goal_q", "goal_current", "d", "theta", "tilt_y", "force", "energy"),
     *("d_std", "theta_std", "gain", "frame_age_s"),
@@ -40,7 +40,9 @@ def refreshed(publisher: Publisher) -> bool:
 
 
 def test_state_has_every_field_of_the_public_face_with_its_type() -> None:
-    message = msgpack.unpackb(msgpack.packb(state_message(State(), (True, False))))
+    message = msgpack.unpackb(
+        msgpack.packb(state_message(State(), Parts((True, False), True, True)))
+    )
     assert set(message) == {
         *("schema", "seq", "timestamp", "mono_ns", "mode", "fault", "torque"),
         *("tick_s", "compute_s", "wake_late_s", "overruns", "left", "right", "object"),
@@ -59,7 +61,7 @@ def test_state_has_every_field_of_the_public_face_with_its_type() -> None:
 def test_a_finger_that_takes_no_part_keeps_its_shape_and_is_not_valid() -> None:
     state = State()
     state.reading.valid = True
-    message = state_message(state, (True, False))
+    message = state_message(state, Parts((True, False), True, False))
     assert message["left"].keys() == message["right"].keys()
     assert message["left"]["valid"] is True
     assert message["right"]["valid"] is False

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.settings import Settings, SettingsError, load
+from tools.arguments import seconds
+from tools.event_log import EventLog
 
 _STARTED = time.monotonic()
 
@@ -22,26 +24,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
     )
-    parser.add_argument("--duration", type=_seconds, metavar="S", help="end after S seconds")
+    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--monitor", action="store_true", help="show the live page here; q ends both"
     )
 
 
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not value > 0.0:
-        raise argparse.ArgumentTypeError(f"expected a time above 0 s, found {text}")
-    return value
-
-
 def run(arguments: argparse.Namespace) -> int:
-    """Run until a signal, ``--duration`` or a fault that ends it; see the module's docstring."""
+    """Run until a signal or ``--duration``; 0, or 1 with a line that says what was wrong.
+
+    Wrong settings give 2 and the whole report.
+    """
     try:
         settings = load(arguments.config, arguments.dir)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
+    signals = _Signals()
+    log = EventLog()
+    try:
+        return _serve(settings, arguments, signals, log)
+    except Interrupted:
+        log.line("info", "end", "ended while starting; torque was never on")
+        return 0
+    finally:
+        log.close()
+
+
+def _serve(
+    settings: Settings, arguments: argparse.Namespace, signals: _Signals, log: EventLog
+) -> int:
     # What follows imports numpy, numba and zmq: wrong settings are told without waiting for them.
     from daemon.realtime import hold_collector, settle
 
@@ -51,25 +63,26 @@ def run(arguments: argparse.Namespace) -> int:
     from daemon.sockets import AddressError
     from daemon.tactile.base import TactileError
 
-    log = _Log()
-    log.line("info", "start", f"softfinger: {_scene(settings)}; new kernels take half a minute to compile")
+    log.line("info", "start", f"softfinger: {_scene(settings)}")
+    log.line("info", "start", "kernels that are new take half a minute to compile")
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=cache_folder())
-    except (SettingsError, AddressError, ServoError, TactileError) as error:
-        print(f"softfinger: {error}", file=sys.stderr)
+    except (SettingsError, AddressError, ServoError, TactileError, ValueError) as error:
+        log.plain(f"softfinger: {error}")
         return 1
     with daemon:
         settle()
-        _on_signals(daemon.loop)
+        signals.hand_over(daemon.loop)
         log.line("info", "start", _ready(settings, daemon))
         log.quiet = arguments.monitor  # from here on the page owns the terminal
         with _page(settings, daemon.loop) if arguments.monitor else nullcontext():
             daemon.loop.run(arguments.duration)
     state = daemon.loop.state
     if state.fault:
-        print(f"softfinger: ended with a fault: {state.fault}", file=sys.stderr)
-        return 1
-    return 0
+        log.plain(f"softfinger: ended with a fault: {state.fault}")
+    if state.torque:
+        log.plain("softfinger: torque could not be turned off and may still be on")
+    return 1 if state.fault or state.torque else 0
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
@@ -94,31 +107,43 @@ def _ready(settings: Settings, daemon: Any) -> str:
     )
 
 
-def _on_signals(loop: Any) -> None:
-    def end(_number: int, _frame: Any) -> None:
-        loop.end()
-
-    def stop(_number: int, _frame: Any) -> None:
-        loop.stop()
-
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
-    signal.signal(signal.SIGUSR1, stop)
+class Interrupted(BaseException):
+    """A signal asked for the end before the loop ran. No ``except Exception`` may hold it up."""
 
 
-def cache_folder() -> Path:
-    """Where built contact tables are kept between runs."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "softfinger"
-
-
-class _Log:
-    """Events as lines on standard error, unless ``quiet``."""
+class _Signals:
+    """SIGINT, SIGTERM and SIGHUP (the terminal is gone) end; SIGUSR1 stops, once the loop runs."""
 
     def __init__(self) -> None:
-        self.quiet = False
+        self._loop: Any = None
+        self._ended = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._end)
+        signal.signal(signal.SIGUSR1, self._stop)
 
-    def line(self, level: str, kind: str, text: str) -> None:
-        """Print one event."""
-        if not self.quiet:
-            print(f"{level:7} {kind:8} {text}", file=sys.stderr, flush=True)
+    def hand_over(self, loop: Any) -> None:
+        """From now on signals speak to the loop. Raises Interrupted when one came before."""
+        self._loop = loop
+        if self._ended:
+            raise Interrupted
+
+    def _end(self, _number: int, _frame: Any) -> None:
+        self._ended = True
+        if self._loop is None:
+            raise Interrupted
+        self._loop.end()
+
+    def _stop(self, _number: int, _frame: Any) -> None:
+        if self._loop is not None:
+            self._loop.stop()
+
+
+def cache_folder() -> Path | None:
+    """Where built contact tables are kept between runs; None where there is no home for it."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    if base:
+        return Path(base) / "softfinger"
+    try:
+        return Path.home() / ".cache" / "softfinger"
+    except RuntimeError:
+        return None

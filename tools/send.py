@@ -10,6 +10,7 @@ from typing import Any
 
 from daemon.commands import NoAnswer, send
 from daemon.settings import CommandSettings
+from tools.arguments import seconds
 
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("values", metavar="key=value", nargs="*")
     parser.add_argument("--address", default=CommandSettings().address, help="command socket")
     parser.add_argument("--client", default="", help="name that owns the commander's lease")
-    parser.add_argument("--timeout", type=float, default=2.0, metavar="S")
+    parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -68,6 +68,7 @@ class DynamixelServos:
         self._line: ServoLine | None = None
         self._fast = False
         self._torque = False
+        self._was_quiet = False  # the bus watchdog may have stopped the servos
         self._last_sent = 0.0  # time.monotonic() of the last packet the servos must have heard
         self._quiet_limit = math.inf  # s without a packet after which the watchdog is asked
         self._retries = 0
@@ -177,7 +178,7 @@ class DynamixelServos:
         if not reading.valid:
             return
         reading.t = self._clock.now()
-        self._last_sent = begin
+        self._sent(begin)
         alert = 0
         for finger, servo_id in self._ids.items():
             current, velocity, position = _PRESENT.unpack(present.data_dict[servo_id])
@@ -200,12 +201,18 @@ class DynamixelServos:
         goals = self._goals
         if goals is None or not self._torque:
             return
-        if time.monotonic() - self._last_sent > self._quiet_limit:
+        if self._was_quiet or time.monotonic() - self._last_sent > self._quiet_limit:
             self._check_watchdog()
         for finger, servo_id in self._ids.items():
             goals.changeParam(servo_id, self._packed(finger, goal.q[finger], goal.current[finger]))
         if goals.txPacket() == COMM_SUCCESS:
             self._last_sent = time.monotonic()
+
+    def _sent(self, t: float) -> None:
+        """A packet went out at ``t``; note whether the line was quiet before for too long."""
+        if t - self._last_sent > self._quiet_limit:
+            self._was_quiet = True
+        self._last_sent = t
 
     def _packed(self, finger: int, q: float, current: float) -> bytes:
         """One servo's goal as its registers take it in this mode."""
@@ -230,8 +237,8 @@ class DynamixelServos:
         """
         line = self._open_line()
         if not on:
-            self._torque = False
             self._store(reg.TORQUE_ENABLE, "<B", dict.fromkeys(self._ids, 0), "torque off")
+            self._torque = False
             self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(self._ids, 0), "watchdog off")
             return
         self._refuse_hardware_errors(line)
@@ -263,6 +270,7 @@ class DynamixelServos:
             self._quiet_limit = 0.8 * ticks * reg.WATCHDOG_UNIT
             self._store(reg.BUS_WATCHDOG, "<B", dict.fromkeys(each, ticks), "watchdog armed")
         self._last_sent = time.monotonic()
+        self._was_quiet = False
         self._torque = True
 
     def _choose_goals(self, line: ServoLine) -> None:
@@ -346,6 +354,7 @@ class DynamixelServos:
                     f"{self._name(finger)}: its bus watchdog stopped it, since no packet "
                     "came in time: disarm, then arm"
                 )
+        self._was_quiet = False
         self._last_sent = time.monotonic()
 
     # --- exchanges outside the tick ----------------------------------------------------------

@@ -40,6 +40,7 @@ class SimulatedServos:
         self._dq = [0.0, 0.0]
         self._seq = 0
         self._trips = 0
+        self._tripped = False  # the watchdog took the torque that was switched on here
 
     def connect(self) -> None:
         """Take the servos, torque off. Raises ServoError when the model can't do the job."""
@@ -90,6 +91,11 @@ class SimulatedServos:
         if not self._connected:
             return
         self._exchange()
+        if self._tripped:
+            raise ServoError(
+                "the bus watchdog stopped the simulated servos, since nothing came in time: "
+                "disarm, then arm"
+            )
         for joint in self._joints:
             scale = self._scales[joint]
             self._goal_q[joint] = scale.angle(scale.position_counts(goal.q[joint]))
@@ -125,6 +131,7 @@ class SimulatedServos:
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False
+            self._tripped = True
             self._trips += 1
         self._hand.advance(now)
         self._last = now
@@ -134,6 +141,7 @@ class SimulatedServos:
 
     def _switch(self, on: bool) -> None:
         self._torque = on
+        self._tripped = False
         self._hand.hold_torque_until(self._last + self._watchdog if on else math.inf)
         self._drive()
 
