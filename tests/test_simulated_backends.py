@@ -129,7 +129,8 @@ def test_watchdog_takes_torque_off_in_silence_only():
     bench.clock.sleep_until(bench.clock.now() + 0.5)
     bench.servos.read(bench.reading)
     assert bench.servos.counters()["watchdog"] == 1
-    bench.run(0.3)
+    with pytest.raises(ServoError, match="bus watchdog stopped the simulated servos"):
+        bench.run(0.3)
     assert np.abs(bench.hand.current).max() == pytest.approx(0, abs=1e-6)
     bench.servos.set_torque(True)
     bench.run(1.0)
