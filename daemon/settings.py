@@ -1,23 +1,31 @@
-"""Settings: TOML in, one validated `Settings` out, or one report with everything that is wrong.
+"""Settings: the sections of a profile, with their defaults, bounds and units.
 
-Holds the sections with their defaults, bounds and units, and nothing that acts on them. The
-defaults alone are the built-in simulated hand; ``config/sim.toml`` spells them out. Lengths are m,
-angles rad, currents A, rates Hz; pairs are (left, right).
+Nothing here acts on them; `daemon.profiles` reads and checks a file. The defaults alone are the
+built-in simulated hand; ``config/sim.toml`` spells them out. Lengths are m, angles rad, currents A,
+rates Hz; pairs are (left, right).
 """
 
 from __future__ import annotations
 
-import difflib
-import tomllib
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+# Every number has an end on both sides: what no hand has is a slip of the pen, and must not reach
+# an integral. Bounds are closed or open as the quantity is.
+Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+Length = Annotated[float, Field(ge=1e-4, le=10, allow_inf_nan=False)]  # m
+Place = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]  # m
+Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]  # rad
+Seconds = Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)]
+Delay = Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]  # s
+Rate = Annotated[float, Field(ge=0.1, le=10_000, allow_inf_nan=False)]  # Hz
+Acceleration = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]  # m/s²
+Factor = Annotated[float, Field(ge=1e-5, le=1e5, allow_inf_nan=False)]
+Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
+Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Finger = Literal["left", "right"]
 FINGER_NAMES = ("left", "right")
@@ -49,25 +57,25 @@ class Scene(Section):
 class Hand(Section):
     """Two rotational fingers in a plane: pivots at (∓pivot_separation/2, 0), q > 0 closes."""
 
-    pivot_separation: Positive = 0.100
-    finger_length: Positive = 0.080
-    finger_offset: Finite = 0.0
-    q_min: tuple[Finite, Finite] = (-0.5, -0.5)
-    q_max: tuple[Finite, Finite] = (1.0, 1.0)
-    open_angle: tuple[Finite, Finite] = (0.0, 0.0)  # where release goes
+    pivot_separation: Length = 0.100
+    finger_length: Length = 0.080
+    finger_offset: Place = 0.0
+    q_min: tuple[Angle, Angle] = (-0.5, -0.5)
+    q_max: tuple[Angle, Angle] = (1.0, 1.0)
+    open_angle: tuple[Angle, Angle] = (0.0, 0.0)  # where release goes
 
 
 class Tip(Section):
     """The soft hemispherical fingertip."""
 
-    radius: Positive = 0.020
+    radius: Length = 0.020
 
 
 class MaterialLaw(Section):
     """Stress-strain law of the tip: the paper's Table I, a constant modulus, or measured points."""
 
     law: Literal["table_i", "constant", "points"] = "table_i"
-    modulus: Positive = 0.304e6  # Pa, for law = "constant"
+    modulus: Modulus = 0.304e6  # Pa, for law = "constant"
     strain: tuple[Finite, ...] = ()  # for law = "points"
     stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
 
@@ -87,15 +95,15 @@ class ServoSettings(Section):
     model: str = "XM430-W350"
     ids: tuple[Annotated[int, Field(ge=0, le=252)], Annotated[int, Field(ge=0, le=252)]] = (1, 2)
     direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
-    zero: tuple[int, int] = (2048, 2048)  # counts at q = 0
+    zero: tuple[Counts, Counts] = (2048, 2048)  # counts at q = 0
     gear_ratio: Positive = 1.0  # servo turns for one joint turn
     current_limit: tuple[Positive, Positive] = (6.0, 6.0)  # A; the servo's own limit binds too
     mode: ServoMode = "current-based position"  # or "current", or "position" (can't grasp)
     stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
     damping: NonNegative = 0.4  # A·s/rad, likewise
-    reply_timeout: Positive = 0.004  # s, a missing reply costs no more
-    fault_after: Positive = 0.05  # s without a good exchange → fault
-    watchdog: NonNegative = 0.1  # s, the servo's own bus watchdog; 0 leaves it off
+    reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
+    fault_after: Seconds = 0.05  # s without a good exchange → fault
+    watchdog: Delay = 0.1  # s, the servo's own bus watchdog; 0 leaves it off
 
 
 class TactileSettings(Section):
@@ -106,18 +114,18 @@ class TactileSettings(Section):
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
     rows: Annotated[int, Field(ge=4, le=256)] = 44
     cols: Annotated[int, Field(ge=4, le=256)] = 44
-    pitch: Positive = 0.058 / 44
+    pitch: Length = 0.058 / 44
     pitch_y: NonNegative = 0.0  # from row to row; 0: as pitch
-    centre: tuple[Finite, Finite] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
-    rotation: tuple[Finite, Finite] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
+    centre: tuple[Place, Place] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
+    rotation: tuple[Angle, Angle] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
     dead: tuple[Cells, Cells] = ((), ())  # cells [row, col] that are left out
     threshold: Annotated[int, Field(ge=0, le=255)] = 0  # smallest count sent; 0 stands for less
     pascal_per_count: Positive = 4.0
     full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
-    rate: Positive = 100.0  # frames a second that are expected
+    rate: Rate = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
-    latency: NonNegative = 0.005  # s from the middle of a scan to the first byte on the wire
-    open_timeout: Positive = 2.0  # s to wait for a first good frame
+    latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
+    open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # what tells the sensors from others, as a serial number
     calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
     recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, folder of .npy, ASCII export
@@ -139,11 +147,11 @@ class Loop(Section):
 
 
 class Stream(Section):
-    """The publisher. A topic's rate is exact: every n-th tick."""
+    """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
 
     address: str = "tcp://127.0.0.1:9872"
-    state_rate: Positive = 100.0
-    tactile_rate: Positive = 25.0
+    state_rate: Rate = 100.0
+    tactile_rate: Rate = 25.0
     queue: Annotated[int, Field(ge=1, le=100_000)] = 200  # messages kept for a slow subscriber
 
 
@@ -151,28 +159,28 @@ class CommandSettings(Section):
     """The command server."""
 
     address: str = "tcp://127.0.0.1:9873"
-    lease: Positive = 2.0  # s a commander keeps the hand after its last command
+    lease: Seconds = 2.0  # s a commander keeps the hand after its last command
     max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
 
 
 class Control(Section):
     """Gains and rates of the control law; each default was chosen in simulation."""
 
-    torque_constant: Positive = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
+    torque_constant: Factor = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
     approach_speed: Positive = 0.3  # rad/s
     approach_current: Positive = 0.15  # A, while closing: a tip that feels nothing presses no more
     move_speed: Positive = 1.0  # rad/s
     contact_force: Positive = 0.5  # N at which a finger counts as touching
     force_default: Positive = 5.0  # N, grasp without force=
     law: Literal["energy", "two_phase", "position"] = "energy"  # "position" is for comparison
-    force_time: Positive = 0.2  # s in which the force goes from what is felt to what is wanted
-    smooth_time: Positive = 0.1  # s over which references are averaged: bounds their jerk
+    force_time: Seconds = 0.2  # s in which the force goes from what is felt to what is wanted
+    smooth_time: Seconds = 0.1  # s over which references are averaged: bounds their jerk
     force_gain: NonNegative = 1.0  # N a N of force error
     force_bandwidth: NonNegative = 1.0  # Hz of the force integral
     rotate_speed: Positive = 0.65  # rad/s of the object's angle
     rotate_bandwidth: NonNegative = 1.5  # Hz of the angle integral
     joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
-    joint_inertia: Positive = 0.010  # kg·m², finger and rotor: what is damped
+    joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
     damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
     joint_friction: NonNegative = 0.05  # N·m of Coulomb friction, given where motion is wanted
     friction_speed: Positive = 0.02  # rad/s wanted from which on all of it is given
@@ -188,8 +196,8 @@ class Safety(Section):
     current_max: Positive = 1.2  # A
     current_move: Positive = 0.4  # A, while nothing is grasped
     force_max: Positive = 30.0  # N
-    d_max: Positive = 0.012  # m
-    theta_margin: NonNegative = 0.05  # rad kept from the domain's limit
+    d_max: Length = 0.012  # m
+    theta_margin: Annotated[float, Field(ge=0, le=1)] = 0.05  # rad kept from the domain's limit
     velocity_max: Positive = 6.0  # rad/s
     frame_age_hold: Positive = 3.0  # frame periods: goals freeze
     frame_age_fault: Positive = 10.0  # frame periods: fault
@@ -199,27 +207,30 @@ class Safety(Section):
 class ObjectSettings(Section):
     """What the daemon assumes of the object."""
 
-    width: Positive = 0.040
+    width: Length = 0.040
 
 
 class Simulation(Section):
     """The plant behind simulated backends and the emulator; these defaults are our own choice."""
 
     seed: Annotated[int, Field(ge=0)] = 1
-    object_mass: Positive = 0.10  # kg
-    object_width: Positive = 0.040
-    object_height: Positive = 0.060
-    object_position: tuple[Finite, Finite] = (0.0, 0.080)  # m, in the hand's plane
-    object_angle: Finite = 0.0
-    gravity: tuple[Finite, Finite] = (0.0, 0.0)  # m/s² in the plane: the hand lies on a table
+    object_mass: Factor = 0.10  # kg
+    object_width: Length = 0.040
+    object_height: Length = 0.060
+    object_position: tuple[Place, Place] = (0.0, 0.080)  # m, in the hand's plane
+    object_angle: Angle = 0.0
+    gravity: tuple[Acceleration, Acceleration] = (
+        0.0,
+        0.0,
+    )  # m/s²; the hand lies on a table
     table_friction: NonNegative = 0.3  # Coulomb, object on the table it lies on
     tip_friction: NonNegative = 0.6  # Coulomb, tip on object
-    modulus_scale: Positive = 1.0  # the real tip over the settings' material
+    modulus_scale: Factor = 1.0  # the real tip over the settings' material
     tactile_noise: NonNegative = 1520.0  # Pa a cell
-    tactile_delay: NonNegative = 0.010  # s from the middle of a scan to its arrival
-    palm: Finite = 0.0  # m, the palm's place along y; the pivots are at 0
-    tip_loss: NonNegative = 0.002  # s, the tip's damping over its stiffness
-    joint_inertia: Positive = 0.010  # kg·m² at the joint: finger and reflected rotor
+    tactile_delay: Delay = 0.010  # s from the middle of a scan to its arrival
+    palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
+    tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
+    joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
     joint_damping: NonNegative = 0.02  # N·m·s/rad
     joint_friction: NonNegative = 0.05  # N·m, Coulomb
     compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only
@@ -230,7 +241,7 @@ class Task(Section):
 
     name: Literal["none", "demo"] = "none"
     force: Positive = 8.0
-    angle: Finite = 0.14
+    angle: Angle = 0.14
 
 
 class Settings(Section):
@@ -252,139 +263,3 @@ class Settings(Section):
     object: ObjectSettings = ObjectSettings()
     simulation: Simulation = Simulation()
     task: Task = Task()
-
-
-def load(path: Path | None = None, directory: Path | None = None) -> Settings:
-    """Read and check a profile; None gives the built-in simulated hand.
-
-    ``directory`` replaces ``{dir}`` in the ports. Raises SettingsError with one line for every
-    unknown key, wrong type and broken bound.
-    """
-    name = str(path) if path else "built-in settings"
-    try:
-        text = path.read_text(encoding="utf-8") if path else ""
-        raw = tomllib.loads(text)
-    except OSError as error:
-        raise SettingsError(f"{name}: can't be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f"{name}: not TOML: {error}") from None
-    data = _tuples(raw)
-    problems: list[str] = []
-    try:
-        settings = Settings.model_validate(data)
-    except ValidationError as error:
-        problems = [_line(name, details) for details in error.errors()]
-    else:
-        problems = [f"{name}: {problem}" for problem in _contradictions(settings, directory)]
-    if problems:
-        raise SettingsError("\n".join(problems))
-    return settings if directory is None else _with_directory(settings, directory)
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return tuple(_tuples(item) for item in value)
-    return value
-
-
-def _line(name: str, details: ErrorDetails) -> str:
-    location = [str(part) for part in details["loc"]]
-    key = ".".join(location)
-    if details["type"] == "extra_forbidden":
-        known = _known_keys(location[:-1])
-        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
-        return f"{name}: {key}: found an unknown key, expected a known one; nearest: {near[0]}"
-    expected = details["msg"].removeprefix("Input should ").removeprefix("be ")
-    expected = expected.removeprefix("Tuple should have ").replace(" after validation", "")
-    expected = (
-        expected.replace("a valid tuple", "an array")
-        .replace("a valid integer", "a whole number")
-        .replace("a valid ", "a ")
-    )
-    return f"{name}: {key}: found {_shown(details['input'])}, expected {expected}"
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_shown(item) for item in value) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else repr(value)
-
-
-def _known_keys(location: list[str]) -> list[str]:
-    model: type[BaseModel] = Settings
-    for part in location:
-        inner = model.model_fields[part].annotation
-        assert isinstance(inner, type)
-        assert issubclass(inner, BaseModel)
-        model = inner
-    return list(model.model_fields)
-
-
-def _contradictions(settings: Settings, directory: Path | None) -> list[str]:
-    """What each key allows but all of them together don't."""
-    found = []
-    scene, hand, material = settings.scene, settings.hand, settings.material
-    if len(set(scene.fingers)) != len(scene.fingers):
-        found.append(f"scene.fingers: found {_shown(scene.fingers)}, expected each finger once")
-    if settings.servos.backend == "none" and settings.tactile.backend == "none":
-        found.append("servos.backend, tactile.backend: found none and none, expected at least one")
-    for index, finger in enumerate(FINGER_NAMES):
-        low, open_, high = hand.q_min[index], hand.open_angle[index], hand.q_max[index]
-        if not low < high:
-            found.append(f"hand.q_max: found {high:g} for {finger}, expected above q_min {low:g}")
-        elif not low <= open_ <= high:
-            found.append(
-                f"hand.open_angle: found {open_:g} for {finger}, expected {low:g} to {high:g}"
-            )
-    if settings.servos.ids[0] == settings.servos.ids[1] and len(scene.fingers) == 2:
-        found.append(f"servos.ids: found {_shown(settings.servos.ids)}, expected two different ids")
-    if material.law == "points" and len(material.strain) != len(material.stress):
-        found.append(
-            f"material.stress: found {len(material.stress)} numbers, "
-            f"expected {len(material.strain)} as in material.strain"
-        )
-    tactile = settings.tactile
-    for index, cells in enumerate(tactile.dead):
-        found += [
-            f"tactile.dead: found {_shown(cell)} for {FINGER_NAMES[index]}, "
-            f"expected a cell of {tactile.rows} × {tactile.cols}"
-            for cell in cells
-            if cell[0] >= tactile.rows or cell[1] >= tactile.cols
-        ]
-    if tactile.backend == "replay":
-        found += [
-            f'tactile.recording: found "" for {name}, expected a recording'
-            for name in scene.fingers
-            if not tactile.recording[FINGER_NAMES.index(name)]
-        ]
-    simulated = {settings.servos.backend, tactile.backend} <= {"simulated", "replay", "none"}
-    if settings.loop.clock == "virtual" and not simulated:
-        found.append('loop.clock: found "virtual", expected "real" with hardware backends')
-    ports = []
-    if settings.servos.backend == "dynamixel":
-        ports.append(("servos.port", settings.servos.port))
-    if tactile.backend not in ("simulated", "replay", "none"):
-        ports += [("tactile.port", port) for port in settings.tactile.port]
-    if directory is None:
-        found += [
-            f"{key}: found {_shown(port)}, expected --dir to say which folder {{dir}} is"
-            for key, port in ports
-            if "{dir}" in port
-        ]
-    return found
-
-
-def _with_directory(settings: Settings, directory: Path) -> Settings:
-    def filled(port: str) -> str:
-        return port.replace("{dir}", str(directory))
-
-    left, right = settings.tactile.port
-    servos = settings.servos.model_copy(update={"port": filled(settings.servos.port)})
-    tactile = settings.tactile.model_copy(update={"port": (filled(left), filled(right))})
-    return settings.model_copy(update={"servos": servos, "tactile": tactile})

@@ -15,7 +15,8 @@ from daemon.calibration import (
     load_calibration,
     save_calibration,
 )
-from daemon.settings import Settings, load
+from daemon.profiles import load
+from daemon.settings import Settings
 from kinematics.contact import Fingertip
 from kinematics.material import Material
 from kinematics.pressure import SensorGrid

@@ -21,9 +21,10 @@ from daemon.checkup import addresses as sockets
 from daemon.checkup import hand, kernels, machine, mending, ports
 from daemon.checkup.result import Result
 from daemon.commands import CommandServer
+from daemon.profiles import load
 from daemon.servos import registers as reg
 from daemon.servos.mend import scan
-from daemon.settings import Settings, load
+from daemon.settings import Settings
 from daemon.simulation.emulator import Emulator
 from tools import doctor
 from tools.cli import main

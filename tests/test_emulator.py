@@ -20,7 +20,8 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler, PortHandler
 
 from daemon.clock import RealClock
 from daemon.model import make_estimator, make_material
-from daemon.settings import Settings, load
+from daemon.profiles import load
+from daemon.settings import Settings
 from daemon.simulation import emulator as module
 from daemon.simulation.emulator import (
     DEFAULT_BOARD,

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.settings import Settings, SettingsError, load
+from daemon.profiles import load
+from daemon.settings import Settings, SettingsError
 
 CONFIG = Path(__file__).parent.parent / "config"
 
@@ -73,7 +74,7 @@ def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path: Pa
             "servos.baud: found 1.5, expected a whole number",
             "servos.ids.1: found 300, expected less than or equal to 252",
             "servos.backend: found \"dynamxl\", expected 'simulated', 'dynamixel' or 'none'",
-            "tip.radius: found -1, expected greater than 0",
+            "tip.radius: found -1, expected greater than or equal to 0.0001",
             "lop: found an unknown key, expected a known one; nearest: loop",
             "tactile.noise: found nan, expected a finite number",
             'scene.fingers: found "left", expected an array',
@@ -107,6 +108,7 @@ def test_contradictions_between_keys_are_all_told(tmp_path: Path) -> None:
     keys = [line.split(":")[0] for line in lines]
     assert keys == [
         "scene.fingers",
+        "servos.backend, tactile.backend",
         "hand.q_max",
         "hand.open_angle",
         "servos.ids",
@@ -146,3 +148,53 @@ def test_dir_fills_the_ports(tmp_path: Path) -> None:
     settings = load(path, Path("/tmp/hand"))
     assert settings.servos.port == "/tmp/hand/servos"
     assert settings.tactile.port == ("/tmp/hand/a", "/dev/b")
+
+
+def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
+    lines = report(tmp_path, '[servos]\nids = [3, 3]\n[tip]\nradius = "big"\n')
+    assert lines == [
+        'tip.radius: found "big", expected a number',
+        "servos.ids: found [3, 3], expected two different ids",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('[servos]\nbackend = "dynamixel"', "servos.backend, tactile.backend: found dynamixel and"),
+        ('[servos]\nmodel = "XM999"', "servos.model: "),
+        ("[servos]\nwatchdog = 0.003", "servos.watchdog: found 0.003 s, expected above two ticks"),
+        ('[stream]\naddress = "tcp://127.0.0.1:99999"', "stream.address: found"),
+        ('[stream]\naddress = "tcp://*:9872"', "stream.address: found"),
+        ('[stream]\naddress = "inproc://x"', "stream.address: found"),
+        ('[commands]\naddress = "ipc://"', "commands.address: found"),
+        ('[commands]\naddress = "ipc://a\\u0000b"', 'commands.address: found "ipc://a?b"'),
+        ('[commands]\naddress = "tcp://127.0.0.1:9872"', "commands.address: found"),
+        ("servos = 3", "servos: found 3, expected a table"),
+        ("[[loop]]\nrate = 100.0", "loop: found [a table], expected a table"),
+        ("[tactile]\nrate = 1e300", "tactile.rate: found 1e+300, expected less than or equal to"),
+        ("[hand]\nfinger_length = 1e300", "hand.finger_length: found 1e+300"),
+        ("[tip]\nradius = 1e-300", "tip.radius: found 1e-300"),
+        ("[simulation]\ntactile_delay = 1e9", "simulation.tactile_delay: found 1000000000.0"),
+        ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a number"),
+        ('"\\u001b[31m" = 1', "?[31m: found an unknown key"),
+        ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
+        ('[task]\nname = "demo"\nforce = 500.0', "task.force: found 500 N, expected above 0.5 to"),
+        ("x = " + "[" * 5000, "nested too deeply"),
+        ("x = " + "9" * 5000, "not TOML: "),
+        (
+            '[material]\nlaw = "points"\nstrain = [0.0, 0.2, 0.1]\nstress = [0.0, 1.0, 2.0]',
+            "material.strain, material.stress: ",
+        ),
+    ],
+)
+def test_absurd_settings_are_told_in_one_line(tmp_path: Path, text: str, line: str) -> None:
+    lines = report(tmp_path, text)
+    assert lines[0].startswith(line), lines
+    assert all(len(each) < 300 for each in lines)
+
+
+def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
+    path = tmp_path / "profile.toml"
+    path.write_bytes(b"\xef\xbb\xbf[loop]\nrate = 100.0\n")
+    assert load(path).loop.rate == 100.0

@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daemon.settings import Settings, SettingsError, load
+from daemon.profiles import load
+from daemon.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
     from daemon.calibration import Calibration, Converter

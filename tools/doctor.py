@@ -17,8 +17,9 @@ from daemon.checkup.machine import check_machine
 from daemon.checkup.mending import mend_kernels, mend_latency_timer, mend_servos
 from daemon.checkup.ports import check_latency_timer, check_port, note_ports
 from daemon.checkup.result import Result
+from daemon.profiles import load
 from daemon.records import FINGERS
-from daemon.settings import Settings, SettingsError, load
+from daemon.settings import Settings, SettingsError
 from tools.run import cache_folder
 
 _PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from daemon.settings import ServoSettings, Settings, SettingsError, load
+from daemon.profiles import load
+from daemon.settings import ServoSettings, Settings, SettingsError
 
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:

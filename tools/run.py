@@ -11,7 +11,8 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from daemon.settings import Settings, SettingsError, load
+from daemon.profiles import load
+from daemon.settings import Settings, SettingsError
 from tools.arguments import seconds
 from tools.event_log import EventLog
 

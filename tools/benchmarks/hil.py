@@ -11,7 +11,7 @@ from typing import Any
 
 from daemon.assembly import Daemon
 from daemon.loop import Loop
-from daemon.settings import load
+from daemon.profiles import load
 from tools.benchmarks.report import Row, row
 
 _SECONDS = 10.0

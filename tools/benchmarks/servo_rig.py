@@ -15,10 +15,11 @@ from typing import Any
 import dynamixel_sdk as sdk
 
 from daemon.clock import RealClock
+from daemon.profiles import load
 from daemon.records import Goal, Reading
 from daemon.servos import registers as reg
 from daemon.servos.dynamixel import DynamixelServos
-from daemon.settings import Settings, load
+from daemon.settings import Settings
 
 PROFILE = """\
 tactile.backend = "none"
