@@ -29,6 +29,7 @@ EventSink = Callable[[str, str, str], None]
 _REFRESH = 0.05  # s between two looks at who subscribes
 _RETRY = 0.5  # s between two tries to turn torque off
 _STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
+_DEAF = 0.1  # s in which what waited meanwhile has come through the socket's own thread
 _LATE = 0.05  # s after its deadline from which a late tick is told
 
 
@@ -74,6 +75,7 @@ class Loop:
         self._published = [0, 0]  # newest frame of each finger that went out
         self._ending = False
         self._stopping = False
+        self._deaf_until = -math.inf  # until then commands are from before a stall
         self._off_again = False  # torque off is asked for although the state says so already
         self._next_try = -math.inf  # when torque off may be tried again after it failed
 
@@ -93,7 +95,8 @@ class Loop:
         """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
-        self._refuse_old()
+        if self._server is not None:
+            self._server.drain(self._refuse_old)
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -124,7 +127,7 @@ class Loop:
             if timing.wake_late_s > _LATE:
                 self.emit("warning", "late", f"a tick came {timing.wake_late_s:.3f} s late")
             if timing.tick_s > _STALL:
-                self._refuse_old()
+                self._deaf_until = now + _DEAF
             last = now
             self.tick(now)
             done = clock.now()
@@ -138,16 +141,11 @@ class Loop:
                 self._safety.overruns_in_row = 0
         clock.sleep_until(deadline)
 
-    def _refuse_old(self) -> None:
-        """Refuse what waits: its sender has given up, and only an old stop is still right."""
-
-        def answer(request: dict[str, Any]) -> dict[str, Any]:
-            if request["command"] == "stop":
-                return self._by_person(request)
-            raise Refused(f"{request['command'][:40]}: came while the daemon stood still; again")
-
-        if self._server is not None:
-            self._server.drain(answer)
+    def _refuse_old(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Its sender has given up waiting: no old command may move the hand, but stop stops."""
+        if request["command"] == "stop":
+            return self._by_person(request)
+        raise Refused(f"{request['command'][:40]}: came while the daemon stood still; again")
 
     # The tick
 
@@ -195,7 +193,8 @@ class Loop:
             self._stopping = False
             self._by_person({"command": "stop"})
         if self._server is not None:
-            self._server.serve(self._by_person)
+            old = state.t < self._deaf_until
+            self._server.serve(self._refuse_old if old else self._by_person)
         if self._task is not None:
             self._follow(self._task)
         state.mode = control.mode

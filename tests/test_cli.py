@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -142,7 +143,10 @@ def test_bad_settings_end_it_with_the_whole_report(profile: Profile) -> None:
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ('[servos]\nbackend = "dynamixel"\nport = "/dev/absent"\n', "/dev/absent"),
+        (
+            '[servos]\nbackend = "dynamixel"\nport = "/dev/absent"\n[tactile]\nbackend = "none"\n',
+            "/dev/absent",
+        ),
         (
             '[servos]\nbackend = "none"\n[tactile]\nbackend = "flexitac"\nport = ["/dev/no", "x"]',
             "/dev/no",
@@ -160,7 +164,7 @@ def test_a_missing_port_is_named(profile: Profile, text: str, error: str) -> Non
 def test_send_without_a_daemon_or_with_nonsense(addresses: tuple[str, str]) -> None:
     done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "0.1")
     assert done.returncode == 2
-    assert "is softfinger running?" in done.stderr
+    assert "is softfinger running, or still starting?" in done.stderr
     done = softfinger("send", "grasp", "force:5", "--address", addresses[1])
     assert done.returncode == 2
     assert "found 'force:5', expected key=number" in done.stderr
@@ -210,3 +214,78 @@ def test_the_readme_mathematics_runs() -> None:
     exec(mathematics, names)
     assert names["estimate"].d == pytest.approx(0.004, rel=1e-3)
     assert names["contact"].force > 0.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_during_start_up_ends_it_without_a_trace(profile: Profile, number: int) -> None:
+    process = subprocess.Popen(
+        [*SOFTFINGER, "run", "--config", str(profile(""))], stderr=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stderr is not None
+        first = process.stderr.readline()  # said once the handlers are there, before the kernels
+        process.send_signal(number)
+        said = first + process.stderr.read()
+    assert process.returncode == 0
+    assert "Traceback" not in said
+    assert "ended" in said.splitlines()[-1]
+
+
+def test_a_lost_terminal_ends_the_daemon_with_torque_off(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str]
+) -> None:
+    running = start("--config", str(profile("")))
+    assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
+    assert running.end(signal.SIGHUP) == 0
+    assert "ended, torque off" in running.lines[-1]
+
+
+def test_a_reader_of_the_log_that_stops_reading_stops_nothing(
+    profile: Profile, addresses: tuple[str, str]
+) -> None:
+    process = subprocess.Popen(
+        [*SOFTFINGER, "run", "--config", str(profile(""))], stderr=subprocess.PIPE
+    )
+    with process:
+        assert process.stderr is not None
+        process.stderr.close()  # from now on each line written to it fails
+        until(lambda: softfinger("send", "arm", "--address", addresses[1]).returncode == 0, 60.0)
+        status = softfinger("send", "status", "--address", addresses[1])
+        assert json.loads(status.stdout)["mode"] == "armed"
+        process.terminate()
+    assert process.returncode == 0
+
+
+def test_commands_that_waited_through_a_stall_are_refused_but_stop_stops(
+    start: Callable[..., Running],
+    profile: Profile,
+    addresses: tuple[str, str],
+    context: zmq.Context[Any],
+) -> None:
+    running = start("--config", str(profile("")))
+    assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
+    running.process.send_signal(signal.SIGSTOP)
+    socket = context.socket(zmq.DEALER)
+    socket.connect(addresses[1])
+    for request in ({"command": "move", "left": 0.1}, {"command": "stop"}):
+        socket.send_multipart([b"", msgpack.packb(request)])
+    select.select([], [], [], 0.5)  # the stall itself
+    running.process.send_signal(signal.SIGCONT)
+    replies = []
+    for _ in range(2):
+        assert socket.poll(5000)
+        replies.append(msgpack.unpackb(socket.recv_multipart()[-1]))
+    assert "came while the daemon stood still" in replies[0]["error"]
+    assert replies[1]["ok"]
+    assert running.end() in (0, 1)
+
+
+def test_an_ipc_address_never_replaces_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "precious"
+    file.write_text("kept", encoding="utf-8")
+    config = tmp_path / "profile.toml"
+    config.write_text(f'stream.address = "ipc://{file}"\n', encoding="utf-8")
+    done = softfinger("run", "--config", str(config), "--duration", "0.2")
+    assert done.returncode == 1
+    assert "is there already and is no socket" in done.stderr
+    assert file.read_text(encoding="utf-8") == "kept"
