@@ -12,7 +12,8 @@ import pytest
 from daemon.assembly import Daemon
 from daemon.commands import Refused
 from daemon.reference import Reference
-from daemon.settings import Settings, load
+from daemon.profiles import load
+from daemon.settings import Settings
 from tools.benchmarks.control import Watched
 
 PAPER: dict[str, dict[str, Any]] = {
