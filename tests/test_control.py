@@ -11,8 +11,8 @@ import pytest
 
 from daemon.assembly import Daemon
 from daemon.commands import Refused
-from daemon.reference import Reference
 from daemon.profiles import load
+from daemon.reference import Reference
 from daemon.settings import Settings
 from tools.benchmarks.control import Watched
 
