@@ -6,6 +6,7 @@ are compiled and warm before the loop exists, and so before torque can be on.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -119,7 +120,11 @@ class Daemon:
     def close(self) -> None:
         """Torque off, then everything closed, last opened first. Never raises."""
         while self._closers:
-            self._closers.pop()()
+            closer = self._closers.pop()
+            try:
+                closer()
+            except Exception as error:  # the others, torque off among them, must still run
+                logging.getLogger(__name__).error("closing: %s", error)
 
     def __enter__(self) -> Daemon:
         return self

@@ -53,7 +53,7 @@ class Control:
         self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
         self._touching = [False, False]
         self._gripping = False
-        self._since = 0.0  # time in the present mode [s]
+        self._rest_current = settings.safety.current_move  # A, with which the joints hold a goal
         self._waiting = 0.0  # s since the ramps ended, or the grip has been settled
         self._lost = 0.0  # s without contact in a grip
 
@@ -185,7 +185,8 @@ class Control:
         if mode is not self.mode:
             self.events.append(("info", "mode", f"{self.mode.value} → {mode.value}"))
         self.mode = mode
-        self._since = self._waiting = self._lost = 0.0
+        self._rest_current = self._settings.safety.current_move
+        self._waiting = self._lost = 0.0
         if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
             self._gripping = False
 
@@ -211,7 +212,6 @@ class Control:
         goal.valid = self.torque
         if not self.torque:
             return
-        self._since += dt
         mode = self.mode
         if mode is Mode.MOVING or mode is Mode.RELEASING:
             self._travel(dt)
@@ -221,8 +221,7 @@ class Control:
             self._hold(dt, goal)
         else:
             closing = mode is Mode.GRASPING
-            safety = self._settings.safety
-            bound = self._approach_current() if closing else safety.current_move
+            bound = self._approach_current() if closing else self._rest_current
             for index in self._fingers:
                 goal.q[index] = self._ways[index].value
                 goal.current[index] = bound
@@ -287,10 +286,10 @@ class Control:
                 goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
                 goal.current[index] = abs(current)
         self._watch_slip()
-        self._watch_contact(dt, contacts)
+        self._watch_contact(dt, contacts, max(goal.current[index] for index in self._fingers))
         self._watch_settling(dt, contacts)
 
-    def _watch_contact(self, dt: float, contacts: list[Contact]) -> None:
+    def _watch_contact(self, dt: float, contacts: list[Contact], current: float) -> None:
         lost = False
         for contact in contacts:
             lost = lost or not contact.contact
@@ -299,6 +298,8 @@ class Control:
             self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
             self._hold_here()
             self._enter(Mode.ARMED)
+            # A board that went blind must not make the joints press harder than they did.
+            self._rest_current = min(current, self._rest_current)
 
     def _watch_slip(self) -> None:
         """Turning shears the tips, however firm the grip: it ends where they would slip."""

@@ -280,6 +280,53 @@ def test_commands_that_waited_through_a_stall_are_refused_but_stop_stops(
     assert running.end() in (0, 1)
 
 
+def test_subscribers_that_come_late_stop_reading_or_die_change_nothing(
+    start: Callable[..., Running],
+    profile: Profile,
+    addresses: tuple[str, str],
+    context: zmq.Context[Any],
+) -> None:
+    running = start("--config", str(profile("stream.state_rate = 500.0\n")))
+    stuck = context.socket(zmq.SUB)
+    stuck.setsockopt(zmq.RCVHWM, 1)
+    stuck.setsockopt(zmq.RCVBUF, 4096)
+    stuck.subscribe("hand")
+    stuck.connect(addresses[0])
+    dying = subprocess.Popen(
+        [sys.executable, "-c", SUBSCRIBER.format(address=addresses[0])],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert dying.stdout is not None
+    assert dying.stdout.readline() == "first\n"
+    late = context.socket(zmq.SUB)
+    late.subscribe("hand/state")
+    late.connect(addresses[0])
+    seen = []
+    for count in range(1500):
+        if count == 500:
+            dying.kill()
+        assert late.poll(5000)
+        seen.append(msgpack.unpackb(late.recv_multipart()[1])["seq"])
+    assert seen == list(range(seen[0], seen[0] + len(seen))), "a state was lost or held up"
+    dying.wait()
+    dying.stdout.close()
+    assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
+    assert running.end() == 0
+
+
+SUBSCRIBER = """
+import zmq
+socket = zmq.Context.instance().socket(zmq.SUB)
+socket.connect("{address}")
+socket.subscribe("hand/state")
+socket.recv_multipart()
+print("first", flush=True)
+while True:
+    socket.recv_multipart()
+"""
+
+
 def test_an_ipc_address_never_replaces_a_file(tmp_path: Path) -> None:
     file = tmp_path / "precious"
     file.write_text("kept", encoding="utf-8")

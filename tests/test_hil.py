@@ -248,4 +248,4 @@ def test_a_killed_stand_in_hand_is_a_fault_and_no_crash(
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=20) == 1
     assert process.stderr is not None
-    assert "ended with a fault" in process.stderr.read().splitlines()[-1]
+    assert "ended with a fault" in process.stderr.read()

@@ -352,6 +352,15 @@ def test_saturated_sensors_latch_a_fault_and_drive_nothing(make: Make) -> None:
         command(daemon, "clear")
 
 
+def test_blind_sensors_end_the_grip_without_pressing_harder(make: Make) -> None:
+    daemon = grasped(make(), 5.0)
+    assert daemon.hand is not None
+    blinded(daemon, 0)
+    advance_to(daemon, "armed", 0.5)
+    daemon.loop.advance(1.0)
+    assert daemon.hand.force.max() < 5.5
+
+
 def test_tare_is_refused_while_something_touches(make: Make) -> None:
     daemon = grasped(make(), 5.0)
     command(daemon, "release")

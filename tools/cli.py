@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -42,7 +43,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             module.add_arguments(subparser)
     arguments = parser.parse_args(words)
     assert module is not None  # argparse has refused everything else
-    status: int = module.run(arguments)
+    try:
+        status: int = module.run(arguments)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        return 130  # as a shell says of a program that Ctrl-C ended
+    except BrokenPipeError:
+        # Whoever read the output has seen enough, as in `| head`; nothing more can be said to it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     return status
 
 

@@ -161,7 +161,8 @@ class Terminal:
             size = os.get_terminal_size(self._output)
         except OSError:
             size = shutil.get_terminal_size()
-        return max(1, size.columns), max(1, size.lines)
+        # A serial console may say 0 × 0: then as a terminal of old.
+        return size.columns or 80, size.lines or 24
 
     def draw(self, lines: Sequence[Sequence[Segment]]) -> None:
         """Show ``lines``, each exactly as wide as the terminal."""

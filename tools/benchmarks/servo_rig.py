@@ -87,7 +87,8 @@ class OurCycle:
 
     def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
         settings = load(folder / "servos.toml", folder)
-        servos = settings.servos.model_copy(update={"baud": baud})
+        # No bus watchdog: the line is quiet while another way of driving it has its turn.
+        servos = settings.servos.model_copy(update={"baud": baud, "watchdog": 0.0})
         self.settings: Settings = settings.model_copy(update={"servos": servos})
         self.servos = DynamixelServos(self.settings, RealClock())
         self.servos.connect()
