@@ -145,7 +145,8 @@ class Loop:
         """Its sender has given up waiting: no old command may move the hand, but stop stops."""
         if request["command"] == "stop":
             return self._by_person(request)
-        raise Refused(f"{request['command'][:40]}: came while the daemon stood still; again")
+        name = request["command"][:40]
+        raise Refused(f"{name}: came while the daemon stood still or was starting; send it again")
 
     # The tick
 

@@ -104,11 +104,11 @@ class Safety:
     def _frames_silent(self, state: State) -> str:
         if not self._has_sensors or not self._frames_older(state, self._limits.frame_age_fault):
             return ""
-        newest = min(
+        stalest = min(
             (state.contacts[i] for i in self._fingers), key=lambda contact: contact.t_sound
         )
-        age = state.t - newest.t_sound
-        what = "frame" if newest.t_arrival == newest.t_sound else "sound estimate"
+        age = state.t - stalest.t_sound
+        what = "frame" if stalest.t_arrival == stalest.t_sound else "sound estimate"
         return f"tactile: no {what} for {age:.3f} s"
 
     def _too_deep(self, state: State) -> str:

@@ -55,7 +55,7 @@ class Bound:
             raise AddressError(f"{key}: can't bind {address}: {error}") from None
 
     def readable(self) -> bool:
-        """A message waits. Half a microsecond; no system call unless something happened."""
+        """A message waits. About a microsecond; no system call unless something happened."""
         return bool(cast(int, self.socket.getsockopt(_EVENTS)) & _POLLIN)
 
     def close(self) -> None:
