@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 import zmq
 
+from tests.daemon_process import Running
+
 
 @pytest.fixture
 def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
@@ -43,6 +45,23 @@ def profile(tmp_path: Path, addresses: tuple[str, str]) -> Callable[[str], Path]
         return path
 
     return write
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Running]]:
+    started: list[Running] = []
+
+    def run(*words: str) -> Running:
+        started.append(Running(*words))
+        return started[-1]
+
+    yield run
+    for each in started:
+        if each.process.poll() is None:
+            each.process.kill()
+        each.process.wait()
+        assert each.process.stderr is not None
+        each.process.stderr.close()
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> None:

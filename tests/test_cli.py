@@ -8,7 +8,7 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,56 +17,10 @@ import pytest
 import zmq
 
 from tests.conftest import until
+from tests.daemon_process import SOFTFINGER, Running, softfinger
 
 Profile = Callable[[str], Path]
-SOFTFINGER = [sys.executable, "-m", "tools.cli"]
 README = Path(__file__).parent.parent / "README.md"
-
-
-def softfinger(*words: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*SOFTFINGER, *words], capture_output=True, text=True, timeout=timeout, check=False
-    )
-
-
-class Running:
-    """A ``softfinger run`` in a process of its own, ready when constructed."""
-
-    def __init__(self, *words: str) -> None:
-        self.process = subprocess.Popen(
-            [*SOFTFINGER, "run", *words], stderr=subprocess.PIPE, text=True
-        )
-        self.lines: list[str] = []
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.lines.append(line)
-            if "running, disarmed" in line:
-                return
-        raise AssertionError("".join(self.lines))
-
-    def end(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal, read the rest of what it says, and return the exit status."""
-        self.process.send_signal(number)
-        assert self.process.stderr is not None
-        self.lines += self.process.stderr.readlines()
-        return self.process.wait(timeout=30)
-
-
-@pytest.fixture
-def start() -> Iterator[Callable[..., Running]]:
-    started: list[Running] = []
-
-    def run(*words: str) -> Running:
-        started.append(Running(*words))
-        return started[-1]
-
-    yield run
-    for each in started:
-        if each.process.poll() is None:
-            each.process.kill()
-        each.process.wait()
-        assert each.process.stderr is not None
-        each.process.stderr.close()
 
 
 def test_arm_grasp_and_stop_from_the_command_line(

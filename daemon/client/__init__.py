@@ -1,0 +1,46 @@
+"""The hand from a notebook or a program of one's own: its stream as typed records, its commands.
+
+::
+
+    from daemon.client import Hand
+
+    with Hand() as hand:
+        hand.arm()
+        hand.grasp(force=5.0)
+        hand.wait_for(lambda state: state.mode == "holding")
+        print(hand.state().left.force)
+        for state in hand.stream():
+            ...
+
+`AsyncHand` is the same for asyncio. Everything here is the subscriber's side of the public wire and
+needs no more than its two addresses; nothing in it touches the daemon's own state.
+"""
+
+from daemon.client.asynchronous import AsyncHand
+from daemon.client.errors import HandFault, NoStream, NotInTime
+from daemon.client.hand import Hand
+from daemon.client.records import (
+    Event,
+    FingerState,
+    HandState,
+    ObjectState,
+    TactileFrame,
+    to_columns,
+)
+from daemon.commands import NoAnswer, Refused
+
+__all__ = [
+    "AsyncHand",
+    "Event",
+    "FingerState",
+    "Hand",
+    "HandFault",
+    "HandState",
+    "NoAnswer",
+    "NoStream",
+    "NotInTime",
+    "ObjectState",
+    "Refused",
+    "TactileFrame",
+    "to_columns",
+]

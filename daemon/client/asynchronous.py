@@ -1,0 +1,115 @@
+"""`AsyncHand`: what `daemon.client.hand.Hand` is, for asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import msgpack
+import zmq
+import zmq.asyncio
+
+from daemon import messages
+from daemon.client.errors import HandFault, NoStream, NotInTime
+from daemon.client.hand import COMMANDS, STREAM, accepted
+from daemon.client.records import Event, HandState, TactileFrame
+from daemon.client.wire import Decoder, nothing_from, prepare
+from daemon.commands import NoAnswer
+
+
+class AsyncHand:
+    """A hand by its two addresses, in one event loop: ``async with AsyncHand() as hand: …``."""
+
+    def __init__(
+        self,
+        stream: str = STREAM,
+        commands: str = COMMANDS,
+        *,
+        client: str = "",
+        timeout: float = 2.0,
+    ) -> None:
+        self.stream_address = stream
+        self.command_address = commands
+        self.client = client
+        self.timeout = timeout
+        self._context = zmq.asyncio.Context()
+
+    async def __aenter__(self) -> AsyncHand:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._context.destroy(linger=0)
+
+    def stream(self) -> AsyncIterator[HandState]:
+        """States one after the other, every one that is published."""
+        return self._records(messages.STATE)
+
+    def frames(self) -> AsyncIterator[TactileFrame]:
+        """Tactile frames of both fingers."""
+        return self._records(messages.TACTILE)
+
+    def events(self) -> AsyncIterator[Event]:
+        """What the daemon tells: modes, faults, warnings."""
+        return self._records(messages.EVENT)
+
+    async def _records(self, topic: bytes) -> AsyncIterator[Any]:
+        decoder = Decoder(topic)
+        async with self._socket(zmq.SUB) as socket:
+            prepare(socket, self.stream_address, topic)
+            while True:
+                record = decoder.take(await socket.recv_multipart())
+                if record is not None:
+                    yield record
+
+    @asynccontextmanager
+    async def _socket(self, kind: int) -> AsyncIterator[Any]:
+        socket = self._context.socket(kind)
+        try:
+            yield socket
+        finally:
+            socket.close(linger=0)
+
+    async def state(self) -> HandState:
+        """The next state to come. Raises NoStream."""
+        return await self.wait_for(lambda _: True, self.timeout)
+
+    async def wait_for(
+        self, condition: Callable[[HandState], object], timeout: float = 10.0
+    ) -> HandState:
+        """The first state from now on for which ``condition`` holds.
+
+        Raises as `daemon.client.hand.Hand.wait_for` does.
+        """
+        last: HandState | None = None
+        states = self.stream()
+        try:
+            async with asyncio.timeout(timeout):
+                async for last in states:
+                    if condition(last):
+                        return last
+                    if last.fault:
+                        raise HandFault(last.fault)
+        except TimeoutError:
+            pass
+        finally:
+            await states.aclose()  # type: ignore[attr-defined]
+        if last is None:
+            raise NoStream(nothing_from(self.stream_address, messages.STATE, timeout))
+        raise NotInTime(f"not within {timeout:g} s; the last state: mode {last.mode}")
+
+    async def command(self, name: str, **numbers: float) -> dict[str, Any]:
+        """Send one command and return the reply. Raises Refused with the reason, and NoAnswer."""
+        request: dict[str, Any] = {"command": name, **numbers}
+        if self.client:
+            request["client"] = self.client
+        async with self._socket(zmq.REQ) as socket:
+            socket.connect(self.command_address)
+            await socket.send(messages.pack(request))
+            if not await socket.poll(self.timeout * 1e3):
+                raise NoAnswer(f"no answer from {self.command_address} within {self.timeout:g} s")
+            reply = msgpack.unpackb(await socket.recv())
+        if not isinstance(reply, dict):
+            raise NoAnswer(f"{self.command_address} answered something that is not a reply")
+        return accepted(reply)

@@ -1,0 +1,90 @@
+"""What the clients for programs and for asyncio share: topics, subscriptions, gaps, schema."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+import zmq
+
+from daemon import messages
+from daemon.client.records import read_event, read_frame, read_state
+
+_QUEUE = 100_000  # messages kept for a program that is slow for a while
+_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+
+READERS: dict[bytes, Callable[[dict[str, Any]], Any]] = {
+    messages.STATE: read_state,
+    messages.TACTILE: read_frame,
+    messages.EVENT: read_event,
+}
+
+
+def prepare(socket: Any, address: str, topic: bytes) -> None:
+    """Subscribe a SUB socket to one topic. Raises zmq.ZMQError when the address can't be read."""
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.RCVHWM, _QUEUE)
+    socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+    socket.setsockopt(zmq.SUBSCRIBE, topic)
+    socket.connect(address)
+
+
+def nothing_from(address: str, topic: bytes, seconds: float) -> str:
+    """What a NoStream says."""
+    return f"no {topic.decode()} from {address} within {seconds:g} s; is softfinger running?"
+
+
+class Gaps:
+    """Counts what was lost between two messages of one topic, by ``seq`` and its step.
+
+    A ``seq`` that goes back is another daemon, or the same one started again: no loss.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._last: dict[str, int] = {}
+
+    def take(self, message: dict[str, Any]) -> None:
+        """Look at one more message. ``seq_step`` is how far apart neighbours are, 1 if untold."""
+        seq, step, source = message.get("seq"), message.get("seq_step", 1), message.get("finger")
+        if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
+            return
+        key = source if isinstance(source, str) else ""
+        last = self._last.get(key)
+        if last is not None and seq > last + step:
+            self.lost += (seq - last - 1) // step
+        self._last[key] = seq
+
+
+class Decoder:
+    """Turns what comes off the wire into records, counts gaps and tells a foreign schema once."""
+
+    def __init__(self, topic: bytes) -> None:
+        self._read = READERS[topic]
+        self.gaps = Gaps()
+        self.unreadable = 0
+        self._told = False
+
+    def take(self, frames: list[bytes]) -> Any | None:
+        """The record of one message, None when it can't be read."""
+        try:
+            message = msgpack.unpackb(frames[-1])
+            if not isinstance(message, dict):
+                raise ValueError("not a map")
+            record = self._read(message)
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+            self.unreadable += 1
+            return None
+        self.gaps.take(message)
+        schema = message.get("schema")
+        if schema != messages.SCHEMA and not self._told:
+            self._told = True
+            warnings.warn(
+                f"the stream is of schema {schema!r}, this client knows {messages.SCHEMA}; "
+                "it keeps to the fields it knows",
+                stacklevel=3,
+            )
+        return record

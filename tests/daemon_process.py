@@ -1,0 +1,38 @@
+"""``softfinger`` as real processes: one that ends by itself, and a daemon that runs."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+SOFTFINGER = [sys.executable, "-m", "tools.cli"]
+
+
+def softfinger(*words: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*SOFTFINGER, *words], capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+class Running:
+    """A ``softfinger run`` in a process of its own, ready when constructed."""
+
+    def __init__(self, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [*SOFTFINGER, "run", *words], stderr=subprocess.PIPE, text=True
+        )
+        self.lines: list[str] = []
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if "running, disarmed" in line:
+                return
+        raise AssertionError("".join(self.lines))
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """Send a signal, read the rest of what it says, and return the exit status."""
+        self.process.send_signal(number)
+        assert self.process.stderr is not None
+        self.lines += self.process.stderr.readlines()
+        return self.process.wait(timeout=30)
