@@ -146,6 +146,21 @@ class Loop(Section):
     clock: Literal["real", "virtual"] = "real"
 
 
+class Realtime(Section):
+    """How the process is made fit for a steady tick; what isn't allowed is told and done without.
+
+    All but the priority are harmless: a program at SCHED_FIFO keeps others off its processor.
+    """
+
+    priority: Annotated[int, Field(ge=0, le=80)] = 0  # of SCHED_FIFO; 0: the usual scheduling
+    cpus: tuple[Annotated[int, Field(ge=0, le=1023)], ...] = ()  # the loop's; none named: all
+    lock_memory: bool = True  # nothing of the process is swapped out
+    hold_latency: bool = True  # processors stay out of idle states that take long to leave
+    timer_slack: Annotated[float, Field(ge=0, le=1e-3)] = 1e-9  # s; 0: the system's, 50 µs
+    freeze_collector: bool = True  # a full collection would take tens of milliseconds
+    spin: Annotated[float, Field(ge=0, le=1e-3)] = 5e-5  # s before a tick that are waited awake
+
+
 class Stream(Section):
     """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
 
@@ -161,6 +176,14 @@ class CommandSettings(Section):
     address: str = "tcp://127.0.0.1:9873"
     lease: Seconds = 2.0  # s a commander keeps the hand after its last command
     max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
+    per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is free
+
+
+class Access(Section):
+    """Who may subscribe and command. Addresses off this machine need keys."""
+
+    keys: str = ""  # folder that `softfinger keys` made: both sockets take only its clients
+    ipc_mode: Literal["0600", "0660", "0666"] = "0600"  # rights of an ipc address's file
 
 
 class Control(Section):
@@ -201,6 +224,23 @@ class Safety(Section):
     velocity_max: Positive = 6.0  # rad/s
     frame_age_hold: Positive = 3.0  # frame periods: goals freeze
     frame_age_fault: Positive = 10.0  # frame periods: fault
+    frame_age_action: Literal["torque off", "open"] = "torque off"  # open: first, then the fault
+    goal_reach: Positive = 0.5  # rad off the present angle within which a goal may jump
+    goal_speed: Positive = 3.0  # rad/s of a goal that is further off
+    current_rate: Positive = 30.0  # A/s with which a goal current may rise
+    current_fault: Positive = 1.8  # A measured for 0.1 s → fault
+    stall_error: Positive = 0.1  # rad off its goal, with all the current it may take …
+    stall_time: Seconds = 2.0  # … for so many s: a joint has stalled → fault
+    temperature_warn: Positive = 60.0  # °C of a servo
+    temperature_max: Positive = 70.0  # °C → fault
+    voltage_min: NonNegative = 0.0  # V of a servo's supply → fault; 0: the model's own limit
+    voltage_max: NonNegative = 0.0  # V, likewise
+    residual_angle: Positive = 0.2  # rad between the object's angles by the two fingers → fault
+    residual_width: Positive = 0.004  # m of the held object's width since the grip → fault
+    residual_force: Positive = 0.5  # share by which the two tips' forces differ: warning
+    residual_torque: Positive = 0.5  # share by which a joint's torque misses its tip's force
+    saturated: Fraction = 0.05  # share of a sensor's cells that are full: warning
+    frozen_after: Delay = 0.5  # s of identical frames while something touches → fault; 0: never
     overruns_fault: Annotated[int, Field(ge=1)] = 100  # ticks late in a row → fault
 
 
@@ -227,7 +267,18 @@ class Simulation(Section):
     tip_friction: NonNegative = 0.6  # Coulomb, tip on object
     modulus_scale: Factor = 1.0  # the real tip over the settings' material
     tactile_noise: NonNegative = 1520.0  # Pa a cell
+    tactile_gain_spread: Fraction = 0.0  # standard deviation of the cells' sensitivities
+    tactile_dead: Fraction = 0.0  # share of cells that read 0, beside those of tactile.dead
+    tactile_blur: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # m, standard deviation
+    tactile_hysteresis: Fraction = 0.0  # reads up to so much more while a cell is unloaded
+    tactile_creep: Fraction = 0.0  # rise of the reading under a lasting pressure
+    tactile_creep_time: Positive = 10.0  # s in which it comes about
+    tactile_crosstalk: Fraction = 0.0  # share of a line's mean that its cells read too much
+    tactile_drift: NonNegative = 0.0  # Pa, how far the cells' zeros wander
+    tactile_drift_time: Positive = 60.0  # s in which they do
     tactile_delay: Delay = 0.010  # s from the middle of a scan to its arrival
+    tactile_jitter: Delay = 0.0  # s that a frame may come later still
+    tactile_dropped: Annotated[float, Field(ge=0, le=0.99)] = 0.0  # share of frames that never come
     palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
     tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
     joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
@@ -256,8 +307,10 @@ class Settings(Section):
     tactile: TactileSettings = TactileSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     loop: Loop = Loop()
+    realtime: Realtime = Realtime()
     stream: Stream = Stream()
     commands: CommandSettings = CommandSettings()
+    access: Access = Access()
     control: Control = Control()
     safety: Safety = Safety()
     object: ObjectSettings = ObjectSettings()
