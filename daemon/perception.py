@@ -70,10 +70,10 @@ class FingerPerception:
             self._learn_zero(counts)
         if self._converter is not None:
             self.estimate(self._converter(counts), contact)
-            return True
-        if self._zero is not None:
-            counts = np.maximum(counts, self._zero) - self._zero
-        self.estimate(counts, contact)
+        else:
+            if self._zero is not None:
+                counts = np.maximum(counts, self._zero) - self._zero
+            self.estimate(counts, contact)
         if contact.valid:
             contact.t_sound = frame.t_arrival
         return True

@@ -68,6 +68,33 @@ def test_pressures_are_told_in_pa(unit, pascal):
 
 
 @pytest.mark.parametrize(
+    ("written", "pitch"),
+    [("0.127 centimeters", 1.27e-3), ("1.27 millimeters", 1.27e-3), ("0.05 inches", 1.27e-3)],
+)
+def test_units_may_be_spelt_out(written, pitch):
+    found = parse(EXPORT.replace("1.27 mm", written)).pitch
+    assert found == pytest.approx((2e-3, pitch))
+
+
+def test_comments_are_no_header_and_what_stands_below_them_is():
+    comments = "COMMENTS:\nunits were wrong, cols swapped\nsecond line\nUNITS RAW"
+    export = parse(EXPORT.replace("UNITS RAW", comments))
+    assert export.raw
+    assert export.values.shape == (2, 2, 3)
+
+
+def test_a_spreadsheets_commas_make_no_difference():
+    head, frames = EXPORT.split("Frame 4")
+    spread = "".join(f"{line},,\n" for line in head.splitlines()) + "Frame 4, 0,, 6:21:52 PM,,,Raw"
+    assert np.array_equal(parse(spread + frames).values, parse(EXPORT).values)
+
+
+def test_a_single_frame_needs_no_frame_line():
+    single = EXPORT.split("Frame 4")[0] + "0,5,B,\n7,255,1,\n@@\n"
+    assert np.array_equal(parse(single).values, parse(EXPORT).values[:1])
+
+
+@pytest.mark.parametrize(
     ("area", "side"), [("1.6129 mm2", 1.27e-3), ("0.016129 cm2", 1.27e-3), ("0.0025 in2", 1.27e-3)]
 )
 def test_without_spacings_the_area_tells_the_pitch(area, side):

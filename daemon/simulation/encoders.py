@@ -35,7 +35,7 @@ def encode_glove(counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0) -
     """Number + 11, each count's high and low five bits + 11, newline; counts over 1023 saturate."""
     counts = np.minimum(counts, 1023)
     halves = np.stack([counts // 32 + 11, counts % 32 + 11], axis=-1)
-    return bytes((11 + number % 245,)) + halves.astype(np.uint8).tobytes() + b"\n"
+    return bytes((11 + number % 244,)) + halves.astype(np.uint8).tobytes() + b"\n"
 
 
 def encode_cobs(counts: NDArray[np.uint16], number: int = 0, t: float = 0.0) -> bytes:

@@ -2,8 +2,10 @@
 
 Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
 ``Frame n`` (more may stand behind it) and its rows, cells separated by commas, ``B`` where the
-sensor has no cell; a line ``@@`` may end it. Keys are misspelt in the wild (``NOISE_TRESHOLD``) and
-lengths come in mm, cm or in, areas in their squares, readings raw or in a unit of pressure.
+sensor has no cell; a line ``@@`` may end it. The export of a single frame has no ``Frame`` line.
+Keys are misspelt in the wild (``NOISE_TRESHOLD``); lengths come in mm, cm, m or in, abbreviated or
+spelt out, areas in their squares, readings raw or in a unit of pressure. Below ``COMMENTS:`` stands
+free text, in which only words in capitals are keys; a spreadsheet leaves commas at the lines' ends.
 """
 
 from __future__ import annotations
@@ -18,7 +20,12 @@ from numpy.typing import NDArray
 
 _MOST = 1024  # rows or cols
 _LARGEST = 1e12  # of any reading, in its unit
-_LENGTHS = {"": 1e-3, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "inch": 0.0254}
+_LENGTHS = {
+    **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
+    **dict.fromkeys(("cm", "centimeters", "centimetres", "centimeter", "centimetre"), 1e-2),
+    **dict.fromkeys(("m", "meters", "metres", "meter", "metre"), 1.0),
+    **dict.fromkeys(("in", "inch", "inches"), 0.0254),
+}
 _RAW = ("raw", "rawsum", "counts", "")
 _PRESSURES = {
     "pa": 1.0,
@@ -103,12 +110,14 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
 
 def _header(lines: list[str]) -> tuple[dict[str, str], int]:
     header: dict[str, str] = {}
+    in_comments = False
     for number, line in enumerate(lines):
-        key, _, value = line.strip().partition(" ")
+        key, _, value = line.strip().rstrip(",").partition(" ")
         if key.upper() == "ASCII_DATA":
             return header, number + 1
-        if key:
+        if key and (key.isupper() or not in_comments):
             header[_spelt(key.upper())] = value.strip()
+            in_comments |= key.upper().startswith("COMMENT")
     raise TekscanError("no line ASCII_DATA: this is no Tekscan-style export")
 
 
@@ -143,6 +152,10 @@ def _frames(
             frames.append(np.empty((rows, cols)))
             row = 0
             continue
+        if row == rows and not frames:  # the export of a single frame
+            numbers.append(1)
+            frames.append(np.empty((rows, cols)))
+            row = 0
         if row == rows:
             raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
         frames[-1][row] = _row(line, cols, number)
@@ -194,7 +207,7 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float], power: 
     unit = match[2].lower() if match else ""
     wrong_power = match is not None and match[3] not in ("", str(power))
     if not math.isfinite(value) or unit not in units or wrong_power:
-        known = ", ".join(name for name in units if name)
+        known = ", ".join(name for name in units if 0 < len(name) <= 4)
         raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
     return float(value * units[unit] ** power)
 
