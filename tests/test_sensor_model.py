@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.simulation.sensor_model import SensorModel
+from daemon.settings import Settings
+from daemon.simulation import sensor_effects
+from daemon.simulation.sensor_model import Imperfections, SensorModel
 from kinematics.contact import Fingertip
 from kinematics.estimator import ContactEstimator
 from kinematics.material import Material
@@ -16,8 +18,13 @@ MATERIAL = Material.table_i()
 GRID = SensorGrid(44, 44, 0.058 / 44)
 
 
-def model(scale=4.0, **options):
-    return SensorModel(GRID, TIP, MATERIAL, scale, **options)
+FLAWS = set(Imperfections.__dataclass_fields__) - {"dead"}
+
+
+def model(scale=4.0, grid=GRID, **options):
+    flaws = {name: options.pop(name) for name in list(options) if name in FLAWS}
+    flaws["dead"] = options.pop("dead_share", 0.0)
+    return SensorModel(grid, TIP, MATERIAL, scale, Imperfections(**flaws), **options)
 
 
 def frame(sensor, d=0.004, tilt_x=0.2, tilt_y=-0.1):
@@ -53,10 +60,10 @@ def test_noise_has_the_size_asked_for_and_ends_at_zero():
     assert free.mean() == pytest.approx(600.0 / np.sqrt(2 * np.pi), rel=0.1)
 
 
-@pytest.mark.parametrize(("bits", "full"), [(8, 255), (12, 4095), (16, 65535)])
-def test_counts_end_at_the_converters_largest(bits, full):
-    counts = frame(model(scale=0.5, bits=bits), d=0.008)
-    assert counts.max() == min(full, 65535)
+@pytest.mark.parametrize("full", [255, 4095, 65535])
+def test_counts_end_at_the_converters_largest(full):
+    counts = frame(model(scale=0.5, full_count=full), d=0.008)
+    assert counts.max() == full
     assert (counts == full).sum() > 50
 
 
@@ -79,7 +86,12 @@ def test_a_gain_scales_the_pressure():
 
 def test_the_estimator_reads_it_back():
     sensor = SensorModel(
-        SensorGrid(44, 44, 0.058 / 44, rotation=0.3), TIP, MATERIAL, 4.0, noise=600.0, seed=7
+        SensorGrid(44, 44, 0.058 / 44, rotation=0.3),
+        TIP,
+        MATERIAL,
+        4.0,
+        Imperfections(noise=600.0),
+        seed=7,
     )
     estimator = ContactEstimator(TIP, MATERIAL, sensor.grid, 600.0, free_gain=False)
     out = np.zeros(GRID.shape, np.uint16)
@@ -97,13 +109,19 @@ def test_the_estimator_reads_it_back():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"bits": 0}, "bits"),
-        ({"bits": 17}, "bits"),
+        ({"full_count": 0}, "full_count"),
+        ({"full_count": 65536}, "full_count"),
         ({"scale": 0.0}, "pascal_per_count"),
         ({"gain": -1.0}, "gain"),
         ({"noise": -1.0}, "noise"),
         ({"noise": float("nan")}, "noise"),
         ({"gain_spread": -0.1}, "gain_spread"),
+        ({"dead_share": 1.1}, "dead"),
+        ({"blur": -1e-3}, "blur"),
+        ({"hysteresis": float("inf")}, "hysteresis"),
+        ({"creep_time": 0.0}, "creep_time"),
+        ({"drift_time": 0.0}, "drift_time"),
+        ({"crosstalk": -0.1}, "crosstalk"),
     ],
 )
 def test_wrong_arguments_are_refused(options, message):

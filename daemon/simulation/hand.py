@@ -66,7 +66,8 @@ class SimulatedHand:
         memory[layout.POSITION + 4] = simulation.object_angle
         memory[layout.MODE : layout.MODE + 2] = layout.CURRENT_BASED_POSITION_MODE
         # As many as may be on their way to a sensor's reader.
-        kept = math.ceil(simulation.tactile_delay * settings.tactile.rate) + SPARE_SAMPLES
+        latest = simulation.tactile_delay + simulation.tactile_jitter
+        kept = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
         self._ring = np.full((kept, layout.SAMPLE), -1.0)
         self._done = 0
         self._torque_until = math.inf
@@ -142,6 +143,11 @@ class SimulatedHand:
     def samples(self) -> int:
         """Contact samples taken so far; number k was taken at ``start`` + k / tactile.rate."""
         return int(self.memory[layout.SAMPLES])
+
+    @property
+    def kept_samples(self) -> int:
+        """How many of the newest samples are kept."""
+        return len(self._ring)
 
     def sample(self, number: int) -> FloatArray:
         """Row of layout.SAMPLE columns: seq, t since start, then d, θ and gain of both tips.
