@@ -156,6 +156,10 @@ class ControlTable:
             item.address: struct.Struct(_FORMATS[item.size, item.signed]).unpack_from
             for item in self.items
         }
+        self._pack = {
+            item.address: struct.Struct(_FORMATS[item.size, item.signed]).pack_into
+            for item in self.items
+        }
         self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int, int]]]] = {}
         self.reset()
 
@@ -175,6 +179,12 @@ class ControlTable:
         """Value of the item at that address."""
         value: int = self._unpack[address](self.memory, address)[0]
         return value
+
+    def put(self, item: Item, value: int) -> None:
+        """Store a value that lies in the item's range."""
+        self._pack[item.address](self.memory, item.address, value)
+        if item.backed_up:
+            self._layouts.clear()
 
     def set(self, address: int, value: int) -> None:
         """Store a value, access rights aside; too great a value keeps its low bytes."""
@@ -223,8 +233,8 @@ class ControlTable:
         if error:
             return error, []
         plan: list[tuple[Item, int]] = []
-        for item, begin, end in layout:
-            value = int.from_bytes(data[begin:end], "little", signed=item.signed)
+        for item, begin, _ in layout:
+            (value,) = self._unpack[item.address](data, begin)
             if not item.low <= value <= item.high:
                 return protocol.DATA_RANGE, []
             plan.append((item, value))

@@ -36,6 +36,7 @@ _EFFECTIVE = frozenset(
         reg.BUS_WATCHDOG,
     )
 )
+_MOTION_END = reg.PRESENT_POSITION + 4
 _CLEAR_FIRMWARE = 42
 _BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
 _CLEAR_KEY = b"\x01DXL\x22"
@@ -66,6 +67,7 @@ class EmulatedServo:
     ) -> None:
         self.model = model
         self.firmware = model.firmware if firmware is None else firmware
+        self.fast_reads = model.fast_read(self.firmware)  # answers fast sync and fast bulk read
         self.table = ControlTable(model, self.firmware)
         self.silent = False
         self.voltage = (model.voltage_min + model.voltage_max) / 2 * reg.VOLTAGE_UNIT
@@ -118,11 +120,6 @@ class EmulatedServo:
     def alert(self) -> int:
         """The alert bit of its status packets."""
         return protocol.ALERT if self.table.memory[reg.HARDWARE_ERROR_STATUS] else 0
-
-    @property
-    def fast_reads(self) -> bool:
-        """Whether it answers fast sync and fast bulk read."""
-        return self.model.fast_read(self.firmware)
 
     @property
     def torque_on(self) -> bool:
@@ -184,7 +181,9 @@ class EmulatedServo:
         table = self.table
         if not table.holds(address, length):
             return None
-        if table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
+        if address >= reg.PRESENT_CURRENT and address + length <= _MOTION_END:
+            self._joint.refresh_motion()
+        elif table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
             self._joint.refresh(t - self._booted, self.voltage, self.temperature)
         return table.read(address, length)
 
@@ -194,7 +193,7 @@ class EmulatedServo:
         if error:
             return error
         for item, value in plan:
-            self.table.set(item.address, value)
+            self.table.put(item, value)
         for item, value in plan:
             if item.address in _EFFECTIVE:
                 self._effect(item.address, value, t)

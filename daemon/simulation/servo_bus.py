@@ -171,7 +171,7 @@ class ServoBus:
                     servo.heard(t)
                 replies += self._answers(packet, listening, t)
                 if packet.instruction not in _READS:
-                    self._due = min(servo.next_event() for servo in self.servos)
+                    self._due = min([servo.next_event() for servo in self.servos])
             elif self._crc_reply:
                 replies += [
                     self._status(servo, protocol.CRC_ERROR)
@@ -281,12 +281,11 @@ class ServoBus:
         if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
             return []  # an ID may stand in the list once only
         replies: list[Reply] = []
-        block = bytearray()
         if fast:
-            length = 1 + sum(length + 4 for _, _, length in wanted)
-            block += protocol.HEADER + bytes((0, BROADCAST, length & 0xFF, length >> 8 & 0xFF))
-            block.append(protocol.STATUS)
-        crc, summed = 0, 0  # CRC over block[:summed], the earlier CRCs included
+            length = 1 + sum([length + 4 for _, _, length in wanted])
+            piece = protocol.fast_head(length)
+        block = b""
+        crc, delay = 0, 0.0
         for servo_id, address, length in wanted:
             servo = by_id.get(servo_id)
             if servo is None or servo.status_return_level < 1 or (fast and not servo.fast_reads):
@@ -296,17 +295,17 @@ class ServoBus:
             if not fast:
                 replies.append(self._status(servo, error, data or b""))
                 continue
-            block.append(error | servo.alert)
-            block.append(servo_id)
-            block += bytes(length) if data is None else data
-            crc = protocol.crc16(bytes(block[summed:]), crc)
-            summed = len(block)
-            block += crc.to_bytes(2, "little")
-            replies.append(Reply(servo.return_delay, b""))
-        if not fast or not replies:
+            # Each CRC goes over all bytes before it, the earlier CRCs too.
+            piece += bytes((error | servo.alert, servo_id))
+            piece += bytes(length) if data is None else data
+            crc = protocol.crc16(piece, crc)
+            block += piece
+            piece = crc.to_bytes(2, "little")
+            delay += servo.return_delay
+        if not block:
             return replies
         # The blocks follow each other as one packet; the delays before them add up.
-        return [Reply(sum(reply.delay for reply in replies), bytes(block))]
+        return [Reply(delay, block + piece)]
 
     def _sync_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
         if len(data) < 4:

@@ -26,8 +26,10 @@ _PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # cou
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
 _ARRIVED = 20  # counts from the goal that count as there
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
+_MOTION = struct.Struct("<hii")  # registers 126 … 135
 _U32 = struct.Struct("<I").unpack_from
 _I32 = struct.Struct("<i").unpack_from
+_I16 = struct.Struct("<h").unpack_from
 
 
 class ServoJoint:
@@ -71,7 +73,7 @@ class ServoJoint:
     # --- position ----------------------------------------------------------------------------
 
     def _encoder(self) -> int:
-        return self._scale.position_counts(float(self._plant.q[self._joint]))
+        return self._scale.position_counts(self._plant.q.item(self._joint))
 
     def forget_turns(self) -> int:
         """Bring the position into one turn; by how many counts it fell."""
@@ -82,10 +84,13 @@ class ServoJoint:
     def position(self) -> int:
         """Present position in counts, as register 132 tells it."""
         within = self._encoder() - self._turns * reg.COUNTS_PER_TURN
-        return self.sign * within + self._table.get(reg.HOMING_OFFSET)
+        memory = self._table.memory
+        if memory[reg.DRIVE_MODE] & 1:
+            within = -within
+        return within + int(_I32(memory, reg.HOMING_OFFSET)[0])
 
     def _angle(self, position: float) -> float:
-        within = self.sign * (position - self._table.get(reg.HOMING_OFFSET))
+        within = self.sign * (position - _I32(self._table.memory, reg.HOMING_OFFSET)[0])
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -135,7 +140,7 @@ class ServoJoint:
         if not table.memory[reg.TORQUE_ENABLE]:
             self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
-            bound = abs(table.get(reg.GOAL_CURRENT)) * self._model.current_unit
+            bound = abs(_I16(table.memory, reg.GOAL_CURRENT)[0]) * self._model.current_unit
             goal = self._angle(self.profile.position)
             self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
@@ -153,23 +158,31 @@ class ServoJoint:
         speed = float(self._plant.dq[self._joint]) * self._scale.direction * self._speed
         return self._model.stall_current * (duty - speed)
 
-    def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
-        """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
-        table, scale, joint, profile = self._table, self._scale, self._joint, self.profile
-        memory = table.memory
+    def _motion(self) -> tuple[int, int, int]:
+        """Registers 126, 128 and 132: current (or load), velocity, position."""
+        plant, joint, scale = self._plant, self._joint, self._scale
         sign = self.sign
-        rate = float(self._plant.dq[joint])
-        ampere = float(self._plant.current[joint])
-        velocity = sign * scale.velocity_counts(rate)
-        position = self.position()
-        pwm = 0
-        if memory[reg.TORQUE_ENABLE]:
-            duty = self._load * ampere + self._speed * rate
-            pwm = max(-885, min(885, round(sign * 885.0 * duty)))
+        ampere = plant.current.item(joint)
         if self._model.senses_current:
             current = sign * scale.current_counts(ampere)
         else:  # the register is present load, 0.1 %
             current = round(sign * 1000.0 * self._load * ampere)
+        velocity = sign * scale.velocity_counts(plant.dq.item(joint))
+        return max(-32768, min(32767, current)), velocity, self.position()
+
+    def refresh_motion(self) -> None:
+        """Bring registers 126 … 135 up to date, which is all that most reads ask for."""
+        _MOTION.pack_into(self._table.memory, reg.PRESENT_CURRENT, *self._motion())
+
+    def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
+        """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
+        profile, memory = self.profile, self._table.memory
+        current, velocity, position = self._motion()
+        pwm = 0
+        if memory[reg.TORQUE_ENABLE]:
+            ampere, rate = self._plant.current.item(self._joint), self._plant.dq.item(self._joint)
+            duty = self._load * ampere + self._speed * rate
+            pwm = max(-885, min(885, round(self.sign * 885.0 * duty)))
         busy = profile.busy
         arrived = not busy and abs(profile.target - position) <= _ARRIVED
         _PRESENT.pack_into(
@@ -179,7 +192,7 @@ class ServoJoint:
             abs(velocity) > _U32(memory, reg.MOVING_THRESHOLD)[0],
             arrived | busy << 1,
             pwm,
-            max(-32768, min(32767, current)),
+            current,
             velocity,
             position,
             round(profile.velocity / _PER_VELOCITY),
