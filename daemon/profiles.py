@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,18 @@ _EXPECTED = (
 )
 
 
-def load(path: Path | None = None, directory: Path | None = None) -> Settings:
+def load(
+    path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
+) -> Settings:
     """Read and check a profile; None gives the built-in simulated hand.
 
-    ``directory`` replaces ``{dir}`` in the ports. Raises SettingsError with one line for every
-    unknown key, wrong type, broken bound and contradiction.
+    ``directory`` replaces ``{dir}`` in the ports. ``changes``, as ``loop.rate=1000``, go over the
+    file. Raises SettingsError with one line for every unknown key, wrong type, broken bound and
+    contradiction.
     """
     name = str(path) if path else "built-in settings"
     data = _read(path, name) if path else {}
+    changed = {_change(data, change) for change in changes}
     wrong: set[str] = set()
     problems: list[str] = []
     try:
@@ -45,7 +50,12 @@ def load(path: Path | None = None, directory: Path | None = None) -> Settings:
         problems = [_line(details) for details in error.errors()]
     problems += contradictions(settings, directory, wrong)
     if problems:
-        raise SettingsError("\n".join(f"{name}: {problem}" for problem in problems))
+        raise SettingsError(
+            "\n".join(
+                f"{'--set' if problem.split(':')[0] in changed else name}: {problem}"
+                for problem in problems
+            )
+        )
     return settings if directory is None else _with_directory(settings, directory)
 
 
@@ -61,6 +71,22 @@ def _read(path: Path, name: str) -> dict[str, Any]:
     except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits another
         raise SettingsError(f"{name}: not TOML: {error}") from None
     return {key: _tuples(item) for key, item in raw.items()}
+
+
+def _change(data: dict[str, Any], change: str) -> str:
+    """Put one ``section.key=value`` into ``data`` and return its key. Raises SettingsError."""
+    key, equals, text = change.partition("=")
+    section, dot, inner = key.strip().partition(".")
+    if not (equals and dot and section and inner):
+        raise SettingsError(f"--set: found {change!r}, expected section.key=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        value = text.strip()  # a text needs no quotes of its own: the shell has taken them
+    held = data.setdefault(section, {})
+    if isinstance(held, dict):
+        held[inner] = _tuples(value)
+    return f"{section}.{inner}"
 
 
 def _tuples(value: Any) -> Any:

@@ -73,6 +73,15 @@ def test_duration_ends_by_itself(profile: Profile) -> None:
     assert "ended, torque off" in done.stderr
 
 
+def test_settings_from_the_command_line(profile: Profile) -> None:
+    path = str(profile(""))
+    done = softfinger("run", "--config", path, "--set", "loop.rate=quick", "--set", "tip.radius=9")
+    assert done.returncode == 2
+    assert done.stderr.startswith("--set: loop.rate: found 'quick', expected a number")
+    done = softfinger("run", "--config", path, "--set", "loop.rate=100", "--duration", "0.1")
+    assert done.returncode == 0
+
+
 def test_a_second_daemon_says_so_and_ends(
     start: Callable[..., Running], profile: Profile, addresses: tuple[str, str]
 ) -> None:

@@ -198,3 +198,25 @@ def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
     path = tmp_path / "profile.toml"
     path.write_bytes(b"\xef\xbb\xbf[loop]\nrate = 100.0\n")
     assert load(path).loop.rate == 100.0
+
+
+def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text("loop.rate = 250.0\n[tip]\nradius = 0.015\n")
+    changes = ["loop.rate=1000", "tactile.backend=none", 'scene.fingers=["left"]']
+    settings = load(file, changes=changes)
+    assert (settings.loop.rate, settings.tip.radius) == (1000.0, 0.015)
+    assert settings.tactile.backend == "none"
+    assert settings.scene.fingers == ("left",)
+    with pytest.raises(SettingsError) as report:
+        load(file, changes=["loop.rate=fast", "tip.radios=0.02"])
+    assert str(report.value).splitlines() == [
+        "--set: tip.radios: found an unknown key, expected a known one; nearest: radius",
+        "--set: loop.rate: found 'fast', expected a number",
+    ]
+
+
+@pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1"])
+def test_a_change_that_names_no_key_is_told(change: str) -> None:
+    with pytest.raises(SettingsError, match=r"^--set: found .* expected section\.key=value"):
+        load(changes=[change])

@@ -4,6 +4,35 @@ from __future__ import annotations
 
 import argparse
 import math
+from pathlib import Path
+
+from daemon.profiles import load
+from daemon.settings import Settings
+
+
+def add_profile(parser: argparse.ArgumentParser) -> None:
+    """``--config``, ``--set`` and ``--dir``: which hand. `profile` reads what they say."""
+    add_settings(parser)
+    parser.add_argument(
+        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
+    )
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """``--config`` and ``--set``, for a subcommand whose ``--dir`` is its own."""
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting that goes over the file's, as loop.rate=1000; may be given again",
+    )
+
+
+def profile(arguments: argparse.Namespace) -> Settings:
+    """The settings that `add_profile`'s arguments name. Raises SettingsError with the report."""
+    return load(arguments.config, arguments.dir, arguments.set)
 
 
 def seconds(text: str) -> float:

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daemon.profiles import load
 from daemon.settings import Settings, SettingsError
+from tools.arguments import add_profile, profile
 
 if TYPE_CHECKING:
     from daemon.calibration import Calibration, Converter
@@ -40,10 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("step", choices=STEPS)
     parser.add_argument("file", type=Path, metavar="FILE", help="the calibration; made if absent")
     parser.add_argument("--finger", choices=("left", "right"), default="left")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
-    parser.add_argument(
-        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
-    )
+    add_profile(parser)
     parser.add_argument(
         "--recording", type=Path, nargs="+", default=[], metavar="R", help="instead of the sensor"
     )
@@ -70,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Do one step; 1 with one line when it can't be done, and then the file is as it was."""
     try:
-        settings = load(arguments.config, arguments.dir)
+        settings = profile(arguments)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 from daemon.checkup.addresses import check_addresses
 from daemon.checkup.hand import check_board, check_servos
@@ -17,9 +16,9 @@ from daemon.checkup.machine import check_machine
 from daemon.checkup.mending import mend_kernels, mend_latency_timer, mend_servos
 from daemon.checkup.ports import check_latency_timer, check_port, note_ports
 from daemon.checkup.result import Result
-from daemon.profiles import load
 from daemon.records import FINGERS
 from daemon.settings import Settings, SettingsError
+from tools.arguments import add_profile, profile
 from tools.run import cache_folder
 
 _PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board
@@ -35,17 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``doctor``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
-    parser.add_argument(
-        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
-    )
+    add_profile(parser)
     parser.add_argument("--fix", action="store_true", help="mend what can be mended from here")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Check, print, and tell by the exit status."""
     try:
-        settings = load(arguments.config, arguments.dir)
+        settings = profile(arguments)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from daemon.profiles import load
 from daemon.settings import ServoSettings, Settings, SettingsError
+from tools.arguments import add_settings, profile
 
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="where servos, tactile-left and tactile-right are linked; made if absent",
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    add_settings(parser)
     parser.add_argument("--model", metavar="NAME", help="the servos' model")
     parser.add_argument("--ids", type=_ids, metavar="L,R", help="the servos' IDs, left first")
     parser.add_argument(
@@ -146,7 +146,7 @@ def _send(folder: Path, words: str) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:
-    settings = load(arguments.config, arguments.dir)
+    settings = profile(arguments)
     changes = {}
     if arguments.model is not None:
         changes["model"] = arguments.model

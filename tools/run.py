@@ -11,9 +11,8 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from daemon.profiles import load
 from daemon.settings import Settings, SettingsError
-from tools.arguments import seconds
+from tools.arguments import add_profile, profile, seconds
 from tools.event_log import EventLog
 
 _STARTED = time.monotonic()
@@ -21,10 +20,7 @@ _STARTED = time.monotonic()
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``run``."""
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
-    parser.add_argument(
-        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
-    )
+    add_profile(parser)
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--monitor", action="store_true", help="show the live page here; q ends both"
@@ -37,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     Wrong settings give 2 and the whole report.
     """
     try:
-        settings = load(arguments.config, arguments.dir)
+        settings = profile(arguments)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
@@ -56,10 +52,11 @@ def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: _Signals, log: EventLog
 ) -> int:
     # What follows imports numpy, numba and zmq: wrong settings are told without waiting for them.
-    from daemon.realtime import hold_collector, settle
+    from daemon.realtime import RealTime, hold_collector
 
     hold_collector()
     from daemon.assembly import Daemon
+    from daemon.schedule import Schedule
     from daemon.servos.base import ServoError
     from daemon.sockets import AddressError
     from daemon.tactile.base import TactileError
@@ -71,19 +68,32 @@ def _serve(
     except (SettingsError, AddressError, ServoError, TactileError, ValueError) as error:
         log.plain(f"softfinger: {error}")
         return 1
-    with daemon:
-        settle()
-        signals.hand_over(daemon.loop)
+    with daemon, RealTime(settings) as measures:
+        loop = daemon.loop
+        signals.hand_over(loop)
+        for event in measures.events():
+            loop.emit(*event)
+        loop.emit("info", "schedule", str(Schedule(settings)))
         log.line("info", "start", _ready(settings, daemon))
         log.quiet = arguments.monitor  # from here on the page owns the terminal
-        with _page(settings, daemon.loop) if arguments.monitor else nullcontext():
-            daemon.loop.run(arguments.duration)
+        with _page(settings, loop) if arguments.monitor else nullcontext():
+            loop.run(arguments.duration)
+    _tell_times(daemon.loop, log)
     state = daemon.loop.state
     if state.fault:
         log.plain(f"softfinger: ended with a fault: {state.fault}")
     if state.torque:
         log.plain("softfinger: torque could not be turned off and may still be on")
     return 1 if state.fault or state.torque else 0
+
+
+def _tell_times(loop: Any, log: EventLog) -> None:
+    statistics = loop.statistics
+    if not statistics.ticks:
+        return
+    log.plain(f"{statistics.ticks} ticks, {loop.state.timing.overruns} overruns")
+    for line in statistics.table():
+        log.plain(line)
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
