@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.settings import Settings
-from daemon.simulation import sensor_effects
 from daemon.simulation.sensor_model import Imperfections, SensorModel
 from kinematics.contact import Fingertip
 from kinematics.estimator import ContactEstimator

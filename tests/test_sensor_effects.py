@@ -1,0 +1,228 @@
+"""What the simulated sensor does to the pressure: each operator against a plain twin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daemon.simulation import sensor_effects
+from daemon.simulation.sensor_model import Imperfections, SensorModel
+from kinematics.contact import Fingertip
+from kinematics.estimator import ContactEstimator
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+
+A, E, PITCH = 0.020, 0.304e6, 0.058 / 44
+TIP = Fingertip(A)
+LINEAR = Material.constant(E)
+CONTACTS = [(0.0005, 0.1, -0.2), (0.002, 0.3, 0.1), (0.006, 0.0, -0.4)]
+
+
+def sensor(grid=None, **flaws):
+    grid = grid or SensorGrid(44, 44, PITCH, (3e-4, -5e-4))
+    return SensorModel(grid, TIP, LINEAR, 1.0, Imperfections(**flaws), full_count=65535, gain=0.2)
+
+
+def counts(model, contact, t=0.0):
+    out = np.zeros(model.grid.shape, np.uint16)
+    model.frame(*contact, out, t)
+    return out.astype(float)
+
+
+def spread(fine, width):
+    """Dense continuous convolution: a Gaussian over a grid much finer than it, both ways."""
+    reach = math.ceil(7 * width)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    weights /= weights.sum()
+    for axis in (0, 1):
+        fine = np.apply_along_axis(lambda line: np.convolve(line, weights, "same"), axis, fine)
+    return fine
+
+
+@pytest.mark.parametrize("width", [1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
+def test_blur_is_the_continuous_convolution(width):
+    # A grid that the footprint leaves: what presses beyond its edge is spread onto it too.
+    rows, cols, parts, centre = 16, 20, 16, (3e-4, 5.3e-3)
+    model = sensor(SensorGrid(rows, cols, PITCH, centre), blur=width)
+    margin = math.ceil(7 * width / PITCH)
+    shape = ((rows + 2 * margin) * parts, (cols + 2 * margin) * parts)
+    dense = SensorGrid(*shape, PITCH / parts, centre)
+    for contact in CONTACTS:
+        fine = spread(dense.pressure(TIP, LINEAR, *contact), width / PITCH * parts)
+        cells = fine.reshape(shape[0] // parts, parts, -1, parts).mean(axis=(1, 3))
+        expected = cells[margin:-margin, margin:-margin]
+        model.press(*contact)
+        np.testing.assert_allclose(model._pressure, expected, rtol=0, atol=2.5e-4 * E)
+        sharp = model.grid.pressure(TIP, LINEAR, *contact)
+        assert np.abs(sharp - expected).max() > 10 * np.abs(model._pressure - expected).max() or (
+            width < 3e-4
+        )
+
+
+def test_blur_keeps_the_force_and_adds_its_variance_each_way():
+    grid = SensorGrid(50, 44, (PITCH, 0.0011))
+    x = (np.arange(44) - 21.5) * PITCH
+    y = (np.arange(50) - 24.5) * 0.0011
+    moments = []
+    for width in (0.0, 1.2e-3):
+        model = sensor(grid, blur=width)
+        model.press(0.004, 0.1, 0.05)
+        p = model._pressure / model._pressure.sum()
+        moments.append(
+            (
+                model._pressure.sum(),
+                p.sum(axis=0) @ x**2 - (p.sum(axis=0) @ x) ** 2,
+                p.sum(axis=1) @ y**2 - (p.sum(axis=1) @ y) ** 2,
+            )
+        )
+    sharp, blurred = moments
+    assert blurred[0] == pytest.approx(sharp[0], rel=1e-5)
+    assert blurred[1] - sharp[1] == pytest.approx(1.2e-3**2, rel=2e-3)
+    assert blurred[2] - sharp[2] == pytest.approx(1.2e-3**2, rel=2e-3)
+
+
+def test_hysteresis_is_the_prandtl_ishlinskii_sum_of_plays():
+    rng = np.random.default_rng(1)
+    path = np.abs(np.cumsum(rng.normal(0.0, 1.0, (60, 3, 4)), axis=0)) * 1e4
+    excess = 0.1
+    plays = np.zeros((sensor_effects.PLAYS, 3, 4))
+    twin = np.zeros_like(plays)
+    shares = 2 * excess * (np.arange(sensor_effects.PLAYS) + 0.5) / sensor_effects.PLAYS
+    for p in path:
+        out = p.copy()
+        sensor_effects.hysteresis(out, excess, plays)
+        high = (1 + shares)[:, None, None] * p
+        twin = np.maximum(p, np.minimum(high, twin))
+        np.testing.assert_allclose(out, twin.mean(axis=0), rtol=1e-12)
+        assert np.all(out >= p)
+        assert np.all(out <= (1 + excess) * p * (1 + 1e-12))
+
+
+def test_loading_is_unchanged_unloading_reads_more_and_loops_close():
+    model = sensor(hysteresis=0.1)
+    clean = sensor()
+
+    def force(d):
+        return counts(model, (d, 0.0, 0.0)).sum() / counts(clean, (d, 0.0, 0.0)).sum()
+
+    assert force(0.002) == pytest.approx(1.0, abs=1e-9)
+    assert force(0.004) == pytest.approx(1.0, abs=1e-9)
+    assert force(0.0038) > 1.03
+    assert force(0.002) == pytest.approx(1.1, abs=0.005)
+    assert 1.0 < force(0.0021) < 1.07  # on the way back up, within the loop
+    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the loop is closed
+    assert force(0.006) == pytest.approx(1.0, abs=1e-9)
+    assert not counts(model, (0.0, 0.0, 0.0)).any()
+
+
+def test_creep_is_the_exact_response_to_straight_pieces():
+    share, time = 0.2, 3.0
+    before, crept = np.zeros((2, 2)), np.zeros((2, 2))
+    shape = np.array([[1.0, 2.0], [0.5, 0.0]])
+    times = [0.0, 0.7, 0.7, 5.0, 5.001, 30.0]
+    values = [0.0, 100.0, 40.0, 40.0, 0.0, 10.0]
+    # The twin integrates dz/dt = (p − z)/time in small steps.
+    z = 0.0
+    for k in range(1, len(times)):
+        elapsed = times[k] - times[k - 1]
+        steps = 20000
+        for m in range(steps):
+            p = values[k - 1] + (values[k] - values[k - 1]) * (m + 0.5) / steps
+            z += elapsed / steps * (p - z) / (time + 0.5 * elapsed / steps)
+        out = values[k] * shape
+        sensor_effects.creep(out, share, time, elapsed, before, crept)
+        np.testing.assert_allclose(out, (values[k] + share * z) * shape, rtol=1e-6, atol=1e-6)
+
+
+def test_a_lasting_contact_creeps_up_and_its_mark_fades():
+    model = sensor(creep=0.05, creep_time=10.0)
+    contact = (0.004, 0.1, 0.0)
+    counts(model, (0.0, 0.0, 0.0), 0.0)
+    first = counts(model, contact, 0.01).sum()
+    assert counts(model, contact, 10.01).sum() / first == pytest.approx(
+        1 + 0.05 * (1 - math.exp(-1)), rel=1e-3
+    )
+    assert counts(model, contact, 100.0).sum() / first == pytest.approx(1.05, rel=1e-3)
+    gone = counts(model, (0.0, 0.0, 0.0), 100.01).sum() / first
+    assert gone == pytest.approx(0.05, rel=0.01)
+    assert counts(model, (0.0, 0.0, 0.0), 110.01).sum() / first == pytest.approx(
+        0.05 * math.exp(-1), rel=0.02
+    )
+
+
+def test_zeros_drift_to_their_deviation_and_forget_in_their_time():
+    offset = np.zeros((60, 60))
+    rng = np.random.default_rng(2)
+    sensor_effects.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
+    # A random walk at first: deviation · √(2 t / time).
+    assert offset.std() == pytest.approx(50.0 * math.sqrt(2 * 0.01 / 60.0), rel=0.05)
+    for _ in range(40):
+        sensor_effects.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))
+    assert offset.std() == pytest.approx(50.0, rel=0.05)
+    earlier = offset.copy()
+    sensor_effects.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
+    assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.06)
+
+
+def test_crosstalk_is_a_share_of_both_lines_means():
+    model = sensor(crosstalk=0.3)
+    signal = counts(sensor(), CONTACTS[1])
+    expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
+    np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
+    assert expected[0].max() > 100.0  # a ghost far from the contact
+
+
+@pytest.mark.parametrize("least", [0, 3])
+def test_counting_rounds_clips_and_leaves_out_what_is_small_or_dead(least):
+    rng = np.random.default_rng(3)
+    signal, offset, normals = rng.normal(2.0, 3.0, (3, 5, 7))
+    rows, cols = rng.normal(0.0, 1.0, 5), rng.normal(0.0, 1.0, 7)
+    live = (rng.random((5, 7)) > 0.2).astype(float)
+    out = np.zeros((5, 7), np.uint16)
+    sensor_effects.count(signal, offset, rows, cols, live, 0.7, normals, (least, 9), out)
+    value = signal + offset + rows[:, None] + cols + 0.7 * normals
+    expected = np.clip(np.floor(value + 0.5), 0, 9)
+    expected[(expected < least) | (live == 0.0)] = 0
+    np.testing.assert_array_equal(out, expected)
+
+
+def test_dead_cells_nobody_is_told_of_are_a_share_and_the_seeds():
+    grid = SensorGrid(100, 100, PITCH)
+    flaws = Imperfections(dead=0.05)
+    first, again, other = (
+        SensorModel(grid, TIP, LINEAR, 1.0, flaws, seed=seed).live for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+    assert (~first).mean() == pytest.approx(0.05, abs=0.01)
+
+
+def test_a_blur_misleads_an_estimator_that_does_not_know_it_by_its_variance():
+    # d = 2a − 2√(a² − 3σ_y²) with σ_y² larger by w²: what the campaign's envelope is up against.
+    model = sensor(blur=1e-3)
+    model.press(0.002, 0.0, 0.0)
+    found = ContactEstimator(TIP, LINEAR, model.grid, 600.0, method="moments")(model._pressure)
+    sharp = 0.002 * (4 * A - 0.002) / 12
+    expected = 2 * A - 2 * math.sqrt(A * A - 3 * (sharp + 1e-6))
+    assert found.d == pytest.approx(expected, rel=0.03)
+
+
+def test_all_at_once_is_the_same_for_a_seed():
+    flaws = {
+        "noise": 600.0,
+        "gain_spread": 0.05,
+        "dead": 0.01,
+        "blur": 5e-4,
+        "hysteresis": 0.05,
+        "creep": 0.03,
+        "crosstalk": 0.02,
+        "drift": 200.0,
+    }
+    first, again = sensor(**flaws), sensor(**flaws)
+    assert first.remembers
+    for k, contact in enumerate(CONTACTS * 3):
+        np.testing.assert_array_equal(
+            counts(first, contact, 0.01 * k), counts(again, contact, 0.01 * k)
+        )
