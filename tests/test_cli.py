@@ -77,7 +77,7 @@ def test_settings_from_the_command_line(profile: Profile) -> None:
     path = str(profile(""))
     done = softfinger("run", "--config", path, "--set", "loop.rate=quick", "--set", "tip.radius=9")
     assert done.returncode == 2
-    assert done.stderr.startswith("--set: loop.rate: found 'quick', expected a number")
+    assert done.stderr.startswith('--set: loop.rate: found "quick", expected a number')
     done = softfinger("run", "--config", path, "--set", "loop.rate=100", "--duration", "0.1")
     assert done.returncode == 0
 

@@ -212,7 +212,7 @@ def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> Non
         load(file, changes=["loop.rate=fast", "tip.radios=0.02"])
     assert str(report.value).splitlines() == [
         "--set: tip.radios: found an unknown key, expected a known one; nearest: radius",
-        "--set: loop.rate: found 'fast', expected a number",
+        '--set: loop.rate: found "fast", expected a number',
     ]
 
 
