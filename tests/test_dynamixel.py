@@ -21,8 +21,9 @@ from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
 from daemon.servos.checks import check_latency
 from daemon.servos.dynamixel import DynamixelServos
+from daemon.servos.groups import GroupRead
 from daemon.servos.models import by_name, by_number
-from daemon.servos.packets import GroupRead, PacketHandler
+from daemon.servos.packets import PacketHandler
 from daemon.servos.port import PortGone, SerialPort
 from daemon.servos.units import JointScale
 from daemon.settings import ServoSettings, Settings

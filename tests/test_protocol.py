@@ -7,7 +7,7 @@ from dynamixel_sdk import PacketHandler as sdk_handler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.servos.packets import crc16 as handler_crc16
+from daemon.servos.crc import crc16 as handler_crc16
 from daemon.simulation import protocol
 from daemon.simulation.protocol import BROADCAST, Parser, crc16, frame, status, stuff, unstuff
 

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.servos import registers as reg
-from daemon.servos.packets import GroupRead, PacketHandler
+from daemon.servos.groups import GroupRead
+from daemon.servos.packets import PacketHandler
 from daemon.servos.port import SerialPort
 from daemon.simulation.servo_bus import ServoBus
 from tests.servo_harness import RADIAN, make_bus
