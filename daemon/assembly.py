@@ -10,16 +10,14 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import zmq
 
-from daemon.calibration import Converter, calibration_for
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.loop import EventSink, Loop
-from daemon.model import make_estimator, make_grid, make_material, make_table, make_tip
+from daemon.model import make_grid, make_material, make_models, make_table, make_tip
 from daemon.perception import FingerPerception
 from daemon.prediction import Prediction
 from daemon.records import FINGERS, Contact, ObjectPose, Reading
@@ -29,6 +27,9 @@ from daemon.settings import Settings
 from daemon.stream import Publisher
 from daemon.tactile import make_sensor
 from kinematics.table import ContactTable
+
+if TYPE_CHECKING:
+    from daemon.simulation.hand import SimulatedHand
 
 
 class Daemon:
@@ -58,19 +59,14 @@ class Daemon:
     def _assemble(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
-        self.material = make_material(settings.material)
-        self.table = make_table(settings, self.material, cache, on_event)
-        self.hand = None
-        if "simulated" in (settings.servos.backend, settings.tactile.backend):
-            from daemon.simulation.hand import SimulatedHand
-
-            self.hand = SimulatedHand(settings, self.clock.now(), self.table)
+        self.models = make_models(settings, cache, on_event)
+        self.hand = self._make_hand(cache, on_event)
         self.servos = make_servos(settings, self.clock, self.hand)
-        perceptions = self._make_perceptions(cache, on_event)
+        perceptions = self._make_perceptions()
         prediction = None
         if perceptions and self.servos is not None:
-            prediction = Prediction(settings, self.table)
-        warm_up(settings, self.table, perceptions)
+            prediction = Prediction(settings, self.tables)
+        warm_up(settings, self.tables, perceptions)
         if self.servos is not None:
             self._connect(self.servos)
         for perception in perceptions:
@@ -90,28 +86,34 @@ class Daemon:
         self._closers.append(server.close)
         return publisher, server
 
-    def _make_perceptions(
-        self, cache: Path | None, on_event: EventSink | None
-    ) -> list[FingerPerception]:
+    def _make_hand(self, cache: Path | None, on_event: EventSink | None) -> SimulatedHand | None:
+        """The simulated hand, where a backend wants one.
+
+        Its tips are of the settings' material, whatever a calibration says of them.
+        """
         settings = self.settings
-        tactile = settings.tactile
+        if "simulated" not in (settings.servos.backend, settings.tactile.backend):
+            return None
+        from daemon.simulation.hand import SimulatedHand
+
+        table = next((each.table for each in self.models if not each.own_material), None)
+        if table is None:
+            table = make_table(settings, make_material(settings.material), cache, on_event)
+        return SimulatedHand(settings, self.clock.now(), table)
+
+    def _make_perceptions(self) -> list[FingerPerception]:
+        settings = self.settings
         made = []
         for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
             sensor = make_sensor(settings, self.clock, self.hand, finger)
-            if sensor is None:
-                continue
-            calibration = calibration_for(settings, finger)
-            material, table, converter = self.material, self.table, None
-            if calibration is not None:
-                converter = Converter(calibration, tactile.pascal_per_count)
-                if calibration.modulus is not None:
-                    material = calibration.modulus.material()
-                    table = make_table(settings, material, cache, on_event)
-            live = getattr(sensor, "live", None)  # of a recording that lacks cells
-            estimator = make_estimator(settings, material, finger, live, calibration)
-            scale = tactile.pascal_per_count
-            made.append(FingerPerception(finger, sensor, estimator, table, scale, converter))
+            if sensor is not None:
+                made.append(FingerPerception(sensor, self.models[finger], settings))
         return made
+
+    @property
+    def tables(self) -> tuple[ContactTable, ContactTable]:
+        """The contact tables of both tips; one and the same where their material is."""
+        return self.models[0].table, self.models[1].table
 
     def _connect(self, servos: Servos) -> None:
         self._closers.append(servos.close)
@@ -138,20 +140,21 @@ class Daemon:
         self.close()
 
 
-def warm_up(settings: Settings, table: ContactTable, perceptions: list[FingerPerception]) -> None:
+def warm_up(
+    settings: Settings,
+    tables: tuple[ContactTable, ContactTable],
+    perceptions: list[FingerPerception],
+) -> None:
     """Run every kernel of the loop once on a made-up contact, on estimators' scratch alone."""
     if not perceptions:
         return
-    tactile = settings.tactile
     pressure = make_grid(settings).pressure(
         make_tip(settings), make_material(settings.material), 0.1 * settings.tip.radius, 0.1, 0.0
     )
-    counts = np.clip(np.round(pressure / tactile.pascal_per_count), 0, 65535).astype(np.uint16)
     contacts = [Contact(), Contact()]
     for perception in perceptions:
-        for frame in (counts, counts, np.zeros_like(counts)):
-            perception.estimate(frame, contacts[perception.finger])
-    prediction = Prediction(settings, table)
+        perception.warm_up(pressure, contacts[perception.finger])
+    prediction = Prediction(settings, tables)
     for k in (1, 2):
         prediction.advance(Reading(t=0.01 * k))
         for perception in perceptions:

@@ -23,6 +23,7 @@ from kinematics.material import Material
 
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+_STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
 
@@ -112,6 +113,16 @@ class Calibration(_Part):
     curve: CurveStep | None = None
     centre: CentreStep | None = None
     modulus: ModulusStep | None = None
+
+    @property
+    def identity(self) -> str:
+        """Whose and of when: the sensor's name, its finger without one, and the file's date."""
+        return f"{self.sensor.label or self.sensor.finger} {self.date}"
+
+    def summary(self) -> str:
+        """Whose, of when, and which steps were done, in one line."""
+        steps = [name for name in _STEPS if getattr(self, name) is not None]
+        return f"{self.identity}: {', '.join(steps) or 'no step'}"
 
 
 def now() -> str:

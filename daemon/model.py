@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.calibration import Calibration, Converter
+from daemon.calibration import Calibration, Converter, calibration_for
+from daemon.records import FINGERS
 from daemon.settings import MaterialLaw, Settings, SettingsError
 from daemon.table_files import load_or_build
 from kinematics.contact import Fingertip
@@ -17,6 +19,54 @@ from kinematics.estimator import ContactEstimator
 from kinematics.material import Material
 from kinematics.pressure import SensorGrid
 from kinematics.table import ContactTable, TableError
+
+
+@dataclass(frozen=True)
+class FingerModel:
+    """What one finger's frames and contacts are understood by, from settings and calibration.
+
+    Estimator, table and prediction share it. ``calibration`` is None where there is none.
+    """
+
+    finger: int
+    material: Material
+    table: ContactTable
+    grid: SensorGrid
+    calibration: Calibration | None = None
+
+    @property
+    def own_material(self) -> bool:
+        """The tip's law was measured, and is not the settings'."""
+        return self.calibration is not None and self.calibration.modulus is not None
+
+
+def make_models(
+    settings: Settings, cache: Path | None, on_event: Callable[[str, str, str], None] | None = None
+) -> tuple[FingerModel, FingerModel]:
+    """Both fingers' models; a finger whose tip's modulus is not calibrated has the settings' law.
+
+    A finger that takes no part, or has no sensor, goes by the settings alone. Raises as
+    :func:`make_table` and `daemon.calibration.calibration_for`.
+    """
+    made: list[FingerModel] = []
+    common: tuple[Material, ContactTable] | None = None
+    for finger, name in enumerate(FINGERS):
+        calibration = None
+        if name in settings.scene.fingers and settings.tactile.backend != "none":
+            calibration = calibration_for(settings, finger)
+        if calibration is not None and calibration.modulus is not None:
+            material = calibration.modulus.material()
+            table = make_table(settings, material, cache, on_event)
+        else:
+            if common is None:
+                law = make_material(settings.material)
+                common = law, make_table(settings, law, cache, on_event)
+            material, table = common
+        grid = make_grid(settings, finger, calibration)
+        made.append(FingerModel(finger, material, table, grid, calibration))
+        if calibration is not None and on_event is not None:
+            on_event("info", "calibration", f"{name}: {calibration.summary()}")
+    return made[0], made[1]
 
 
 def make_tip(settings: Settings) -> Fingertip:

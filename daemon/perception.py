@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.calibration import Converter
+from daemon.model import FingerModel, make_estimator
 from daemon.records import Contact, Frame
+from daemon.settings import Settings
 from daemon.tactile.base import TactileSensor
-from kinematics.estimator import ContactEstimator
 from kinematics.held import total_tilt
-from kinematics.table import ContactTable, lookup
+from kinematics.table import lookup
 
 _TARE_FRAMES = 16
 
@@ -22,23 +23,20 @@ _TARE_FRAMES = 16
 class FingerPerception:
     """One finger's tactile pipeline: newest frame in, its `Contact` filled in place."""
 
-    def __init__(
-        self,
-        finger: int,
-        sensor: TactileSensor,
-        estimator: ContactEstimator,
-        table: ContactTable,
-        pascal_per_count: float,
-        converter: Converter | None = None,
-    ) -> None:
-        """``converter``, where the sensor is calibrated, stands for ``pascal_per_count``."""
-        self.finger = finger
+    def __init__(self, sensor: TactileSensor, model: FingerModel, settings: Settings) -> None:
+        tactile, calibration = settings.tactile, model.calibration
+        self.finger = model.finger
         self.sensor = sensor
         self.frame: Frame | None = None
-        self._estimator = estimator
-        self._table = table.data
-        self._converter = converter
-        self._scale = pascal_per_count if converter is None else 1.0
+        self.frames = 0  # that came
+        live = getattr(sensor, "live", None)  # of a recording that lacks cells
+        self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
+        self._table = model.table.data
+        self._scale = tactile.pascal_per_count
+        self._converter: Converter | None = None
+        if calibration is not None:
+            self._converter = Converter(calibration, tactile.pascal_per_count)
+            self._scale = 1.0
         self._zero: NDArray[np.uint16] | None = None
         self._tare_sum: NDArray[np.uint32] | None = None
         self._tare_left = 0
@@ -59,6 +57,7 @@ class FingerPerception:
         if frame is None or frame is self.frame:
             return False
         self.frame = frame
+        self.frames += 1
         contact.seq = frame.seq
         contact.t = frame.t_sample
         contact.t_arrival = frame.t_arrival
@@ -77,6 +76,18 @@ class FingerPerception:
         if contact.valid:
             contact.t_sound = frame.t_arrival
         return True
+
+    def warm_up(self, pressure: NDArray[np.float64], contact: Contact) -> None:
+        """Run all kernels on a made-up ``pressure`` [Pa] and on none, so that none compiles later.
+
+        The next frame is the first again; ``contact`` is left without contact.
+        """
+        for each in (pressure, pressure, np.zeros_like(pressure)):
+            if self._converter is not None:
+                self.estimate(each, contact)
+            else:
+                counts = np.clip(np.round(each / self._scale), 0, 65535).astype(np.uint16)
+                self.estimate(counts, contact)
 
     def estimate(self, counts: NDArray[np.uint16] | NDArray[np.float64], contact: Contact) -> None:
         """Fill ``contact`` from counts, or from the pressure [Pa] of a calibrated sensor, alone."""

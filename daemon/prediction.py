@@ -207,13 +207,14 @@ def _between(history: FloatArray, row: int, later: int, share: float, column: in
 
 
 @kernel
-def _tell(m: FloatArray, table: FloatArray, out: FloatArray) -> None:
+def _tell(m: FloatArray, table1: FloatArray, table2: FloatArray, out: FloatArray) -> None:
     """Write what the estimates mean: see `Prediction.fill` for the order."""
     motion = held_motion(m[_Q], m[_Q + 1], m[_D], m[_D + 1], m[_ANGLE], m[_B], m[_L], m[_E], m[_A])
     theta1 = m[_ANGLE] + m[_Q]
     theta2 = m[_ANGLE] - m[_Q + 1]
     for finger in range(2):
         theta = theta1 if finger == 0 else theta2
+        table = table1 if finger == 0 else table2
         force, energy, stiffness, _, _, _, inside = lookup(
             table, m[_D + finger], total_tilt(theta, m[_TILT + finger])
         )
@@ -234,7 +235,7 @@ def _tell(m: FloatArray, table: FloatArray, out: FloatArray) -> None:
     out[19] = motion[2]
     out[20] = motion[3]
     out[21] = motion[4]
-    lever1, lever2, shear = holding_levers(table, m[_D], m[_D + 1], theta1, theta2, motion)
+    lever1, lever2, shear = holding_levers(table1, table2, m[_D], m[_D + 1], theta1, theta2, motion)
     out[22] = lever1
     out[23] = lever2
     out[24] = shear
@@ -263,10 +264,11 @@ class Held:
 class Prediction:
     """The filter of one hand. Costs nothing but a comparison while no tip is touched."""
 
-    def __init__(self, settings: Settings, table: ContactTable) -> None:
+    def __init__(self, settings: Settings, tables: tuple[ContactTable, ContactTable]) -> None:
+        """``tables``: what each tip feels, which may be of different materials."""
         hand = settings.hand
         self._with_object = settings.scene.object_model
-        self._table = table.data
+        self._tables = tables[0].data, tables[1].data
         self._m = np.zeros(_MEMORY)
         self._m[: _COUNT + 2] = (
             0.5 * hand.pivot_separation,
@@ -321,7 +323,7 @@ class Prediction:
         if not (left or right):
             pose.angle = pose.width = 0.0
             return
-        _tell(self._m, self._table, self._out)
+        _tell(self._m, *self._tables, self._out)
         out = self._out.tolist()
         angle_std = out[14]
         if left:

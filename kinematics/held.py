@@ -84,14 +84,15 @@ def sheared_gradient(
 
 @kernel
 def holding_levers(
-    data: NDArray[float64],
+    data1: NDArray[float64],
+    data2: NDArray[float64],
     d1: float,
     d2: float,
     theta1: float,
     theta2: float,
     motion: tuple[float, float, float, float, float, float, float],
 ) -> tuple[float, float, float]:
-    """(τ1/F, τ2/F, |T|/N): what holds the object in balance, by the energy of a table's ``data``.
+    """(τ1/F, τ2/F, |T|/N): what holds the object in balance, by the energy of both tips' tables.
 
     The torques are the energy's gradient along the rolling increments, ``motion`` as
     :func:`held_motion` gives it,
@@ -99,14 +100,15 @@ def holding_levers(
         τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
 
     and the object's balance gives one shear force for both tips: T W = N (s1 − s2) + ∂U1/∂θ1 +
-    ∂U2/∂θ2. F is the mean of both tips' forces, so that the levers τ/F [m] don't depend on the
-    modulus. All zero without two contacts.
+    ∂U2/∂θ2. F is the mean of both tips' forces, so that the levers τ/F [m] don't depend on a
+    modulus that both tips share. ``data1`` and ``data2`` are the tables' data. All zero without two
+    contacts.
     """
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, width, apart = motion
-    contact1 = lookup(data, d1, theta1)
-    contact2 = lookup(data, d2, theta2)
+    contact1 = lookup(data1, d1, theta1)
+    contact2 = lookup(data2, d2, theta2)
     tangential = normal = turning1 = turning2 = 0.0
     for _ in range(_SHEAR_STEPS):
         by_d1, turning1 = sheared_gradient(contact1, d1, theta1, tangential)

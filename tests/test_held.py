@@ -34,7 +34,8 @@ def test_levers_are_the_torques_that_balance_the_grasp(grasp: Grasp, delta: floa
     if delta:
         state = grasp.steer(state, delta)
     c = HAND.contacts(state.q, state.pose, WIDTH)
-    lever1, lever2, shear = holding_levers(grasp.table.data, *c.d, *c.theta, motion_of(state))
+    data = grasp.table.data
+    lever1, lever2, shear = holding_levers(data, data, *c.d, *c.theta, motion_of(state))
     forces = grasp.forces(state)
     assert [lever1, lever2] == pytest.approx(forces.torque / forces.force.mean(), rel=5e-4)
     load = np.abs(forces.tangential / forces.normal).mean()
@@ -72,7 +73,23 @@ def test_arms_and_slide_are_the_derivatives_of_what_the_tips_share() -> None:
 
 def test_levers_without_contacts_are_zero(grasp: Grasp) -> None:
     motion = held_motion(0.1, 0.1, 0.0, 1e-3, 0.0, *LENGTHS)
-    assert holding_levers(grasp.table.data, 0.0, 1e-3, 0.1, -0.1, motion) == (0.0, 0.0, 0.0)
+    data = grasp.table.data
+    assert holding_levers(data, data, 0.0, 1e-3, 0.1, -0.1, motion) == (0.0, 0.0, 0.0)
+
+
+def test_each_tip_has_its_own_table(grasp: Grasp) -> None:
+    soft = grasp.table.data
+    stiff = ContactTable.build(Fingertip(0.020), Material.constant(0.6e6)).data
+    q1, q2, d1, d2, angle = 0.14, 0.22, 4.0e-3, 2.6e-3, 0.03
+
+    def levers(left, right, q1, q2, d1, d2, angle):
+        motion = held_motion(q1, q2, d1, d2, angle, *LENGTHS)
+        return holding_levers(left, right, d1, d2, angle + q1, angle - q2, motion)
+
+    here = levers(soft, stiff, q1, q2, d1, d2, angle)
+    mirrored = levers(stiff, soft, q2, q1, d2, d1, -angle)
+    assert here == pytest.approx((mirrored[1], mirrored[0], mirrored[2]), rel=1e-12)
+    assert here[:2] != pytest.approx(levers(soft, soft, q1, q2, d1, d2, angle)[:2], rel=1e-3)
 
 
 def test_total_tilt_is_the_angle_of_the_normal_with_the_axis() -> None:

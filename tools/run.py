@@ -114,7 +114,7 @@ def _ready(settings: Settings, daemon: Any) -> str:
     return (
         f"ready after {time.monotonic() - _STARTED:.2f} s; "
         f"state on {settings.stream.address}, commands on {settings.commands.address}; "
-        f"contact table within {daemon.table.max_error:.1e}"
+        f"contact table within {max(table.max_error for table in daemon.tables):.1e}"
     )
 
 
