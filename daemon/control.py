@@ -64,11 +64,11 @@ class Control:
         getattr(self, f"_{command.name}")(command.numbers)
         return {"mode": self.mode.value}
 
-    def fail(self, reason: str) -> None:
-        """Latch a fault: torque off until ``clear``."""
+    def fail(self, reason: str, name: str) -> None:
+        """Latch a fault: torque off until ``clear``. ``name`` is its row of `daemon.limits`."""
         self._enter(Mode.FAULT)
         self.torque = False
-        self.events.append(("error", "fault", reason))
+        self.events.append(("error", name, reason))
 
     def _arm(self, _: dict[str, float]) -> None:
         if not self._has_servos:

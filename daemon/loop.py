@@ -14,11 +14,11 @@ from daemon.clock import Clock
 from daemon.commands import CommandServer, Refused
 from daemon.control import Control
 from daemon.messages import Parts
-from daemon.modes import Lease, parse
+from daemon.modes import Command, Lease, Mode, parse
 from daemon.perception import FingerPerception
 from daemon.prediction import Held, Prediction
 from daemon.records import FINGERS, Contact, State
-from daemon.safety import Safety
+from daemon.safety import BUS, Safety
 from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
 from daemon.stream import Publisher
@@ -59,10 +59,14 @@ class Loop:
         self._server = server
         self._on_event = on_event
         self._control = Control(settings, servos is not None, bool(perceptions))
-        self._safety = Safety(settings, servos is not None, bool(perceptions))
         self._lease = Lease(settings.commands.lease)
         self._task = Task.named(settings.task)
         self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
+        sensors = bool(perceptions)
+        self._safety = Safety(
+            settings, servos is not None, sensors, self._held, self._frames, perceptions
+        )
+        self._fault_after_opening = ("", "")  # name and reason
         self._scene = Parts(
             fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
             servos=servos is not None,
@@ -199,17 +203,32 @@ class Loop:
         if self._task is not None:
             self._follow(self._task)
         state.mode = control.mode
-        if control.torque:
-            cause = self._safety.cause(state)
-            if cause:
-                self._fail(cause)
+        self._judge()
         if not self._safety.must_hold(state):
             control.step(self.period, state.goal)
-        self._safety.bound(state.goal)
         for event in control.events:
             self.emit(*event)
         control.events.clear()
         state.mode = control.mode
+
+    def _judge(self) -> None:
+        state, control, safety = self.state, self._control, self._safety
+        finding = safety.judge(state)
+        for warning in safety.warnings:
+            self.emit("warning", *warning)
+        safety.warnings.clear()
+        if not control.torque:
+            self._fault_after_opening = ("", "")
+            return
+        if finding is not None and safety.opens_first(finding, state.mode):
+            self.emit("error", *finding)
+            self._fault_after_opening = finding
+            control.command(Command("release", {}, ""))
+        elif finding is not None:
+            self._fail(finding.text, finding.name)
+        elif self._fault_after_opening[0] and state.mode != Mode.RELEASING:
+            name, reason = self._fault_after_opening
+            self._fail(reason, name)
 
     def _write(self, now: float) -> None:
         state, servos = self.state, self.servos
@@ -225,7 +244,7 @@ class Loop:
             state.goal.seq = state.seq
             state.goal.t = now
             try:
-                servos.write(state.goal)
+                self._safety.write(servos, state)
             except ServoError as error:
                 self._fail(str(error))
                 self._torque_off(servos)
@@ -293,7 +312,7 @@ class Loop:
             for perception in self.perceptions:
                 perception.tare()
         if command.name == "clear":
-            self.state.fault = ""
+            self.state.fault = self.state.fault_name = ""
         if command.name == "status":
             reply |= self._status()
         return reply
@@ -345,10 +364,12 @@ class Loop:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
         return {
             "fault": state.fault,
+            "fault_name": state.fault_name,
             "torque": state.torque,
             "seq": state.seq,
             "overruns": state.timing.overruns,
             "counters": counters,
+            "limited": dict(self._safety.limited),
         }
 
     def _by_person(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -377,8 +398,8 @@ class Loop:
         if self._on_event is not None:
             self._on_event(level, kind, text)
 
-    def _fail(self, reason: str) -> None:
+    def _fail(self, reason: str, name: str = BUS) -> None:
         if not self.state.fault:
-            self.state.fault = reason
-            self._control.fail(reason)
+            self.state.fault, self.state.fault_name = reason, name
+            self._control.fail(reason, name)
             self.state.mode = self._control.mode

@@ -4,18 +4,19 @@ A map has string keys. A field that is a float is always sent as a float, a fiel
 and fields are only ever added. SI units.
 
 ``hand/state``
-    ``schema, seq, timestamp`` (Unix s), ``mono_ns, mode, fault, torque, tick_s, compute_s,
-    wake_late_s, overruns``; under ``left`` and ``right``: ``valid`` (the finger takes part and
-    what it has of servos and sensors gave fresh, sound numbers), ``q`` [rad], ``dq`` [rad/s],
-    ``current`` [A], ``goal_q`` [rad], ``goal_current`` [A], ``d`` [m], ``theta`` [rad], ``tilt_y``
-    [rad], ``force`` [N], ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq,
-    frame_age_s``;
+    ``schema, seq, timestamp`` (Unix s), ``mono_ns, mode, fault, fault_name, torque, tick_s,
+    compute_s, wake_late_s, overruns``; under ``left`` and ``right``: ``valid`` (the finger takes
+    part and what it has of servos and sensors gave fresh, sound numbers), ``q`` [rad], ``dq``
+    [rad/s], ``current`` [A], ``temperature`` [°C] and ``voltage`` [V] (0 while not known),
+    ``goal_q`` [rad], ``goal_current`` [A], ``d`` [m], ``theta`` [rad], ``tilt_y`` [rad], ``force``
+    [N], ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq, frame_age_s``;
     under ``object``: ``valid, angle`` [rad], ``width`` [m].
 ``hand/tactile``
     ``schema, seq, timestamp, finger, rows, cols, pitch`` [m], ``unit`` (``"count"``), ``scale``
     (Pa a count), ``data``: rows × cols little-endian uint16, row-major.
 ``hand/event``
     ``schema, seq, timestamp, mono_ns, level`` (``info``, ``warning``, ``error``), ``kind, text``.
+    A limit's ``kind``, as a fault's ``fault_name``, is its name in :mod:`daemon.limits`.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ def state_message(state: State, scene: Parts) -> dict[str, Any]:
         reading.q,
         reading.dq,
         reading.current,
+        reading.temperature,
+        reading.voltage,
         state.goal.q,
         state.goal.current,
         strict=True,
@@ -66,6 +69,7 @@ def state_message(state: State, scene: Parts) -> dict[str, Any]:
         "mono_ns": int(state.t * 1e9),
         "mode": state.mode,
         "fault": state.fault,
+        "fault_name": state.fault_name,
         "torque": state.torque,
         "tick_s": timing.tick_s,
         "compute_s": timing.compute_s,
@@ -84,15 +88,17 @@ def state_message(state: State, scene: Parts) -> dict[str, Any]:
 def _finger(
     state: State,
     contact: Contact,
-    joint: tuple[float, float, float, float, float],
+    joint: tuple[float, ...],
     valid: bool,
 ) -> dict[str, Any]:
-    q, dq, current, goal_q, goal_current = joint
+    q, dq, current, temperature, voltage, goal_q, goal_current = joint
     return {
         "valid": valid,
         "q": q,
         "dq": dq,
         "current": current,
+        "temperature": temperature,
+        "voltage": voltage,
         "goal_q": goal_q,
         "goal_current": goal_current,
         "d": contact.d,

@@ -31,6 +31,9 @@ class Reading:
     dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
     current: list[float] = field(default_factory=_pair)  # motor current [A], positive closes
     alert: int = 0  # bit i: servo of finger i reports a hardware error
+    hardware: list[int] = field(default_factory=lambda: [0, 0])  # its error bits, 0 if not known
+    temperature: list[float] = field(default_factory=_pair)  # [°C], 0 while not known
+    voltage: list[float] = field(default_factory=_pair)  # of the supply [V], likewise
 
 
 @dataclass(slots=True)
@@ -108,6 +111,7 @@ class State:
     wall: float = 0.0  # Unix time [s]
     mode: str = "disarmed"
     fault: str = ""
+    fault_name: str = ""  # the row of `daemon.limits` it stands in
     torque: bool = False
     reading: Reading = field(default_factory=Reading)
     contacts: list[Contact] = field(default_factory=_contacts)

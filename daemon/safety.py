@@ -1,146 +1,306 @@
-"""The last stage before the servos: bounds on every goal, and the causes that latch a fault.
+"""The last stage before the servos: judges every state, bounds every goal, and sends it.
 
-`Safety.bound` can't be bypassed: the loop sends nothing that has not been through it. Each cause
-stands in one table, `Safety._CAUSES`; a cause that stands while torque is on latches a fault, and
-``arm`` and ``clear`` are refused as long as one stands.
+`Safety.write` is the only way from a goal to the bus, and bounds what it sends. `Safety.judge` is
+asked at every tick. What is judged stands in one table, `daemon.limits.ROWS`; here stands when, and
+how a warning is told once and a fault is found.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
 
+from daemon.judgements import GRIPPING, PAST_STOP, View, reading_age
+from daemon.limits import ROWS, Row
 from daemon.modes import Mode
-from daemon.records import FINGERS, Goal, State
+from daemon.perception import FingerPerception
+from daemon.prediction import Held
+from daemon.records import Contact, Goal, State
+from daemon.servos.base import Servos
 from daemon.settings import Settings
 
-_GRIPPING = frozenset({Mode.GRASPING, Mode.HOLDING, Mode.ROTATING})
-_PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
+_AGAIN = 1.0  # s after which a warning that was over may be told again
+_EASE = 0.95  # of a bound: what was told stands until it is below
+
+BUS = "servos.bus"  # the row of what the servo backend itself refuses
+
+
+class Finding(NamedTuple):
+    """A fault that stands: its row's name, and what was found."""
+
+    name: str
+    text: str
+
+
+class _Watch:
+    """One row, and since when it stands."""
+
+    __slots__ = ("check", "ended", "lasts", "row", "since", "told")
+
+    def __init__(self, row: Row, settings: Settings) -> None:
+        assert row.check is not None
+        self.row = row
+        self.check = row.check
+        lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
+        self.lasts = float(lasts)
+        self.since = math.inf  # it stands since then, inf: it does not
+        self.ended = -math.inf
+        self.told = False
+
+    def look(self, view: View, state: State) -> str:
+        """What stands now and for long enough, or an empty text."""
+        row = self.row
+        found = self.check(view, state, row.share * _EASE if self.told else row.share)
+        if not found:
+            if self.since < math.inf:
+                self.since = math.inf
+                self.ended = state.t
+            if self.told and state.t - self.ended > _AGAIN:
+                self.told = False
+            return ""
+        self.since = min(self.since, state.t)
+        return found if state.t - self.since >= self.lasts else ""
 
 
 class Safety:
-    """Bounds goals and judges states. Needs no memory of its own but what the state carries."""
+    """Judges states and bounds goals. One thread, the loop's, may call it."""
 
-    def __init__(self, settings: Settings, has_servos: bool, has_sensors: bool) -> None:
-        self._settings = settings
+    def __init__(
+        self,
+        settings: Settings,
+        has_servos: bool,
+        has_sensors: bool,
+        held: Held | None = None,
+        frames: Sequence[Contact] = (),
+        sensors: Sequence[FingerPerception] = (),
+    ) -> None:
+        """``held``, ``frames`` and ``sensors`` are the loop's own, looked at and never changed."""
+        self._view = View(settings, held, frames, sensors)
         self._limits = settings.safety
-        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self._has_servos = has_servos
         self._has_sensors = has_sensors
-        self._frame_period = 1.0 / settings.tactile.rate
-        self.overruns_in_row = 0  # kept by the loop
+        self._fingers = self._view.fingers
+        there = {"": True, "servos": has_servos, "sensors": has_sensors}
+        rows = [row for row in ROWS if row.check is not None and there[row.needs]]
+        watches = [_Watch(row, settings) for row in rows]
+        self._each_tick = [watch for watch in watches if watch.row.at_once]
+        self._in_turn = [watch for watch in watches if not watch.row.at_once]
+        # In the table's order: the first one that stands is the fault's name.
+        self._faults = [watch for watch in watches if watch.row.level == "fault"]
+        self._turn = 0
+        self._busy = False  # a row that is judged at every tick stands, or did a moment ago
+        self._found: dict[_Watch, str] = {}  # faults that stand
+        self.warnings: list[Finding] = []  # to be told; the loop empties it
+        self.limited: Counter[str] = Counter()  # ticks in which a goal was changed, by row
+        self._prepare(settings, has_servos)
 
-    def bound(self, goal: Goal) -> None:
-        """Bound the goal in place; a goal that is not a number becomes invalid."""
-        hand = self._settings.hand
-        for index in self._fingers:
-            q, current = goal.q[index], goal.current[index]
-            if not (math.isfinite(q) and math.isfinite(current)):
-                goal.valid = False
-                return
-            goal.q[index] = min(max(q, hand.q_min[index]), hand.q_max[index])
-            goal.current[index] = min(max(current, 0.0), self._limits.current_max)
+    def _prepare(self, settings: Settings, has_servos: bool) -> None:
+        limits, hand = settings.safety, settings.hand
+        self._age = reading_age(self._view) if has_servos else math.inf
+        near = min((row.share for row in ROWS if row.name.startswith("tip.")), default=1.0)
+        self._joints = [
+            (i, hand.q_min[i] - PAST_STOP, hand.q_max[i] + PAST_STOP) for i in self._fingers
+        ]
+        if not has_servos:
+            self._joints = []
+        self._velocity, self._current = limits.velocity_max, limits.current_fault
+        self._force, self._d = near * limits.force_max, near * limits.d_max
+        self._tilt = (near, near * limits.theta_margin, near / settings.tip.radius)
+        self._frame_age = limits.frame_age_fault * self._view.frame_period
+        self._hold_age = limits.frame_age_hold * self._view.frame_period
+        dt = 1.0 / settings.loop.rate
+        self._step = limits.goal_speed * dt
+        # In position mode no current bounds what a jump does.
+        self._reach = 0.0 if settings.servos.mode == "position" else limits.goal_reach
+        self._rise = limits.current_rate * dt
+        self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in self._fingers]
+        self._sent_q = [0.0, 0.0]
+        self._sent_current = [0.0, 0.0]
+        self._sent_seq = -2
+
+    @property
+    def overruns_in_row(self) -> int:
+        """Late ticks in a row, as the loop counts them."""
+        return self._view.overruns_in_row
+
+    @overruns_in_row.setter
+    def overruns_in_row(self, count: int) -> None:
+        self._view.overruns_in_row = count
+
+    # Judging
+
+    def judge(self, state: State) -> Finding | None:
+        """Look at this tick's state; the first fault that stands, if any.
+
+        Warnings that are new are added to ``warnings``.
+        """
+        if self._busy or not self._quiet(state):
+            self._busy = False
+            for watch in self._each_tick:
+                self._look(watch, state)
+                self._busy = self._busy or watch.told or watch.since < math.inf
+        self._turn = (self._turn + 1) % len(self._in_turn) if self._in_turn else 0
+        if self._in_turn:
+            self._look(self._in_turn[self._turn], state)
+        if not self._found:
+            return None
+        gripping = state.mode in GRIPPING
+        for watch in self._faults:
+            if watch in self._found and (gripping or not watch.row.gripping):
+                return Finding(watch.row.name, self._found[watch])
+        return None
+
+    def _look(self, watch: _Watch, state: State) -> None:
+        found = watch.look(self._view, state)
+        if watch.row.level == "fault":
+            if found:
+                self._found[watch] = found
+            else:
+                self._found.pop(watch, None)
+        elif found and not watch.told:
+            watch.told = True
+            self.warnings.append(Finding(watch.row.name, found))
+
+    def _quiet(self, state: State) -> bool:
+        """Nothing that is judged at every tick can stand: one pass of comparisons.
+
+        It may be False too often and never True too often. A number that is none compares false.
+        """
+        t, reading = state.t, state.reading
+        if self._joints:
+            if not t - reading.t <= self._age or reading.alert:
+                return False
+            q, dq, current = reading.q, reading.dq, reading.current
+            velocity, most = self._velocity, self._current
+            for i, low, high in self._joints:
+                if not (
+                    low <= q[i] <= high
+                    and -velocity <= dq[i] <= velocity
+                    and -most <= current[i] <= most
+                ):
+                    return False
+        if self._has_sensors:
+            contacts = state.contacts
+            oldest = t - self._frame_age
+            near, margin, slope = self._tilt
+            for i in self._fingers:
+                contact = contacts[i]
+                if not contact.t_sound >= oldest:
+                    return False
+                if contact.contact:
+                    d = contact.d
+                    # asin(x) ≥ x, so that this is inside near·(asin(1 − d/a) − margin)
+                    if not (
+                        contact.force <= self._force
+                        and d <= self._d
+                        and abs(contact.theta) <= near - slope * d - margin
+                        and contact.inside
+                    ):
+                        return False
+        view = self._view
+        return view.overruns_in_row < self._limits.overruns_fault and not view.no_number
+
+    def cause(self, state: State, gripping: bool = False) -> str:
+        """The first fault that stands in this state, or an empty text: what refuses a command.
+
+        With ``gripping`` the rows of a grip are judged, whatever the mode.
+        """
+        gripping = gripping or state.mode in GRIPPING
+        for watch in self._faults:
+            if watch.row.gripping and not gripping:
+                continue
+            found = watch.look(self._view, state)
+            if found:
+                return found
+        return ""
 
     def must_hold(self, state: State) -> bool:
         """Frames are late: the goals stay as they are until one comes or a fault latches."""
-        if not self._has_sensors or state.mode not in _GRIPPING:
+        if not self._has_sensors:
             return False
-        return self._frames_older(state, self._limits.frame_age_hold)
+        oldest = state.t - self._hold_age
+        contacts = state.contacts
+        for index in self._fingers:
+            if contacts[index].t_sound < oldest and state.mode in GRIPPING:
+                self.limited["tactile.late"] += 1
+                return True
+        return False
 
-    def cause(self, state: State, gripping: bool = False) -> str:
-        """The first cause of a fault that stands in this state, or an empty text.
-
-        Old frames are one while the hand grips, or when ``gripping`` says to judge as if it did.
-        """
-        for check in self._CAUSES:
-            found = check(self, state)
-            if found:
-                return found
-        return self._frames_silent(state) if gripping or state.mode in _GRIPPING else ""
+    def opens_first(self, finding: Finding, mode: Mode | str) -> bool:
+        """The hand shall open before this fault takes its torque."""
+        wanted = self._limits.frame_age_action == "open"
+        return wanted and finding.name == "tactile.silent" and mode in GRIPPING
 
     def mark_stale(self, state: State) -> None:
         """A contact whose last sound frame is older than a fault allows is not valid."""
         if not self._has_sensors:
             return
-        oldest = state.t - self._limits.frame_age_fault * self._frame_period
+        oldest = state.t - self._frame_age
         for index in self._fingers:
             contact = state.contacts[index]
             if contact.t_sound < oldest:
                 contact.valid = False
                 state.object.valid = False
 
-    def _frames_older(self, state: State, periods: float) -> bool:
-        oldest = state.t - periods * self._frame_period
-        return any(state.contacts[index].t_sound < oldest for index in self._fingers)
+    # Goals
 
-    def _servos_silent(self, state: State) -> str:
-        if not self._has_servos:
-            return ""
-        age = state.t - state.reading.t
-        if age == math.inf:
-            return "servos: no good reading yet"
-        bound = self._settings.servos.fault_after
-        return f"servos: no good reading for {age:.3f} s" if age > bound else ""
+    def write(self, servos: Servos, state: State) -> None:
+        """Bound the state's goal and send it; a goal that is no number is not sent.
 
-    def _servo_alert(self, state: State) -> str:
-        if not self._has_servos or not state.reading.alert:
-            return ""
-        names = [FINGERS[i] for i in self._fingers if state.reading.alert >> i & 1]
-        return f"servos: hardware error reported by {' and '.join(names)}"
+        Raises ServoError as `Servos.write` does.
+        """
+        self.bound(state)
+        if state.goal.valid:
+            servos.write(state.goal)
 
-    def _joints_outside(self, state: State) -> str:
-        if not self._has_servos:
-            return ""
-        hand = self._settings.hand
-        for index in self._fingers:
-            q = state.reading.q[index]
-            if not hand.q_min[index] - _PAST_STOP <= q <= hand.q_max[index] + _PAST_STOP:
-                return f"{FINGERS[index]} joint at {q:.3f} rad, outside its limits"
-            dq = state.reading.dq[index]
-            if abs(dq) > self._limits.velocity_max:
-                return f"{FINGERS[index]} joint at {dq:.2f} rad/s, too fast"
-        return ""
+    def bound(self, state: State) -> None:
+        """Bound the goal in place; a goal that is not a number becomes invalid."""
+        goal = state.goal
+        q, current = goal.q, goal.current
+        present = state.reading.q
+        if state.seq - self._sent_seq != 1:  # torque was off: from the present angle, no current
+            self._sent_q[:] = present
+            self._sent_current[:] = (0.0, 0.0)
+        self._sent_seq = state.seq
+        sent, reach, most = self._sent_current, self._reach, self._limits.current_max
+        for i, low, high in self._ends:
+            wanted = current[i]
+            if (
+                not (low <= q[i] <= high and -reach <= q[i] - present[i] <= reach)
+                or not 0.0 <= wanted <= most
+                or wanted > sent[i] + self._rise
+            ):
+                self._bound_one(goal, i, low, high, present[i])
+                if not goal.valid:
+                    return
+            self._sent_q[i] = q[i]
+            sent[i] = current[i]
 
-    def _frames_silent(self, state: State) -> str:
-        if not self._has_sensors or not self._frames_older(state, self._limits.frame_age_fault):
-            return ""
-        stalest = min(
-            (state.contacts[i] for i in self._fingers), key=lambda contact: contact.t_sound
-        )
-        age = state.t - stalest.t_sound
-        what = "frame" if stalest.t_arrival == stalest.t_sound else "sound estimate"
-        return f"tactile: no {what} for {age:.3f} s"
+    def _bound_one(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
+        q, current = goal.q[i], goal.current[i]
+        if not (math.isfinite(q) and math.isfinite(current)):
+            goal.valid = False
+            self._view.no_number = True
+            return
+        inside = min(max(q, low), high)
+        if inside != q:
+            self._count("goal.angle")
+        sent = self._sent_q[i]
+        lowest = min(sent, present - self._reach) - self._step
+        highest = max(sent, present + self._reach) + self._step
+        near = min(max(inside, lowest), highest)
+        if near != inside:
+            self._count("goal.step")
+        # The joint's limits have the last word.
+        goal.q[i] = min(max(near, low), high)
+        most = min(max(current, 0.0), self._limits.current_max)
+        if most != current:
+            self._count("goal.current")
+        slow = min(most, self._sent_current[i] + self._rise)
+        if slow != most:
+            self._count("goal.slew")
+        goal.current[i] = slow
 
-    def _too_deep(self, state: State) -> str:
-        if not self._has_sensors:
-            return ""
-        for index in self._fingers:
-            contact = state.contacts[index]
-            if not (contact.valid and contact.contact):
-                continue
-            name = FINGERS[index]
-            if contact.force > self._limits.force_max:
-                return f"{name} tip at {contact.force:.1f} N, above {self._limits.force_max:g} N"
-            if contact.d > self._limits.d_max:
-                return f"{name} tip at {contact.d * 1e3:.2f} mm, above {self._limits.d_max * 1e3:g}"
-            # asin((a − d)/a): the object's plane reaches the rim of the tip's backing plate
-            radius = self._settings.tip.radius
-            limit = math.asin(max(1.0 - contact.d / radius, 0.0)) - self._limits.theta_margin
-            if not contact.inside or abs(contact.theta) > limit:
-                degrees = math.degrees(contact.theta)
-                return (
-                    f"{name} tip at {degrees:.1f}°, past {math.degrees(limit):.1f}° at this depth"
-                )
-        return ""
-
-    def _overrunning(self, _: State) -> str:
-        late = self.overruns_in_row
-        return f"loop: {late} overruns in a row" if late >= self._limits.overruns_fault else ""
-
-    _CAUSES: tuple[Callable[[Safety, State], str], ...] = (
-        _servos_silent,
-        _servo_alert,
-        _joints_outside,
-        _too_deep,
-        _overrunning,
-    )
+    def _count(self, name: str) -> None:
+        self.limited[name] += 1

@@ -16,7 +16,20 @@ from tests.conftest import until
 
 BOTH = Parts((True, True), servos=True, sensors=False)
 FINGER_FLOATS = (
-    *("q", "dq", "current", "goal_q", "goal_current", "d", "theta", "tilt_y", "force", "energy"),
+    *(
+        "q",
+        "dq",
+        "current",
+        "temperature",
+        "voltage",
+        "goal_q",
+        "goal_current",
+        "d",
+        "theta",
+        "tilt_y",
+        "force",
+        "energy",
+    ),
     *("d_std", "theta_std", "gain", "frame_age_s"),
 )
 
@@ -44,7 +57,8 @@ def test_state_has_every_field_of_the_public_face_with_its_type() -> None:
         msgpack.packb(state_message(State(), Parts((True, False), True, True)))
     )
     assert set(message) == {
-        *("schema", "seq", "timestamp", "mono_ns", "mode", "fault", "torque"),
+        *("schema", "seq", "timestamp", "mono_ns", "mode", "fault", "fault_name"),
+        "torque",
         *("tick_s", "compute_s", "wake_late_s", "overruns", "left", "right", "object"),
     }
     for key in ("timestamp", "tick_s", "compute_s", "wake_late_s"):

@@ -28,6 +28,8 @@ class FingerState:
     q: float  # joint angle [rad], positive closes
     dq: float  # [rad/s]
     current: float  # [A]
+    temperature: float  # of the servo [°C], 0 while not known
+    voltage: float  # of its supply [V], 0 while not known
     goal_q: float  # [rad]
     goal_current: float  # [A]
     d: float  # maximum displacement [m]
@@ -68,6 +70,7 @@ class HandState:
     mono_ns: int  # the daemon's own clock [ns]
     mode: str
     fault: str  # empty when none
+    fault_name: str  # its name in the table of limits
     torque: bool
     tick_s: float
     compute_s: float
