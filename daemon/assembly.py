@@ -48,7 +48,8 @@ class Daemon:
         table_cache: Path | None = None,
     ) -> None:
         self.settings = settings
-        self.clock: Clock = VirtualClock() if settings.loop.clock == "virtual" else RealClock()
+        virtual = settings.loop.clock == "virtual"
+        self.clock: Clock = VirtualClock() if virtual else RealClock(settings.realtime.spin)
         self._closers: list[Callable[[], None]] = []
         try:
             self._assemble(on_event, wire, table_cache)

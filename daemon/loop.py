@@ -10,10 +10,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from daemon.broadcast import Broadcast
 from daemon.clock import Clock
 from daemon.commands import CommandServer, Refused
 from daemon.control import Control
-from daemon.messages import Parts
 from daemon.modes import Command, Lease, Mode, parse
 from daemon.perception import FingerPerception
 from daemon.prediction import Held, Prediction
@@ -21,12 +21,12 @@ from daemon.records import FINGERS, Contact, State
 from daemon.safety import BUS, Safety
 from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
+from daemon.statistics import Statistics, record
 from daemon.stream import Publisher
 from daemon.task import Task, TaskOver
 
 EventSink = Callable[[str, str, str], None]
 
-_REFRESH = 0.05  # s between two looks at who subscribes
 _RETRY = 0.5  # s between two tries to turn torque off
 _STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
 _DEAF = 0.1  # s in which what waited meanwhile has come through the socket's own thread
@@ -67,16 +67,10 @@ class Loop:
             settings, servos is not None, sensors, self._held, self._frames, perceptions
         )
         self._fault_after_opening = ("", "")  # name and reason
-        self._scene = Parts(
-            fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
-            servos=servos is not None,
-            sensors=bool(perceptions),
-        )
-        rate = settings.loop.rate
-        self._state_every = max(round(rate / settings.stream.state_rate), 1)
-        self._tactile_every = max(round(rate / settings.stream.tactile_rate), 1)
-        self._refresh_every = max(round(rate * _REFRESH), 1)
-        self._published = [0, 0]  # newest frame of each finger that went out
+        self.statistics = Statistics()
+        self._broadcast = None
+        if publisher is not None:
+            self._broadcast = Broadcast(settings, publisher, perceptions, self.statistics)
         self._ending = False
         self._stopping = False
         self._deaf_until = -math.inf  # until then commands are from before a stall
@@ -133,9 +127,7 @@ class Loop:
             if timing.tick_s > _STALL:
                 self._deaf_until = now + _DEAF
             last = now
-            self.tick(now)
-            done = clock.now()
-            timing.compute_s = done - now
+            done = self.tick(now)
             deadline += self.period
             if done > deadline:
                 timing.overruns += 1
@@ -154,18 +146,32 @@ class Loop:
 
     # The tick
 
-    def tick(self, now: float) -> None:
-        """One pass of the pipeline at clock time ``now``."""
-        state = self.state
+    def tick(self, now: float) -> float:
+        """One pass of the pipeline at clock time ``now``; returns the time at its end."""
+        state, clock, statistics = self.state, self._clock, self.statistics
         state.seq += 1
         state.t = now
-        state.wall = self._clock.wall()
+        state.wall = clock.wall()
         self._read()
+        read = clock.now()
         self._feel()
         self._decide()
+        decided = clock.now()
         self._write(now)
-        if self._publisher is not None:
-            self._publish(self._publisher)
+        written = clock.now()
+        if self._broadcast is not None:
+            self._broadcast(state)
+        done = clock.now()
+        state.timing.compute_s = done - now
+        record(
+            statistics.counts,
+            statistics.largest,
+            state.timing.wake_late_s,
+            done - now,
+            (read - now) + (written - decided),
+            done - written,
+        )
+        return done
 
     def _read(self) -> None:
         reading = self.state.reading
@@ -272,25 +278,6 @@ class Loop:
         else:
             state.torque = False
             self._next_try = -math.inf
-
-    def _publish(self, publisher: Publisher) -> None:
-        seq = self.state.seq
-        if seq % self._refresh_every == 0:
-            publisher.refresh()
-        if publisher.wants_state and seq % self._state_every == 0:
-            publisher.state(self.state, self._scene)
-        if publisher.wants_tactile and seq % self._tactile_every == 0:
-            for perception in self.perceptions:
-                self._publish_frame(publisher, perception)
-
-    def _publish_frame(self, publisher: Publisher, perception: FingerPerception) -> None:
-        frame = perception.frame
-        if frame is None or frame.seq == self._published[perception.finger]:
-            return
-        self._published[perception.finger] = frame.seq
-        tactile = self._settings.tactile
-        wall = self.state.wall - (self.state.t - frame.t_sample)
-        publisher.tactile(frame, perception.finger, tactile.pitch, tactile.pascal_per_count, wall)
 
     # Commands, events and faults
 

@@ -14,6 +14,12 @@ and fields are only ever added. SI units.
 ``hand/tactile``
     ``schema, seq, timestamp, finger, rows, cols, pitch`` [m], ``unit`` (``"count"``), ``scale``
     (Pa a count), ``data``: rows × cols little-endian uint16, row-major.
+``hand/stats``
+    once a second: ``schema, seq, timestamp, mono_ns, ticks`` (since the start, as all but the
+    rates), ``overruns, period_s``; under each of ``wake`` (a tick's start after its deadline),
+    ``compute`` (all of a tick's work), ``bus`` (reading and writing servos) and ``publish``:
+    ``p50, p99, p999, max`` [s]; under ``rates`` what the last second had [Hz]: ``tick``, ``left``
+    and ``right`` (tactile frames that came), ``state`` and ``tactile`` (messages that went out).
 ``hand/event``
     ``schema, seq, timestamp, mono_ns, level`` (``info``, ``warning``, ``error``), ``kind, text``.
     A limit's ``kind``, as a fault's ``fault_name``, is its name in :mod:`daemon.limits`.
@@ -26,11 +32,14 @@ from typing import Any, NamedTuple
 import msgpack
 
 from daemon.records import FINGERS, Contact, Frame, State
+from daemon.settings import Settings
+from daemon.statistics import Statistics
 
 SCHEMA = 1
 STATE = b"hand/state"
 TACTILE = b"hand/tactile"
 EVENT = b"hand/event"
+STATS = b"hand/stats"
 
 pack = msgpack.Packer(use_bin_type=True).pack
 
@@ -41,6 +50,25 @@ class Parts(NamedTuple):
     fingers: tuple[bool, bool]
     servos: bool
     sensors: bool
+
+    @classmethod
+    def of(cls, settings: Settings) -> Parts:
+        """What these settings say."""
+        return cls(
+            fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
+            servos=settings.servos.backend != "none",
+            sensors=settings.tactile.backend != "none",
+        )
+
+
+class Rates(NamedTuple):
+    """How often things have happened [Hz]; the names are `hand/stats`'s."""
+
+    tick: float
+    left: float
+    right: float
+    state: float
+    tactile: float
 
 
 def state_message(state: State, scene: Parts) -> dict[str, Any]:
@@ -131,6 +159,24 @@ def tactile_message(
         "unit": "count",
         "scale": scale,
         "data": frame.data.astype("<u2", copy=False).tobytes(),
+    }
+
+
+def stats_message(
+    state: State, period: float, rates: Rates, statistics: Statistics
+) -> dict[str, Any]:
+    """The ``hand/stats`` map."""
+    spreads = {name: spread._asdict() for name, spread in statistics.spreads().items()}
+    return {
+        "schema": SCHEMA,
+        "seq": state.seq,
+        "timestamp": state.wall,
+        "mono_ns": int(state.t * 1e9),
+        "ticks": statistics.ticks,
+        "overruns": state.timing.overruns,
+        "period_s": period,
+        **spreads,
+        "rates": rates._asdict(),
     }
 
 

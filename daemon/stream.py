@@ -14,6 +14,7 @@ import zmq
 from daemon import messages
 from daemon.records import Frame, State
 from daemon.sockets import Bound
+from daemon.statistics import Statistics
 
 _CHANGES = 16  # subscriptions taken in at a time; more wait for the next look
 _LONGEST_TOPIC = 64  # bytes; whoever subscribes to more gets nothing
@@ -28,6 +29,7 @@ class Publisher:
         self._subscriptions: set[bytes] = set()
         self.wants_state = False
         self.wants_tactile = False
+        self.wants_stats = False
         self._events = 0
 
     def refresh(self) -> None:
@@ -44,6 +46,7 @@ class Publisher:
                 self._subscriptions.discard(change[1:])
         self.wants_state = self._wanted(messages.STATE)
         self.wants_tactile = self._wanted(messages.TACTILE)
+        self.wants_stats = self._wanted(messages.STATS)
 
     def _wanted(self, topic: bytes) -> bool:
         return any(topic.startswith(prefix) for prefix in self._subscriptions)
@@ -55,6 +58,12 @@ class Publisher:
     def tactile(self, frame: Frame, finger: int, pitch: float, scale: float, wall: float) -> None:
         """Publish one finger's frame on ``hand/tactile``."""
         self._send(messages.TACTILE, messages.tactile_message(frame, finger, pitch, scale, wall))
+
+    def stats(
+        self, state: State, period: float, rates: messages.Rates, statistics: Statistics
+    ) -> None:
+        """Publish ``hand/stats``."""
+        self._send(messages.STATS, messages.stats_message(state, period, rates, statistics))
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""

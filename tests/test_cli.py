@@ -53,7 +53,7 @@ def test_signals_end_the_daemon_with_torque_off(
     running = start("--config", str(profile("")))
     assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
     assert running.end(number) == 0
-    assert "ended, torque off" in running.lines[-1]
+    assert any("ended, torque off" in line for line in running.lines)
 
 
 def test_sigusr1_stops(
@@ -200,7 +200,7 @@ def test_a_lost_terminal_ends_the_daemon_with_torque_off(
     running = start("--config", str(profile("")))
     assert softfinger("send", "arm", "--address", addresses[1]).returncode == 0
     assert running.end(signal.SIGHUP) == 0
-    assert "ended, torque off" in running.lines[-1]
+    assert any("ended, torque off" in line for line in running.lines)
 
 
 def test_a_reader_of_the_log_that_stops_reading_stops_nothing(

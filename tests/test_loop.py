@@ -13,7 +13,7 @@ import pytest
 
 from daemon.assembly import Daemon
 from daemon.commands import Refused
-from daemon.messages import pack, state_message
+from daemon.messages import Parts, pack, state_message
 from daemon.records import Frame
 from daemon.servos.base import ServoError
 from daemon.settings import Settings
@@ -419,7 +419,7 @@ def run_recorded(make: Make, seed: int) -> list[bytes]:
             name, numbers = script[tick]
             command(daemon, name, **numbers)
         daemon.loop.advance(daemon.loop.period)
-        recorded.append(pack(state_message(daemon.loop.state, daemon.loop._scene)))
+        recorded.append(pack(state_message(daemon.loop.state, Parts.of(daemon.settings))))
     return recorded
 
 
@@ -502,8 +502,8 @@ def test_every_scene_runs_and_its_messages_have_one_shape(
 ) -> None:
     daemon = make(**sections)
     daemon.loop.advance(2.0)
-    message = state_message(daemon.loop.state, daemon.loop._scene)
-    reference = state_message(make().loop.state, daemon.loop._scene)
+    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
+    reference = state_message(make().loop.state, Parts.of(daemon.settings))
     assert message.keys() == reference.keys()
     for part in ("left", "right", "object"):
         assert message[part].keys() == reference[part].keys()

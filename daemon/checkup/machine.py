@@ -11,12 +11,10 @@ import resource
 import time
 from pathlib import Path
 
+from daemon import rights
 from daemon.checkup.result import Result
 
-_LIMITS = "/etc/security/limits.d/softfinger.conf"
-_RULE = "/etc/udev/rules.d/99-softfinger.rules"
-_PRIORITY = 80
-_MEMORY = 512 << 20  # bytes: what the daemon has mapped and touched, with room
+_MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
 _WAKE_UPS = 100
 _PERIOD = 0.002  # s
 _OLDEST = 1_700_000_000.0  # Unix s: a clock that says less was never set
@@ -47,7 +45,7 @@ def check_scheduling() -> Result:
             "warn",
             "scheduling",
             f"SCHED_FIFO is not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick",
-            f'echo "$USER - rtprio {_PRIORITY}" | sudo tee -a {_LIMITS}, then log in again',
+            rights.PRIORITY,
         )
     os.sched_setscheduler(0, *before)
     return Result("pass", "scheduling", "SCHED_FIFO is allowed")
@@ -66,7 +64,7 @@ def check_memory_lock(limit: int) -> Result:
         "warn",
         "memory lock",
         f"{size} may be locked, {_MEMORY >> 20} MiB wanted: pages of the loop can be swapped out",
-        f'echo "$USER - memlock unlimited" | sudo tee -a {_LIMITS}, then log in again',
+        rights.MEMORY_LOCK,
     )
 
 
@@ -77,13 +75,11 @@ def check_idle_states(path: Path) -> Result:
         return Result("warn", name, "this kernel has none: wake-ups take what idle states take")
     if os.access(path, os.W_OK):
         return Result("pass", name, "may be held")
-    rule = f'KERNEL=="{path.name}", GROUP="dialout", MODE="0660"'
     return Result(
         "warn",
         name,
         "no permission to hold it: wake-ups take what idle states take",
-        f"echo '{rule}' | sudo tee -a {_RULE} && sudo udevadm control --reload "
-        f"&& sudo udevadm trigger /dev/{path.name}",
+        rights.LATENCY,
     )
 
 

@@ -1,0 +1,93 @@
+"""What goes out to subscribers on which tick, and how often that really was.
+
+Holds the decimation of the published topics. It sends through `daemon.stream` and looks at what the
+loop shows it; it changes nothing there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from daemon.messages import Parts, Rates
+from daemon.perception import FingerPerception
+from daemon.records import State
+from daemon.schedule import Schedule
+from daemon.settings import Settings
+from daemon.statistics import Statistics
+from daemon.stream import Publisher
+
+
+@dataclass(slots=True)
+class _Counts:
+    """Things that have happened until time ``t`` [s]."""
+
+    t: float = 0.0
+    ticks: int = 0
+    states: int = 0
+    maps: int = 0
+    left: int = 0
+    right: int = 0
+
+
+class Broadcast:
+    """Publishes what is due at a tick and wanted by somebody."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        publisher: Publisher,
+        perceptions: list[FingerPerception],
+        statistics: Statistics,
+    ) -> None:
+        self._publisher = publisher
+        self._perceptions = perceptions
+        self._statistics = statistics
+        self._schedule = Schedule(settings)
+        self._period = 1.0 / settings.loop.rate
+        self._pitch = settings.tactile.pitch
+        self._scale = settings.tactile.pascal_per_count
+        self._scene = Parts.of(settings)
+        self._published = [0, 0]  # newest frame of each finger that went out
+        self._states = self._maps = 0  # messages that went out
+        self._told = _Counts()  # when the rates were last told
+
+    def __call__(self, state: State) -> None:
+        """All that is due at this tick."""
+        publisher, schedule, seq = self._publisher, self._schedule, state.seq
+        if schedule.look.due(seq):
+            publisher.refresh()
+        if publisher.wants_state and schedule.state.due(seq):
+            self._states += 1
+            publisher.state(state, self._scene)
+        if publisher.wants_tactile and schedule.tactile.due(seq):
+            for perception in self._perceptions:
+                self._frame(state, perception)
+        if schedule.stats.due(seq):
+            rates = self._rates(state)
+            if publisher.wants_stats:
+                publisher.stats(state, self._period, rates, self._statistics)
+
+    def _frame(self, state: State, perception: FingerPerception) -> None:
+        frame = perception.frame
+        if frame is None or frame.seq == self._published[perception.finger]:
+            return
+        self._published[perception.finger] = frame.seq
+        self._maps += 1
+        wall = state.wall - (state.t - frame.t_sample)
+        self._publisher.tactile(frame, perception.finger, self._pitch, self._scale, wall)
+
+    def _rates(self, state: State) -> Rates:
+        """Rates [Hz] since they were last asked for."""
+        frames = [0, 0]
+        for perception in self._perceptions:
+            frames[perception.finger] = perception.frames
+        last = self._told
+        now = self._told = _Counts(state.t, state.seq, self._states, self._maps, *frames)
+        per = 1.0 / (now.t - last.t) if now.t > last.t else 0.0
+        return Rates(
+            tick=per * (now.ticks - last.ticks),
+            left=per * (now.left - last.left),
+            right=per * (now.right - last.right),
+            state=per * (now.states - last.states),
+            tactile=per * (now.maps - last.maps),
+        )
