@@ -29,7 +29,6 @@ class FingerPerception:
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frames = 0  # that came
-        self.frames = 0  # that came
         live = getattr(sensor, "live", None)  # of a recording that lacks cells
         self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
         self._table = model.table.data
@@ -58,7 +57,6 @@ class FingerPerception:
         if frame is None or frame is self.frame:
             return False
         self.frame = frame
-        self.frames += 1
         self.frames += 1
         contact.seq = frame.seq
         contact.t = frame.t_sample
