@@ -40,6 +40,7 @@ class Servos(Protocol):
 
         After a failed exchange ``valid`` is False and all else but ``seq`` keeps, so that
         ``reading.t`` is the time of the last good one.
+        Temperature and voltage need not be fresher than a second.
         """
 
     def set_torque(self, on: bool) -> None:

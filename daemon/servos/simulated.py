@@ -14,6 +14,9 @@ from daemon.servos.modes import current_toward, mode_number
 from daemon.servos.units import JointScale
 from daemon.settings import Settings
 from daemon.simulation.hand import SimulatedHand
+from daemon.simulation.servo import AMBIENT, THERMAL_RISE, THERMAL_TIME
+
+_HEALTH_EVERY = 0.25  # s between two looks at temperature and supply
 
 
 class SimulatedServos:
@@ -39,6 +42,10 @@ class SimulatedServos:
         self._q = [0.0, 0.0]  # of the last reading [rad, rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
+        self._temperature = [AMBIENT, AMBIENT]  # °C, warming as the emulated servo's does
+        self._voltage = 0.0
+        self._stall_current = 1.0
+        self._looked = -math.inf
         self._trips = 0
         self._tripped = False  # the watchdog took the torque that was switched on here
 
@@ -52,6 +59,8 @@ class SimulatedServos:
         if unfit:
             raise ServoError(f"servos.model: {unfit}")
         self._scales = [JointScale.of(self._settings.servos, joint, model) for joint in range(2)]
+        self._voltage = 0.5 * (model.voltage_min + model.voltage_max) * reg.VOLTAGE_UNIT
+        self._stall_current = model.stall_current
         self._connected = True
         self._exchange()
         self._switch(False)
@@ -69,10 +78,22 @@ class SimulatedServos:
             reading.q[joint] = self._q[joint] = scale.angle(scale.position_counts(q[joint]))
             reading.dq[joint] = self._dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
             reading.current[joint] = scale.amperes(scale.current_counts(current[joint]))
+        if reading.t - self._looked >= _HEALTH_EVERY:
+            self._look_at_health(reading, current)
         self._seq += 1
         reading.seq = self._seq
         reading.alert = 0
         reading.valid = True
+
+    def _look_at_health(self, reading: Reading, current: list[float]) -> None:
+        passed = min(reading.t - self._looked, _HEALTH_EVERY * 2.0)
+        self._looked = reading.t
+        for joint in self._joints:
+            share = current[joint] / self._stall_current
+            warm = AMBIENT + THERMAL_RISE * share * share
+            self._temperature[joint] += (warm - self._temperature[joint]) * passed / THERMAL_TIME
+            reading.temperature[joint] = float(round(self._temperature[joint]))
+            reading.voltage[joint] = self._voltage
 
     def set_torque(self, on: bool) -> None:
         """Torque on, with the goal at the present count and no current until a goal is written."""
