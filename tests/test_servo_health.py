@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -13,8 +14,10 @@ from daemon.clock import RealClock, VirtualClock
 from daemon.records import Reading
 from daemon.servos import make_servos
 from daemon.servos.base import Servos
+from daemon.servos.models import by_name
 from daemon.servos.simulated import SimulatedServos
 from daemon.settings import Settings
+from daemon.simulation.servo import THERMAL_RISE, THERMAL_TIME
 from tests.conftest import until
 from tests.servo_harness import RunningBus
 
@@ -98,5 +101,7 @@ def test_simulated_servos_warm_with_their_current() -> None:
     for _ in range(2000):
         clock.sleep_until(clock.now() + 0.1)
         servos.read(reading)
-    assert 60.0 < reading.temperature[0] < 95.0
+    share = 2.0 / by_name(Settings().servos.model).stall_current
+    risen = THERMAL_RISE * share**2 * (1.0 - math.exp(-clock.now() / THERMAL_TIME))
+    assert reading.temperature[0] == pytest.approx(25.0 + risen, abs=1.0)
     assert reading.temperature[1] == 25.0
