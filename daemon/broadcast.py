@@ -44,8 +44,6 @@ class Broadcast:
         self._statistics = statistics
         self._schedule = Schedule(settings)
         self._period = 1.0 / settings.loop.rate
-        self._pitch = settings.tactile.pitch
-        self._scale = settings.tactile.pascal_per_count
         self._scene = Parts.of(settings)
         self._published = [0, 0]  # newest frame of each finger that went out
         self._states = self._maps = 0  # messages that went out
@@ -74,7 +72,8 @@ class Broadcast:
         self._published[perception.finger] = frame.seq
         self._maps += 1
         wall = state.wall - (state.t - frame.t_sample)
-        self._publisher.tactile(frame, perception.finger, self._pitch, self._scale, wall)
+        data = perception.shown(frame)
+        self._publisher.tactile(frame, data, perception.finger, perception.facts, wall)
 
     def _rates(self, state: State) -> Rates:
         """Rates [Hz] since they were last asked for."""

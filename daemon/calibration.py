@@ -243,6 +243,11 @@ class Converter:
         return float(pressure.min()) if pressure.size else np.inf
 
     @property
+    def largest(self) -> float:
+        """The greatest pressure [Pa] that any cell can read."""
+        return float(self.at(self._full).max())
+
+    @property
     def quantum(self) -> float:
         """A count's typical width [Pa]: the mean slope of the curve."""
         return self.saturation / self._full

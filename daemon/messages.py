@@ -12,8 +12,17 @@ and fields are only ever added. SI units.
     [N], ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq, frame_age_s``;
     under ``object``: ``valid, angle`` [rad], ``width`` [m].
 ``hand/tactile``
-    ``schema, seq, timestamp, finger, rows, cols, pitch`` [m], ``unit`` (``"count"``), ``scale``
-    (Pa a count), ``data``: rows × cols little-endian uint16, row-major.
+    ``schema, seq, timestamp, mono_ns`` (both of the board's scan), ``delay_s`` (from then until the
+    frame had come), ``valid`` (false: the board is gone, this is its last frame again), ``finger,
+    rows, cols``; ``data``: rows × cols little-endian uint16, row-major, rows along y, in steps of
+    ``scale`` [Pa]. Where the cells are: ``pitch`` [m] from column to column, ``pitch_y`` from row
+    to row, ``centre_x, centre_y`` [m], the tip's centre off the grid's, ``rotation`` [rad] of the
+    sensor's axes against the finger's.
+    ``unit``: ``"count"``, the board's own counts, of which ``scale`` makes a pressure as well as
+    one factor for all cells can; or ``"Pa"``, where ``stream.tactile_unit`` asks for it: data ×
+    scale is the pressure that the estimator was given, by the tare and the calibration if there is
+    one (``calibrated``). ``calibration``: name and date of the calibration that the estimator goes
+    by, whatever the unit; empty when there is none.
 ``hand/stats``
     once a second: ``schema, seq, timestamp, mono_ns, ticks`` (since the start, as all but the
     rates), ``overruns, period_s``; under each of ``wake`` (a tick's start after its deadline),
@@ -27,13 +36,17 @@ and fields are only ever added. SI units.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgpack
+import numpy as np
+from numpy.typing import NDArray
 
 from daemon.records import FINGERS, Contact, Frame, State
 from daemon.settings import Settings
-from daemon.statistics import Statistics
+
+if TYPE_CHECKING:  # it brings compiled kernels, which clients have no use for
+    from daemon.statistics import Statistics
 
 SCHEMA = 1
 STATE = b"hand/state"
@@ -59,6 +72,20 @@ class Parts(NamedTuple):
             servos=settings.servos.backend != "none",
             sensors=settings.tactile.backend != "none",
         )
+
+
+class SensorFacts(NamedTuple):
+    """What `hand/tactile` tells of a sensor with each frame; names and units are that topic's."""
+
+    pitch: float
+    pitch_y: float
+    centre_x: float
+    centre_y: float
+    rotation: float
+    unit: str
+    scale: float
+    calibrated: bool
+    calibration: str
 
 
 class Rates(NamedTuple):
@@ -144,21 +171,25 @@ def _finger(
 
 
 def tactile_message(
-    frame: Frame, finger: int, pitch: float, scale: float, wall: float
+    frame: Frame, data: NDArray[np.uint16], finger: int, facts: SensorFacts, wall: float
 ) -> dict[str, Any]:
-    """The ``hand/tactile`` map of one finger's frame; ``wall`` is the Unix time it was sampled."""
-    rows, cols = frame.data.shape
+    """The ``hand/tactile`` map of one finger's frame; ``wall`` is the Unix time it was sampled.
+
+    ``data`` [rows, cols] is the frame's, in steps as ``facts`` tells.
+    """
+    rows, cols = data.shape
     return {
         "schema": SCHEMA,
         "seq": frame.seq,
         "timestamp": wall,
+        "mono_ns": int(frame.t_sample * 1e9),
+        "delay_s": frame.t_arrival - frame.t_sample,
+        "valid": frame.valid,
         "finger": FINGERS[finger],
         "rows": rows,
         "cols": cols,
-        "pitch": pitch,
-        "unit": "count",
-        "scale": scale,
-        "data": frame.data.astype("<u2", copy=False).tobytes(),
+        **facts._asdict(),
+        "data": data.astype("<u2", copy=False).tobytes(),
     }
 
 

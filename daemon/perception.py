@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.calibration import Converter
+from daemon.messages import SensorFacts
 from daemon.model import FingerModel, make_estimator
 from daemon.records import Contact, Frame
 from daemon.settings import Settings
@@ -18,6 +19,7 @@ from kinematics.held import total_tilt
 from kinematics.table import lookup
 
 _TARE_FRAMES = 16
+_STEPS = 65535  # of a published pressure
 
 
 class FingerPerception:
@@ -37,6 +39,10 @@ class FingerPerception:
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count)
             self._scale = 1.0
+        self._converted: Frame | None = None  # whose pressure the converter holds
+        self._pressure: NDArray[np.float64] | None = None
+        self._as_pressure = settings.stream.tactile_unit == "Pa"
+        self.facts = self._facts(settings, model)
         self._zero: NDArray[np.uint16] | None = None
         self._tare_sum: NDArray[np.uint32] | None = None
         self._tare_left = 0
@@ -68,7 +74,8 @@ class FingerPerception:
         if self._tare_left:
             self._learn_zero(counts)
         if self._converter is not None:
-            self.estimate(self._converter(counts), contact)
+            self._pressure, self._converted = self._converter(counts), frame
+            self.estimate(self._pressure, contact)
         else:
             if self._zero is not None:
                 counts = np.maximum(counts, self._zero) - self._zero
@@ -113,6 +120,34 @@ class FingerPerception:
         contact.force = contact.gain * force
         contact.energy = contact.gain * energy
         contact.inside = inside
+
+    def shown(self, frame: Frame) -> NDArray[np.uint16]:
+        """The newest frame's data [rows, cols] for subscribers, in steps as ``facts`` tells."""
+        if not self._as_pressure:
+            return frame.data
+        if self._converter is None:
+            zero = self._zero
+            return frame.data if zero is None else np.maximum(frame.data, zero) - zero
+        if self._pressure is None or self._converted is not frame:
+            self._pressure, self._converted = self._converter(frame.data), frame
+        return np.rint(self._pressure * (1.0 / self.facts.scale)).astype(np.uint16)
+
+    def _facts(self, settings: Settings, model: FingerModel) -> SensorFacts:
+        scale = settings.tactile.pascal_per_count
+        if self._converter is not None:
+            scale = (
+                self._converter.largest / _STEPS if self._as_pressure else self._converter.quantum
+            )
+        grid = model.grid
+        return SensorFacts(
+            *grid.pitches,
+            *grid.centre,
+            rotation=grid.rotation,
+            unit=settings.stream.tactile_unit,
+            scale=scale,
+            calibrated=self._as_pressure and self._converter is not None,
+            calibration="" if model.calibration is None else model.calibration.identity,
+        )
 
     def _learn_zero(self, counts: NDArray[np.uint16]) -> None:
         if self._tare_sum is None:

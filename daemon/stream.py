@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from daemon import messages
 from daemon.records import Frame, State
@@ -55,9 +57,17 @@ class Publisher:
         """Publish ``hand/state``."""
         self._send(messages.STATE, messages.state_message(state, scene))
 
-    def tactile(self, frame: Frame, finger: int, pitch: float, scale: float, wall: float) -> None:
-        """Publish one finger's frame on ``hand/tactile``."""
-        self._send(messages.TACTILE, messages.tactile_message(frame, finger, pitch, scale, wall))
+    def tactile(
+        self,
+        frame: Frame,
+        data: NDArray[np.uint16],
+        finger: int,
+        facts: messages.SensorFacts,
+        wall: float,
+    ) -> None:
+        """Publish one finger's frame on ``hand/tactile``, see `daemon.messages.tactile_message`."""
+        message = messages.tactile_message(frame, data, finger, facts, wall)
+        self._send(messages.TACTILE, message)
 
     def stats(
         self, state: State, period: float, rates: messages.Rates, statistics: Statistics

@@ -15,6 +15,7 @@ from daemon.calibration import (
     load_calibration,
     save_calibration,
 )
+from daemon.messages import tactile_message
 from daemon.profiles import load
 from daemon.settings import Settings
 from kinematics.contact import Fingertip
@@ -168,6 +169,37 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
             perception.tare()  # a new zero is taken in counts, and the converter knows it
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
+
+
+def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
+    folder, sensor = bench
+    path = tmp_path / "held.npz"
+    np.savez(path, frames=sensor.press(0.003, 0.15, frames=10))
+    settings = daemon_settings(folder, path)
+    in_pascal = settings.model_copy(
+        update={"stream": settings.stream.model_copy(update={"tactile_unit": "Pa"})}
+    )
+    calibration = load_calibration(folder / "sensor.json")
+    for each in (settings, in_pascal):
+        with Daemon(each, wire=False) as daemon:
+            daemon.loop.advance(0.05)
+            (perception,) = daemon.loop.perceptions
+            frame, facts = perception.frame, perception.facts
+            shown = perception.shown(frame)
+            message = tactile_message(frame, shown, 0, facts, 1.0)
+        assert message["centre_x"] == calibration.centre.centre[0]
+        assert message["rotation"] == calibration.centre.rotation
+        assert message["calibration"] == f"A17 {calibration.date}"
+        pressure = Converter(calibration, 20.0)(frame.data)
+        if each is settings:
+            assert (message["unit"], message["calibrated"]) == ("count", False)
+            assert shown is frame.data
+            strong = pressure > 2e4
+            assert shown[strong] * message["scale"] == pytest.approx(pressure[strong], rel=0.6)
+        else:
+            assert (message["unit"], message["calibrated"]) == ("Pa", True)
+            assert np.abs(shown * message["scale"] - pressure).max() <= 0.5 * message["scale"]
+            assert message["scale"] < 20.0
 
 
 @pytest.mark.parametrize(

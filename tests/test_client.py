@@ -192,6 +192,15 @@ def test_a_grid_that_is_not_what_it_says(changes: dict[str, object]) -> None:
         read_frame(message)
 
 
+def test_a_frame_tells_where_its_cells_are_and_what_they_mean() -> None:
+    told = {"pitch_y": 0.002, "centre_x": 1e-4, "unit": "Pa", "scale": 0.5, "calibrated": True}
+    message = {**fake_daemon.frame(0.0, 1), **told, "calibration": "A17 2026"}
+    frame = read_frame(message)
+    assert (frame.finger, frame.valid, frame.unit, frame.calibrated) == ("right", True, "Pa", True)
+    assert (frame.pitch_y, frame.centre, frame.calibration) == (0.002, (1e-4, 0.0), "A17 2026")
+    assert np.array_equal(frame.pressure(), 0.5 * frame.counts)
+
+
 def test_missing_fields_are_not_a_number() -> None:
     state = read_state({"left": {"force": "much"}, "object": 3})
     assert math.isnan(state.left.force)

@@ -71,6 +71,7 @@ def test_fit_keeps_cells_square() -> None:
     assert fit(44, 44, 40, 22) == (11, 22)
     assert fit(10, 40, 11, 22) == (3, 22)
     assert fit(256, 4, 11, 22) == (11, 1)
+    assert fit(12, 32, 11, 22, 32 / 12) == (11, 22)  # oblong cells of a square sensor
 
 
 def test_round_up() -> None:

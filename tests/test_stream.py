@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon.messages import SCHEMA, Parts, state_message
+from daemon.messages import SCHEMA, Parts, SensorFacts, state_message
 from daemon.records import Contact, Frame, State
 from daemon.stream import Publisher
 from tests.conftest import until
@@ -96,7 +96,8 @@ def test_tactile_data_is_little_endian_uint16_row_major(
     until(lambda: (publisher.refresh(), publisher.wants_tactile)[1])
     assert not publisher.wants_state
     data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
-    publisher.tactile(Frame(7, 1.0, 1.1, True, data), 1, 0.002, 4.0, 99.0)
+    facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
+    publisher.tactile(Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
     topic, message = receive(socket)
     assert topic == b"hand/tactile"
     assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
@@ -104,13 +105,24 @@ def test_tactile_data_is_little_endian_uint16_row_major(
         "schema": SCHEMA,
         "seq": 7,
         "timestamp": 99.0,
+        "mono_ns": 1_000_000_000,
+        "delay_s": 0.25,
+        "valid": True,
         "finger": "right",
         "rows": 3,
         "cols": 4,
         "pitch": 0.002,
+        "pitch_y": 0.003,
+        "centre_x": 1e-4,
+        "centre_y": -2e-4,
+        "rotation": 0.1,
         "unit": "count",
         "scale": 4.0,
+        "calibrated": False,
+        "calibration": "A17 2026-01-02",
     }
+    floats = {"timestamp", "delay_s", "scale", *SensorFacts._fields[:5]}
+    assert all(isinstance(message[key], float) for key in floats)
     publisher.close()
 
 

@@ -61,13 +61,17 @@ def printable(value: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TactileFrame:
-    """One frame as it came. ``scale`` is Pa per count, NaN when the message doesn't tell."""
+    """One frame as it came. ``scale`` is Pa per count, NaN when the message doesn't tell.
+
+    ``aspect`` is a cell's height over its width.
+    """
 
     arrived: float
     rows: int
     cols: int
     scale: float
     data: bytes
+    aspect: float = 1.0
 
     def grid(self) -> NDArray[np.float64]:
         """Pressures [rows, cols], Pa; counts where the scale isn't known."""
@@ -177,8 +181,14 @@ class Feed:
         if len(data) != 2 * rows * cols:
             raise ValueError("a grid of another size than told")
         scale = number(record, "scale")
+        aspect = number(record, "pitch_y") / (number(record, "pitch") or math.nan)
         self.frames[finger] = TactileFrame(
-            now, rows, cols, scale if 0.0 < scale < math.inf else math.nan, data
+            now,
+            rows,
+            cols,
+            scale if 0.0 < scale < math.inf else math.nan,
+            data,
+            aspect if 0.01 < aspect < 100.0 else 1.0,
         )
 
     def _take_event(self, record: dict[str, Any]) -> None:

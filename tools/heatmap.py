@@ -83,10 +83,14 @@ def resample(grid: FloatArray, height: int, width: int) -> FloatArray:
     return result
 
 
-def fit(rows: int, cols: int, lines: int, columns: int) -> tuple[int, int]:
-    """Largest (lines, columns) of characters in the given box that shows square cells square."""
-    width = min(columns, max(1, round(2 * lines * cols / rows)))
-    height = min(lines, max(1, round(width * rows / cols / 2)))
+def fit(rows: int, cols: int, lines: int, columns: int, aspect: float = 1.0) -> tuple[int, int]:
+    """Largest (lines, columns) of characters in the given box that shows cells in their shape.
+
+    ``aspect``: a cell's height over its width.
+    """
+    slope = aspect * rows / cols
+    width = min(columns, max(1, round(2 * lines / slope)))
+    height = min(lines, max(1, round(width * slope / 2)))
     return height, width
 
 

@@ -206,7 +206,7 @@ class Page:
         title = apart(
             [Segment(name.upper(), SIDE[name]), Segment(f" {said}", style)], [Segment(peak)], box
         )
-        height, columns = heatmap.fit(frame.rows, frame.cols, lines, box)
+        height, columns = heatmap.fit(frame.rows, frame.cols, lines, box, frame.aspect)
         above = (lines - height) // 2
         picture: list[Line] = [[] for _ in range(lines)]
         for i, line in enumerate(heatmap.picture(grid, full, height, columns, self.depth)):

@@ -89,13 +89,20 @@ class HandState:
 
 @dataclass(frozen=True, slots=True)
 class TactileFrame:
-    """One ``hand/tactile``: the raw counts under one tip."""
+    """One ``hand/tactile``: the raw counts under one tip, or its pressure in steps of ``scale``."""
 
     seq: int
     timestamp: float  # Unix time at which the board sampled it [s]
+    valid: bool  # False: the board is gone, and this is its last frame again
     finger: str
     pitch: float  # from column to column [m]
-    scale: float  # Pa a count
+    pitch_y: float  # and from row to row
+    centre: tuple[float, float]  # the tip's centre off the grid's, x and y [m]
+    rotation: float  # of the sensor's axes against the finger's [rad]
+    unit: str  # "count" or "Pa": what the board said, or what the estimator was given
+    scale: float  # Pa a count or step
+    calibrated: bool  # counts × scale is the pressure by the calibration
+    calibration: str  # name and date of the one that the estimator goes by, empty without
     counts: NDArray[np.uint16]  # [rows, cols], read-only
 
     def pressure(self) -> NDArray[np.float64]:
@@ -135,9 +142,16 @@ def read_frame(message: dict[str, Any]) -> TactileFrame:
     return TactileFrame(
         seq=_as_int(message.get("seq")),
         timestamp=_as_float(message.get("timestamp")),
+        valid=_as_bool(message.get("valid")),
         finger=_as_text(message.get("finger")),
         pitch=_as_float(message.get("pitch")),
+        pitch_y=_as_float(message.get("pitch_y")),
+        centre=(_as_float(message.get("centre_x")), _as_float(message.get("centre_y"))),
+        rotation=_as_float(message.get("rotation")),
+        unit=_as_text(message.get("unit")),
         scale=_as_float(message.get("scale")),
+        calibrated=_as_bool(message.get("calibrated")),
+        calibration=_as_text(message.get("calibration")),
         counts=np.frombuffer(data, dtype="<u2").reshape(rows, cols),
     )
 
