@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -426,40 +424,6 @@ def run_recorded(make: Make, seed: int) -> list[bytes]:
 def test_two_runs_with_one_seed_are_the_same_to_the_bit(make: Make) -> None:
     assert run_recorded(make, 3) == run_recorded(make, 3)
     assert run_recorded(make, 3)[1500:] != run_recorded(make, 4)[1500:]
-
-
-NO_COMPILATION = """
-import gc
-from numba.core.dispatcher import Dispatcher
-from daemon.assembly import Daemon
-from daemon.settings import Settings
-
-def compiled():
-    return sum(len(each.signatures) for each in gc.get_objects() if isinstance(each, Dispatcher))
-
-with Daemon(Settings.model_validate({"loop": {"clock": "virtual"}}), wire=False) as daemon:
-    before = compiled()
-    daemon.loop.advance(0.3)
-    for wait, request in [
-        (0.1, {"command": "arm"}),
-        (3.0, {"command": "grasp", "force": 8.0}),
-        (2.0, {"command": "rotate", "angle": 0.1}),
-        (1.0, {"command": "release"}),
-    ]:
-        daemon.loop.command(request)
-        daemon.loop.advance(wait)
-    assert daemon.loop.state.mode == "armed", daemon.loop.state
-    print(before, compiled())
-"""
-
-
-def test_no_kernel_compiles_in_a_running_loop() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", NO_COMPILATION], capture_output=True, text=True, check=True
-    )
-    before, after = done.stdout.split()
-    assert int(before) > 10
-    assert after == before
 
 
 def test_tare_removes_a_standing_offset(make: Make) -> None:
