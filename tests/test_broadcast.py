@@ -1,0 +1,152 @@
+"""What goes out when: exact decimation, rates as they really were, and the statistics' message."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from daemon.assembly import Daemon
+from daemon.broadcast import Broadcast
+from daemon.messages import SCHEMA, Rates, stats_message
+from daemon.records import State
+from daemon.schedule import Schedule
+from daemon.settings import Settings
+from daemon.statistics import Statistics, record
+from daemon.stream import Publisher
+from tests.conftest import until
+
+
+class Listener:
+    """Wants everything and keeps the tick numbers of what it got."""
+
+    wants_state = wants_tactile = wants_stats = True
+
+    def __init__(self) -> None:
+        self.ticks: dict[str, list[int]] = {"look": [], "state": [], "tactile": [], "stats": []}
+        self.rates: list[Rates] = []
+        self.seq = 0
+
+    def refresh(self) -> None:
+        self.ticks["look"].append(self.seq)
+
+    def state(self, state: State, _: Any) -> None:
+        self.ticks["state"].append(state.seq)
+
+    def tactile(self, *_: Any) -> None:
+        if self.seq not in self.ticks["tactile"][-1:]:  # both fingers' come on the same tick
+            self.ticks["tactile"].append(self.seq)
+
+    def stats(self, state: State, _period: float, rates: Rates, _: Statistics) -> None:
+        self.ticks["stats"].append(state.seq)
+        self.rates.append(rates)
+
+    def event(self, *_: Any) -> None: ...
+
+
+def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}, **sections})
+    listener = Listener()
+    with Daemon(settings, wire=False) as daemon:
+        loop = daemon.loop
+        sending = Broadcast(settings, listener, loop.perceptions, loop.statistics)  # type: ignore[arg-type]
+
+        def broadcast(state: State) -> None:
+            listener.seq = state.seq
+            sending(state)
+
+        loop._broadcast = broadcast  # type: ignore[assignment]
+        loop.advance(seconds)
+    return listener, daemon
+
+
+def test_each_topic_goes_out_on_exactly_every_nth_tick_and_seldom_on_the_same() -> None:
+    listener, _ = listened(4.0)
+    ticks = listener.ticks
+    assert ticks["state"] == list(range(5, 2001, 5))
+    assert ticks["tactile"] == list(range(21, 2001, 20))  # at tick 1 no frame had come
+    assert ticks["look"] == list(range(2, 2001, 25))
+    assert ticks["stats"] == [3, 503, 1003, 1503]
+    assert not set(ticks["state"]) & (set(ticks["tactile"]) | set(ticks["stats"]))
+
+
+def test_rates_are_what_really_happened_in_the_last_second() -> None:
+    listener, _ = listened(4.0, tactile={"rate": 80.0}, stream={"state_rate": 50.0})
+    rates = listener.rates[-1]
+    assert rates.tick == pytest.approx(500.0, abs=0.5)
+    assert rates.left == pytest.approx(80.0, abs=1.01)
+    assert rates.right == pytest.approx(80.0, abs=1.01)
+    assert rates.state == pytest.approx(50.0, abs=0.1)
+    assert rates.tactile == pytest.approx(50.0, abs=0.1)  # 25 of each finger
+
+
+@pytest.mark.parametrize(
+    ("rate", "wanted", "every"), [(500.0, 100.0, 5), (1000.0, 100.0, 10), (500.0, 300.0, 2),
+                                  (100.0, 400.0, 1), (10.0, 0.1, 100)]
+)  # fmt: skip
+def test_the_schedule_takes_the_nearest_whole_number_of_ticks(
+    rate: float, wanted: float, every: int
+) -> None:
+    settings = Settings.model_validate(
+        {"loop": {"rate": rate}, "stream": {"state_rate": wanted, "tactile_rate": wanted}}
+    )
+    schedule = Schedule(settings)
+    assert schedule.state.every == schedule.tactile.every == every
+    due = [seq for seq in range(1, 10 * every + 1) if schedule.tactile.due(seq)]
+    assert len(due) == 10
+    assert f"hand/state ({rate / every:.4g} Hz)" in str(schedule)
+
+
+def test_the_schedule_tells_every_rate() -> None:
+    told = str(Schedule(Settings()))
+    for words in ("every tick (500 Hz)", "frames as they come (100 Hz)", "every 5 hand/state",
+                  "every 20 hand/tactile (25 Hz)", "every 500 hand/stats (1 Hz)"):  # fmt: skip
+        assert words in told
+    blind = str(Schedule(Settings.model_validate({"tactile": {"backend": "none"}})))
+    assert "frames" not in blind
+
+
+def test_the_statistics_message_has_every_field_as_documented(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=10)
+    socket = context.socket(zmq.SUB)
+    socket.subscribe("hand/stats")
+    socket.connect(addresses[0])
+    until(lambda: (publisher.refresh(), publisher.wants_stats)[1])
+    assert not publisher.wants_state
+    statistics = Statistics()
+    record(statistics.counts, statistics.largest, 1e-6, 2e-5, 1e-5, 2e-6)
+    rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
+    publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics)
+    assert socket.poll(5000)
+    topic, payload = socket.recv_multipart()
+    assert topic == b"hand/stats"
+    message = msgpack.unpackb(payload)
+    assert message == {
+        "schema": SCHEMA,
+        "seq": 503,
+        "timestamp": 9.0,
+        "mono_ns": 1_500_000_000,
+        "ticks": 1,
+        "overruns": 0,
+        "period_s": 0.002,
+        **{name: spread._asdict() for name, spread in statistics.spreads().items()},
+        "rates": {"tick": 500.0, "left": 100.0, "right": 99.0, "state": 100.0, "tactile": 50.0},
+    }
+    socket.close()
+    publisher.close()
+
+
+def test_statistics_that_are_zero_are_still_floats() -> None:
+    message = stats_message(State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), Statistics())
+    for name in ("wake", "compute", "bus", "publish"):
+        assert [type(message[name][key]) for key in ("p50", "p99", "p999", "max")] == [float] * 4
+    assert all(isinstance(rate, float) for rate in message["rates"].values())
+
+
+def test_the_loop_counts_the_times_of_each_tick() -> None:
+    _, daemon = listened(0.5)
+    assert daemon.loop.statistics.ticks == daemon.loop.state.seq == 250

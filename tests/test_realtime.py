@@ -1,0 +1,151 @@
+"""Measures for a steady tick: had and given back where allowed, told where they are not."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+
+from daemon.clock import RealClock
+from daemon.realtime import RealTime
+from daemon.settings import Settings
+
+# What the system says of a process that asked for everything: before, during and after.
+HELD = """
+import json, os, sys, threading
+from pathlib import Path
+from daemon.realtime import RealTime
+from daemon.settings import Settings
+
+over = threading.Event()
+threading.Thread(target=over.wait, name="reader").start()
+reader = [t.native_id for t in threading.enumerate() if t.name == "reader"][0]
+
+def seen():
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    files = [os.readlink(f"/proc/self/fd/{n}") if os.path.lexists(f"/proc/self/fd/{n}") else ""
+             for n in os.listdir("/proc/self/fd")]
+    return {
+        "policy": os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK,
+        "priority": os.sched_getparam(0).sched_priority,
+        "reader": os.sched_getparam(reader).sched_priority,
+        "cpus": sorted(os.sched_getaffinity(0)),
+        "others": sorted(os.sched_getaffinity(reader)),
+        "locked": int(status["VmLck"].split()[0]),
+        "latency": "/dev/cpu_dma_latency" in files,
+        "slack": int(Path("/proc/self/timerslack_ns").read_text()),
+        "switch": sys.getswitchinterval(),
+    }
+
+try:
+    cpu = min(os.sched_getaffinity(0))
+    settings = Settings.model_validate({"realtime": {"priority": 7, "cpus": (cpu,)}})
+    told = [seen()]
+    with RealTime(settings) as measures:
+        told.append(seen())
+        child = os.popen("grep -c . /dev/null; chrt -p $$ 2>/dev/null || true").read()
+        events = measures.events()
+    told.append(seen())
+    print(json.dumps({"told": told, "events": events, "cpu": cpu, "child": child}))
+finally:
+    over.set()
+"""
+
+# The same as a user who may do nothing of it.
+REFUSED = """
+import json, os, resource
+from daemon.realtime import RealTime
+from daemon.settings import Settings
+
+settings = Settings.model_validate({"realtime": {"priority": 7, "cpus": (1023,)}})
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.geteuid() == 0:
+    os.setgroups([])
+    os.setgid(65534)
+    os.setuid(65534)
+with RealTime(settings) as measures:
+    block = bytearray(1 << 24)  # what comes later can still be had
+    print(json.dumps(measures.events()))
+"""
+
+
+def run(script: str) -> Any:
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+    )
+    return json.loads(done.stdout)
+
+
+def test_what_is_allowed_is_held_and_given_back() -> None:
+    answer = run(HELD)
+    before, during, after = answer["told"]
+    had = answer["events"][0]
+    assert had[:2] == ["info", "realtime"]
+    if "SCHED_FIFO 7" in had[2]:
+        assert (during["policy"], during["priority"], during["reader"]) == (os.SCHED_FIFO, 7, 6)
+        assert "SCHED_FIFO" not in answer["child"], "child processes inherited the priority"
+    else:
+        assert during["priority"] == 0
+        assert any("SCHED_FIFO" in event[2] for event in answer["events"][1:])
+    assert during["cpus"] == [answer["cpu"]]
+    assert during["others"] == before["others"]
+    assert (during["locked"] > 0) == ("memory locked" in had[2])
+    assert during["latency"] == ("idle states held off" in had[2])
+    assert during["switch"] == pytest.approx(2e-4)
+    assert after == before
+
+
+def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it() -> None:
+    events = run(REFUSED)
+    assert events[0][:2] == ["info", "realtime"]
+    assert "timer slack 1 ns" in events[0][2]
+    assert "memory" not in events[0][2]
+    refused = [text for level, kind, text in events[1:] if (level, kind) == ("warning", "realtime")]
+    assert len(refused) == len(events) - 1
+    for words in (
+        ("SCHED_FIFO 7 refused", "other processes can hold up a tick", "rtprio"),
+        ("processor 1023 refused", "may move between processors"),
+        ("memory lock refused", "can be swapped out", "memlock unlimited"),
+    ):
+        assert any(all(word in text for word in words) for text in refused), (words, refused)
+    if os.access("/dev/cpu_dma_latency", os.F_OK):
+        assert any("/dev/cpu_dma_latency refused" in text and "udev" in text for text in refused)
+
+
+def test_what_is_not_wanted_is_not_asked_for() -> None:
+    nothing = {"lock_memory": False, "hold_latency": False, "timer_slack": 0.0, "spin": 0.0}
+    settings = Settings.model_validate({"realtime": {**nothing, "freeze_collector": False}})
+    with RealTime(settings) as measures:
+        assert measures.outcomes == []
+        assert measures.events() == []
+
+
+def test_virtual_time_waits_for_nothing_and_asks_for_nothing() -> None:
+    settings = Settings.model_validate(
+        {"loop": {"clock": "virtual"}, "realtime": {"priority": 7, "cpus": (0,)}}
+    )
+    affinity = os.sched_getaffinity(0)
+    with RealTime(settings) as measures:
+        assert [outcome.text for outcome in measures.outcomes] == ["collector frozen"]
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+        assert os.sched_getaffinity(0) == affinity
+
+
+@pytest.mark.parametrize("spin", [0.0, 2e-4])
+def test_a_sleep_never_ends_early_and_the_spin_is_within_it(spin: float) -> None:
+    clock = RealClock(spin)
+    for _ in range(20):
+        deadline = clock.now() + 1e-3
+        before = time.thread_time()
+        clock.sleep_until(deadline)
+        assert clock.now() >= deadline
+        assert time.thread_time() - before < 9e-4, "the whole sleep was spent awake"
+    past = clock.now() - 1.0
+    clock.sleep_until(past)
+    assert clock.now() < past + 2.0
