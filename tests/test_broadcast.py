@@ -66,7 +66,7 @@ def test_each_topic_goes_out_on_exactly_every_nth_tick_and_seldom_on_the_same() 
     listener, _ = listened(4.0)
     ticks = listener.ticks
     assert ticks["state"] == list(range(5, 2001, 5))
-    assert ticks["tactile"] == list(range(21, 2001, 20))  # at tick 1 no frame had come
+    assert ticks["tactile"] == list(range(1, 2001, 20))
     assert ticks["look"] == list(range(2, 2001, 25))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & (set(ticks["tactile"]) | set(ticks["stats"]))
