@@ -5,8 +5,8 @@ Gauss lines in y, a line two Gauss points in x, doubled towards the rim; where t
 meets the rim more of them, in parts that shorten towards it, since there g grows like one over a
 square root. At a noise of 0.1 % of the modulus that keeps the bias it causes below a fifth of the
 noise floor up to 6° from the domain's limit, mostly far below, and below a third up to 3°, at a
-third of the cost of the forward model's integrals. Lines of many cells are gathered first and
-integrated in SIMD lanes.
+third of the cost of the forward model's integrals. Strips of many cells are gathered first and
+integrated side by side in SIMD lanes.
 """
 
 from __future__ import annotations
@@ -18,25 +18,29 @@ import numpy as np
 from kinematics.footprint import GAUSS_NODES, GAUSS_WEIGHTS, Crossings, FloatArray, IntArray
 from kinematics.kernels import fast_kernel, kernel
 
-# Planes of the packed footprint cells: share, means of g, x g, y g, variance of strain, reading,
-# weight.
+# Planes of the packed footprint cells: share, means of g, x g, y g over it, variance of strain,
+# reading, weight.
 SHARE, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
 PLANES = 7
 
-# Rows of the scratch for lines across cut cells.
-Y, CELL_X, STRIP, PART_FROM, PART, AREA, LINE_G, LINE_X, LINE_Y, LINE_SQUARE = range(10)
-LINE_ROWS = 10
-LINES_A_CELL = 5 * 6 * 4  # five strips, six lines, four parts
-LINES = 512 + LINES_A_CELL
-OWNERS = 256
+# Rows of the scratch for strips across cut cells, first what goes in: the strip's lower end and
+# length, the cell's left side, and 1 where the rim is on the cell's left, else 0. Then the ends of
+# the line at work, and the sums that come out.
+FROM, LENGTH, CELL_X, SIDE, LEFT, WIDTH, AREA, SUM_G, SUM_X, SUM_Y, SUM_SQUARE = range(11)
+STRIP_ROWS = 11
+STRIPS_A_CELL = 5
+STRIPS = 264  # at once, of each level
+OWNERS = 128
 
-# How near the rim a cell is, and where a line's parts start and how long they are by that: rows are
-# levels, then parts; first for cells with the rim on their right.
+# How near the rim a cell is, and where a line's parts end by that, counted from the rim's far side.
 COARSE, FINE, FINEST = range(3)
-_ENDS = ((0.0, 1.0, 1.0, 1.0, 1.0), (0.0, 0.5, 1.0, 1.0, 1.0), (0.0, 0.5, 0.75, 0.9, 1.0))
-_PARTS = np.diff(_ENDS, axis=1)
-PART_LENGTHS = np.stack([_PARTS, _PARTS])
-PART_STARTS = np.stack([np.array(_ENDS)[:, :4], 1.0 - np.array(_ENDS)[:, 1:]])
+LEVELS = 3
+PART_ENDS = np.array(
+    [[0.0, 1.0, 1.0, 1.0, 1.0], [0.0, 0.5, 1.0, 1.0, 1.0], [0.0, 0.5, 0.75, 0.9, 1.0]]
+)
+
+# Where the queues of strips stand in the integer scratch: strips and cells of each level.
+FILLED, WAITING = range(2)
 
 # The two-point Gauss rule on [0, 1].
 NEAR = 0.5 - 0.5 / math.sqrt(3.0)
@@ -44,59 +48,85 @@ FAR = 0.5 + 0.5 / math.sqrt(3.0)
 
 
 @fast_kernel
-def integrate_lines(
-    lines: FloatArray, count: int, u: float, v: float, w: float, a: float, pitch_x: float
+def integrate_strips(
+    strips: FloatArray,
+    count: int,
+    level: int,
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    pitch_x: float,
 ) -> None:
-    """Integrals along x over the footprint's part of each line, in SIMD lanes.
+    """Integrals over the footprint's part of each strip of ``strips`` [STRIP_ROWS, n], in lanes.
 
-    In: ``lines`` rows Y, CELL_X (the cell's left side), PART_FROM and PART of the chord that is
-    integrated, and STRIP, the line's weight. Out, times that weight: rows AREA, and the integrals
-    of g, x g, y g, face² g².
+    In: rows FROM, LENGTH, CELL_X, SIDE. Out: rows AREA, and the integrals of g, x g, y g and
+    (face g)², with the face's height over the base.
     """
     stretch = 1.0 + v * v
     e = 1.0 / stretch
     a2 = a * a
+    n = 2 * level + 2  # 2, 4, 6 lines
+    parts = 1 << level  # 1, 2, 4 parts a line
     for k in range(count):
-        y = lines[Y, k]
-        x0 = lines[CELL_X, k]
-        rim = a2 - y * y
-        q = u - w * y
-        root = math.sqrt(max(stretch * rim - q * q, 0.0))
-        # A root under the base plane is no edge: there the rim is.
-        edge = math.sqrt(max(rim, 0.0))
-        left = (v * q - root) * e
-        right = (v * q + root) * e
-        left = -edge if q < v * left else left
-        right = edge if q < v * right else right
-        left = max(left, x0)
-        right = min(right, x0 + pitch_x)
-        width = max(right - left, 0.0)
-        left += width * lines[PART_FROM, k]
-        width *= lines[PART, k]
-        xa = left + width * NEAR
-        xb = left + width * FAR
-        ga = 1.0 / math.sqrt(max(rim - xa * xa, 1e-9 * a2))
-        gb = 1.0 / math.sqrt(max(rim - xb * xb, 1e-9 * a2))
-        weight = lines[STRIP, k] * width
-        half = 0.5 * weight
-        # Under the base plane the strain stays 1.
-        ga = ga if q > v * xa else 0.0
-        gb = gb if q > v * xb else 0.0
-        face_a = (q - v * xa) * ga
-        face_b = (q - v * xb) * gb
-        lines[AREA, k] = weight
-        lines[LINE_G, k] = half * (ga + gb)
-        lines[LINE_X, k] = half * (xa * ga + xb * gb)
-        lines[LINE_Y, k] = half * y * (ga + gb)
-        lines[LINE_SQUARE, k] = half * (face_a * face_a + face_b * face_b)
+        strips[AREA, k] = 0.0
+        strips[SUM_G, k] = 0.0
+        strips[SUM_X, k] = 0.0
+        strips[SUM_Y, k] = 0.0
+        strips[SUM_SQUARE, k] = 0.0
+    for line in range(n):
+        node = GAUSS_NODES[n, line]
+        share = GAUSS_WEIGHTS[n, line]
+        for k in range(count):
+            y = strips[FROM, k] + strips[LENGTH, k] * node
+            x0 = strips[CELL_X, k]
+            rim = a2 - y * y
+            q = u - w * y
+            root = math.sqrt(max(stretch * rim - q * q, 0.0))
+            # A root under the base plane is no edge: there the rim is.
+            edge = math.sqrt(max(rim, 0.0))
+            left = (v * q - root) * e
+            right = (v * q + root) * e
+            left = -edge if q < v * left else left
+            right = edge if q < v * right else right
+            left = max(left, x0)
+            width = max(min(right, x0 + pitch_x) - left, 0.0)
+            strips[LEFT, k] = left
+            strips[WIDTH, k] = width
+            strips[AREA, k] += share * strips[LENGTH, k] * width
+        for part in range(parts):
+            start = PART_ENDS[level, part]
+            length = PART_ENDS[level, part + 1] - start
+            mirrored = 1.0 - 2.0 * start - length
+            for k in range(count):
+                y = strips[FROM, k] + strips[LENGTH, k] * node
+                rim = a2 - y * y
+                q = u - w * y
+                width = strips[WIDTH, k]
+                left = strips[LEFT, k] + width * (start + mirrored * strips[SIDE, k])
+                width *= length
+                xa = left + width * NEAR
+                xb = left + width * FAR
+                ga = 1.0 / math.sqrt(max(rim - xa * xa, 1e-9 * a2))
+                gb = 1.0 / math.sqrt(max(rim - xb * xb, 1e-9 * a2))
+                # Under the base plane the strain stays 1.
+                ga = ga if q > v * xa else 0.0
+                gb = gb if q > v * xb else 0.0
+                face_a = (q - v * xa) * ga
+                face_b = (q - v * xb) * gb
+                half = 0.5 * share * strips[LENGTH, k] * width
+                strips[SUM_G, k] += half * (ga + gb)
+                strips[SUM_X, k] += half * (xa * ga + xb * gb)
+                strips[SUM_Y, k] += half * y * (ga + gb)
+                strips[SUM_SQUARE, k] += half * (face_a * face_a + face_b * face_b)
 
 
 @kernel
 def flush(
-    lines: FloatArray,
+    strips: FloatArray,
     owners: IntArray,
-    count: int,
-    waiting: int,
+    filled: IntArray,
+    level: int,
     u: float,
     v: float,
     w: float,
@@ -105,47 +135,52 @@ def flush(
     pitch_y: float,
     packed: FloatArray,
 ) -> None:
-    """Sum the lines of the ``waiting`` cut cells into their places in ``packed``.
+    """Sum the strips of one level's cut cells into the cells' places in ``packed``; empties it.
 
-    ``owners`` [2, waiting] are each cell's place and the end of its lines.
+    ``strips`` [STRIP_ROWS, n] and ``owners`` [2, OWNERS] are the level's: each cell's place and the
+    end of its strips; ``filled`` [2] their numbers.
     """
-    integrate_lines(lines, count, u, v, w, a, pitch_x)
+    # Whole lanes: what is left of earlier strips in the last ones does no harm.
+    integrate_strips(strips, (filled[FILLED] + 7) & ~7, level, u, v, w, a, pitch_x)
     whole = 1.0 / (pitch_x * pitch_y)
-    line = 0
-    for k in range(waiting):
+    strip = 0
+    for k in range(filled[WAITING]):
         area = g = g_x = g_y = square = 0.0
-        while line < owners[1, k]:
-            area += lines[AREA, line]
-            g += lines[LINE_G, line]
-            g_x += lines[LINE_X, line]
-            g_y += lines[LINE_Y, line]
-            square += lines[LINE_SQUARE, line]
-            line += 1
+        while strip < owners[1, k]:
+            area += strips[AREA, strip]
+            g += strips[SUM_G, strip]
+            g_x += strips[SUM_X, strip]
+            g_y += strips[SUM_Y, strip]
+            square += strips[SUM_SQUARE, strip]
+            strip += 1
         place = owners[0, k]
-        area *= whole
-        if area > 1e-9:
-            g *= whole
-            g_x *= whole
-            g_y *= whole
+        share = area * whole
+        if share > 1e-9:
+            per_area = 1.0 / area
+            g *= per_area
+            g_x *= per_area
+            g_y *= per_area
             face = u * g - v * g_x - w * g_y
-            packed[SHARE, place] = area
+            packed[SHARE, place] = share
             packed[PLAIN, place] = g
             packed[ALONG_X, place] = g_x
             packed[ALONG_Y, place] = g_y
             # The strain's variance is that of the face's height times g.
-            packed[VARIANCE, place] = (square * whole - face * face / area) / area
+            packed[VARIANCE, place] = square * per_area - face * face
         else:
-            packed[SHARE, place] = 1.0
+            packed[SHARE, place] = 0.0
             packed[PLAIN, place] = 0.0
             packed[ALONG_X, place] = 0.0
             packed[ALONG_Y, place] = 0.0
             packed[VARIANCE, place] = 0.0
             packed[WEIGHT, place] = 0.0
+    filled[FILLED] = 0
+    filled[WAITING] = 0
 
 
 @kernel
-def push_lines(
-    lines: FloatArray,
+def push_strips(
+    strips: FloatArray,
     count: int,
     x0: float,
     y0: float,
@@ -153,12 +188,11 @@ def push_lines(
     low: float,
     high: float,
     crossings: Crossings,
-    level: int,
 ) -> int:
-    """Cut a cell into strips where the outline crosses its sides; adds the strips' lines.
+    """Cut a cell into strips where the outline crosses its sides; their number with the new ones.
 
     ``low``, ``high`` bound the footprint in y; ``crossings`` are the four y where the outline
-    crosses the cell's left and right side. ``level`` says how near the rim the cell is.
+    crosses the cell's left and right side.
     """
     start = max(y0, low)
     stop = min(y1, high)
@@ -173,22 +207,15 @@ def push_lines(
     b0, b2 = min(b0, b2), max(b0, b2)
     b1, b3 = min(b1, b3), max(b1, b3)
     b1, b2 = min(b1, b2), max(b1, b2)
-    ends = (b0, b1, b2, b3, stop)
-    n = 2 * level + 2  # 2, 4, 6 lines a strip
-    parts = 1 << level  # 1, 2, 4 parts a line
-    side = 1 if x0 < 0.0 else 0
-    for piece in range(5):
-        length = ends[piece] - start
-        if length > 1e-6 * (y1 - y0):
-            for k in range(n):
-                y = start + length * GAUSS_NODES[n, k]
-                weight = length * GAUSS_WEIGHTS[n, k]
-                for m in range(parts):
-                    lines[Y, count] = y
-                    lines[CELL_X, count] = x0
-                    lines[STRIP, count] = weight
-                    lines[PART_FROM, count] = PART_STARTS[side, level, m]
-                    lines[PART, count] = PART_LENGTHS[side, level, m]
-                    count += 1
-            start = ends[piece]
+    side = 1.0 if x0 < 0.0 else 0.0
+    least = 1e-6 * (y1 - y0)
+    for end in (b0, b1, b2, b3, stop):
+        strips[FROM, count] = start
+        strips[LENGTH, count] = end - start
+        strips[CELL_X, count] = x0
+        strips[SIDE, count] = side
+        # Written anyway, and kept if it's worth it: no branch that can't be foreseen.
+        kept = end - start > least
+        count += 1 if kept else 0
+        start = end if kept else start
     return count

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from kinematics import ladder
 from kinematics.cells import CELL_PLANES, LIVE, face_integrals
 from kinematics.contact import Fingertip
-from kinematics.cut_cells import LINE_ROWS, LINES, OWNERS, PLANES
-from kinematics.footprint import FloatArray, Geometry, IntArray
-from kinematics.likelihood import SUMS, cubic_law
+from kinematics.footprint import FloatArray, IntArray
+from kinematics.likelihood import fit_law
 from kinematics.material import Material
+from kinematics.middles import cell_middles
 from kinematics.moments import moment_ratios
 from kinematics.pressure import SensorGrid
+from kinematics.workspace import INTEGERS, floats_needed
 
 
 @dataclass(slots=True)
@@ -137,13 +138,16 @@ class ContactEstimator:
         self._quantum = quantum
         self._cells = np.zeros((rows, CELL_PLANES, cols))
         face_integrals(geometry, self._cells)
-        self._cells[:, LIVE] = 1.0 if live is None else np.asarray(live, dtype=bool)
+        alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
+        self._cells[:, LIVE] = alive
+        middles, bounds = cell_middles(geometry, alive, tip.radius)
         self._tables = np.concatenate(
-            [moment_ratios(tip, material).ravel(), cubic_law(material.law).ravel()]
+            [moment_ratios(tip, material).ravel(), fit_law(material.law).ravel()]
         )
-        self._integers = np.zeros(2 * rows + 2 * OWNERS, dtype=np.int64)
-        self._integers[: 2 * rows] = _disc_runs(geometry, rows, cols).ravel()
-        self._floats = np.zeros(SUMS + 22 + 2 * cols + LINE_ROWS * LINES + PLANES * rows * cols)
+        self._integers = np.zeros(INTEGERS, dtype=np.int64)
+        self._integers[: len(bounds)] = bounds
+        self._floats = np.zeros(floats_needed(rows, cols))
+        self._floats[: middles.size] = middles.ravel()
         plan = np.zeros(ladder.OPTIONS)
         plan[:5] = geometry
         plan[ladder.NOISE] = noise
@@ -210,10 +214,17 @@ class ContactEstimator:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
         """What :func:`kinematics.ladder.estimate_frame` takes behind the frame and its scale.
 
-        For callers that are compiled themselves. Options, cells, tables, state, scratch, integers;
+        For callers that are compiled themselves. Options, cells, tables, state, floats, integers;
         the arrays are the estimator's own. Saturation is as for the last frame of :meth:`update`.
         """
-        return self._plan, self._cells, self._tables, self._state, self._floats, self._integers
+        return (
+            self._plan,
+            self._cells,
+            self._tables,
+            self._state,
+            self._floats,
+            self._integers,
+        )
 
     def _run(self, frame: NDArray[Any], pascal_per_count: float) -> None:
         full = _FULL.get(frame.dtype) if isinstance(frame, np.ndarray) else None
@@ -231,12 +242,7 @@ class ContactEstimator:
             self._frame,
             float(pascal_per_count),
             self._quantum if full == math.inf else float(pascal_per_count),
-            self._plan,
-            self._cells,
-            self._tables,
-            self._state,
-            self._floats,
-            self._integers,
+            *self.compiled_arguments(),
         )
 
     def _tell(self, result: ContactEstimate) -> ContactEstimate:
@@ -255,19 +261,3 @@ class ContactEstimator:
         result.rejected = int(state[ladder.REJECTED])
         result.second = state[ladder.SECOND] > 0.0
         return result
-
-
-def _disc_runs(geometry: Geometry, rows: int, cols: int) -> IntArray:
-    """Columns (first, last + 1) of each row's cells that the tip's disc touches [rows, 2]."""
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    runs = np.zeros((rows, 2), dtype=np.int64)
-    for i in range(rows):
-        y0 = y_first + i * pitch_y
-        y1 = y0 + pitch_y
-        nearest = 0.0 if y0 * y1 <= 0.0 else min(abs(y0), abs(y1))
-        if nearest < a:
-            half = math.sqrt(a * a - nearest * nearest)
-            first = min(max(math.floor((-half - x_first) / pitch_x), 0), cols)
-            last = min(max(math.ceil((half - x_first) / pitch_x), first), cols)
-            runs[i] = first, last
-    return runs

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.kernels import kernel
+from kinematics.kernels import fast_kernel, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -79,6 +79,38 @@ def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
     if q < v * right:
         right = math.sqrt(rim)
     return left, right
+
+
+@fast_kernel
+def line_spans(
+    u: float,
+    v: float,
+    w: float,
+    a: float,
+    start: float,
+    pitch: float,
+    first: int,
+    last: int,
+    left: FloatArray,
+    right: FloatArray,
+) -> None:
+    """:func:`line_span` on the lines y = start + k pitch, k = first..last, into left and right."""
+    stretch = 1.0 + v * v
+    e = 1.0 / stretch
+    for k in range(first, last + 1):
+        y = start + k * pitch
+        rim = a * a - y * y
+        q = u - w * y
+        square = stretch * rim - q * q
+        root = math.sqrt(max(square, 0.0))
+        edge = math.sqrt(max(rim, 0.0))
+        near = (v * q - root) * e
+        far = (v * q + root) * e
+        near = -edge if (q < v * near) | (square <= 0.0) else near
+        far = edge if (q < v * far) | (square <= 0.0) else far
+        none = (rim <= 0.0) | ((square <= 0.0) & (q >= 0.0))
+        left[k] = math.inf if none else near
+        right[k] = -math.inf if none else far
 
 
 @kernel
@@ -143,14 +175,15 @@ def band_columns(
             outer_right = ends[5]
     if not outer_left < outer_right:
         return 0, 0, 0, 0
-    first = min(max(math.floor((outer_left - x_first) / pitch_x), 0), cols)
-    last = min(max(math.ceil((outer_right - x_first) / pitch_x), first), cols)
+    per_pitch = 1.0 / pitch_x
+    first = min(max(math.floor((outer_left - x_first) * per_pitch), 0), cols)
+    last = min(max(math.ceil((outer_right - x_first) * per_pitch), first), cols)
     inner_left = max(below[0], above[0])
     inner_right = min(below[1], above[1])
     if not inner_left < inner_right:
         return first, last, last, last
-    inner_first = max(math.ceil((inner_left - x_first) / pitch_x), first)
-    inner_last = min(math.floor((inner_right - x_first) / pitch_x), last)
+    inner_first = max(math.ceil((inner_left - x_first) * per_pitch), first)
+    inner_last = min(math.floor((inner_right - x_first) * per_pitch), last)
     if inner_first >= inner_last:
         return first, last, last, last
     return first, inner_first, inner_last, last

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
+from kinematics.cut_cells import LEVELS, OWNERS, PLANES, STRIP_ROWS, STRIPS
 from kinematics.footprint import FloatArray, Geometry, IntArray, plane
 from kinematics.kernels import kernel
-from kinematics.likelihood import SUMS, accumulate, footprint_energy, pack
+from kinematics.likelihood import accumulate, footprint_energy, is_bent
+from kinematics.packing import pack
+from kinematics.workspace import GRID, INTEGERS, INVERSE, OWNED, QUEUES, STEP, SUMS, WORK
 
 # Places in what a fit leaves in ``result``.
 D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)
@@ -22,18 +23,25 @@ RESULT = 8
 
 @kernel
 def solve(
-    sums: FloatArray, gain: float, free: bool, step: FloatArray, inverse: FloatArray
+    sums: FloatArray,
+    gain: float,
+    free: bool,
+    step: FloatArray,
+    inverse: FloatArray,
+    work: FloatArray,
 ) -> tuple[bool, float]:
     """Gauss-Newton step in (gain, u, v, w), the inverse normal matrix, (solvable, decrement).
 
     ``sums`` are :func:`kinematics.likelihood.accumulate`'s. Without a ``free`` gain its row is left
     out. The decrement is the fall of the sum of squares that the step promises. Not solvable where
     a pivot of the scaled matrix is below 1e-11: the frame doesn't determine every parameter.
+    ``work`` [40] is scratch.
     """
     first = 0 if free else 1
-    matrix = np.empty((4, 4))
-    right = np.empty(4)
-    scale = np.empty(4)
+    matrix = work[:16].reshape(4, 4)
+    lower = work[16:32].reshape(4, 4)
+    right = work[32:36]
+    scale = work[36:40]
     factor = (1.0, -gain, gain, gain)
     k = 0
     for i in range(4):
@@ -49,7 +57,7 @@ def solve(
         for j in range(first, i + 1):
             matrix[i, j] *= scale[i] * scale[j]
     # Cholesky in the lower triangle, its inverse in ``lower``.
-    lower = np.zeros((4, 4))
+    lower[:] = 0.0
     for j in range(first, 4):
         pivot = matrix[j, j]
         for k in range(first, j):
@@ -94,27 +102,25 @@ def covariance_of(
     """
     n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
     cube = n_z * n_z * n_z
-    jacobian = np.zeros((4, 4))
-    half = np.zeros((4, 4))
-    # d = a − u n_z, n_x = v n_z, n_y = w n_z, ∂n_z/∂v = −v n_z³.
-    jacobian[0, 1] = -n_z
-    jacobian[0, 2] = u * v * cube
-    jacobian[0, 3] = u * w * cube
-    jacobian[1, 2] = n_z - v * v * cube
-    jacobian[1, 3] = -v * w * cube
-    jacobian[2, 2] = -v * w * cube
-    jacobian[2, 3] = n_z - w * w * cube
-    jacobian[3, 0] = 1.0
-    for i in range(4):
-        for j in range(4):
-            for k in range(4):
-                half[i, j] += jacobian[i, k] * inverse[k, j]
-    for i in range(4):
-        for j in range(4):
-            value = 0.0
-            for k in range(4):
-                value += half[i, k] * jacobian[j, k]
-            out[4 * i + j] = value * variance
+    # d = a − u n_z, n_x = v n_z, n_y = w n_z, ∂n_z/∂v = −v n_z³. Rows by (u, v, w).
+    rows = (
+        (-n_z, u * v * cube, u * w * cube),
+        (0.0, n_z - v * v * cube, -v * w * cube),
+        (0.0, -v * w * cube, n_z - w * w * cube),
+    )
+    for i in range(3):
+        p, q, r = rows[i]
+        # One row of the Jacobian times the matrix.
+        by_gain = p * inverse[1, 0] + q * inverse[2, 0] + r * inverse[3, 0]
+        by_u = p * inverse[1, 1] + q * inverse[2, 1] + r * inverse[3, 1]
+        by_v = p * inverse[1, 2] + q * inverse[2, 2] + r * inverse[3, 2]
+        by_w = p * inverse[1, 3] + q * inverse[2, 3] + r * inverse[3, 3]
+        for j in range(3):
+            x, y, z = rows[j]
+            out[4 * i + j] = (by_u * x + by_v * y + by_w * z) * variance
+        out[4 * i + 3] = by_gain * variance
+        out[12 + i] = by_gain * variance
+    out[15] = inverse[0, 0] * variance
 
 
 @kernel
@@ -134,9 +140,7 @@ def fit(
     tolerance: float,
     iterations: int,
     floats: FloatArray,
-    owners: IntArray,
-    packed: FloatArray,
-    lines: FloatArray,
+    integers: IntArray,
     result: FloatArray,
     covariance: FloatArray,
 ) -> bool:
@@ -147,15 +151,27 @@ def fit(
     ``clipped``: cells can't read below 0. ``energy`` and ``number`` are Σ p² [Pa²] and the number
     of the live cells in the tip's disc. Stops when the promised decrement
     is below ``tolerance`` · variance, that is the step is that part of the noise floor, squared.
+    ``floats`` and ``integers`` are scratch, see workspace.py.
     RESIDUAL takes Σ over the footprint of (reading − model)² − reading² [Pa²]. False when the
     frame doesn't determine the contact or the iteration doesn't settle.
     """
     a = geometry[0]
-    cols = frame.shape[1]
-    sums = floats[:SUMS]
-    step = floats[SUMS : SUMS + 4]
-    inverse = floats[SUMS + 4 : SUMS + 20].reshape(4, 4)
-    columns = floats[SUMS + 20 : SUMS + 22 + 2 * cols].reshape(cols + 1, 2)
+    rows, cols = frame.shape
+    sums = floats[SUMS:STEP]
+    step = floats[STEP:INVERSE]
+    inverse = floats[INVERSE:WORK].reshape(4, 4)
+    work = floats[WORK:GRID]
+    at = GRID
+    columns = floats[at : at + 2 * (cols + 1)].reshape(2, cols + 1)
+    at += 2 * (cols + 1)
+    lines = floats[at : at + 2 * (rows + 1)].reshape(2, rows + 1)
+    at += 2 * (rows + 1)
+    strips = floats[at : at + LEVELS * STRIP_ROWS * STRIPS].reshape(LEVELS, STRIP_ROWS, STRIPS)
+    at += LEVELS * STRIP_ROWS * STRIPS
+    packed = floats[at : at + PLANES * rows * cols].reshape(PLANES, rows * cols)
+    queues = integers[QUEUES:OWNED].reshape(LEVELS, 2)
+    owners = integers[OWNED:INTEGERS].reshape(LEVELS, 2, OWNERS)
+    bent = is_bent(law)
     u, v, w = plane(a, result[D], result[N_X], result[N_Y])
     gain = result[GAIN]
     cost = math.inf
@@ -163,7 +179,22 @@ def fit(
     halvings = 0
     solved = False
     for iteration in range(iterations):
-        count = pack(u, v, w, geometry, cells, frame, scale, columns, lines, owners, packed)
+        count = pack(
+            u,
+            v,
+            w,
+            geometry,
+            cells,
+            frame,
+            scale,
+            bent,
+            columns,
+            lines,
+            strips,
+            queues,
+            owners,
+            packed,
+        )
         clip = 0.0
         if clipped:
             # Free cells that end at 0 show half of the noise's variance; where a board sends no
@@ -184,7 +215,7 @@ def fit(
             halvings += 1
             continue
         cost = now
-        solved, decrement = solve(sums, gain, free, step, inverse)
+        solved, decrement = solve(sums, gain, free, step, inverse, work)
         if not solved:
             return False
         before = (u, v, w, gain)

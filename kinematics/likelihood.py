@@ -9,48 +9,16 @@ integrated (cut_cells.py). The outline adds no derivative of its own, as σ is 0
 
 from __future__ import annotations
 
-import math
+from typing import TypeAlias
 
 import numpy as np
 
-from kinematics.cells import (
-    LIVE,
-    PLAIN_MEAN,
-    PLAIN_VAR,
-    PLAIN_X,
-    PLAIN_Y,
-    X_MEAN,
-    X_VAR,
-    X_Y,
-    Y_MEAN,
-    Y_VAR,
-)
-from kinematics.cut_cells import (
-    ALONG_X,
-    ALONG_Y,
-    COARSE,
-    FINE,
-    FINEST,
-    LINES_A_CELL,
-    PLAIN,
-    READING,
-    SHARE,
-    VARIANCE,
-    WEIGHT,
-    flush,
-    push_lines,
-)
-from kinematics.footprint import (
-    FloatArray,
-    Geometry,
-    IntArray,
-    band_columns,
-    extremes,
-    line_span,
-)
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.cut_cells import ALONG_X, ALONG_Y, PLAIN, READING, SHARE, VARIANCE, WEIGHT
+from kinematics.footprint import FloatArray
+from kinematics.kernels import fast_kernel, inlined_kernel, kernel
 
 SUMS = 17
+Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 
 # A cell that can't read below 0 reads more than the pressure on average, by E[max(z + e, 0)] − z
 # standard deviations at a pressure of z, e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this
@@ -58,15 +26,21 @@ SUMS = 17
 CLIP_END = 3.5
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 LAW_PIECES = 128
+POLYNOMIAL = 8
 
 
-def cubic_law(law: FloatArray) -> FloatArray:
-    """Any material's law as LAW_PIECES cubics [pieces + 1, 4] of value, slope at the pieces' ends.
+def fit_law(law: FloatArray) -> FloatArray:
+    """Any material's law in one of two forms, float64 [n, 4].
 
-    Piece k holds the coefficients of t = ε·pieces − k. Within 1e-9 of a smooth law; the last row
-    continues it linearly.
+    A law of one polynomial of at most POLYNOMIAL terms has n = 2: its coefficients in ε, the lowest
+    first. Any other becomes LAW_PIECES cubics by value and slope at the pieces' ends, within 1e-9
+    of a smooth law: row k holds the coefficients of t = ε·pieces − k.
     """
     pieces, order = law.shape
+    if pieces == 1 and order <= POLYNOMIAL:
+        polynomial = np.zeros(POLYNOMIAL)
+        polynomial[:order] = law[0]
+        return polynomial.reshape(2, 4)
     strain = np.linspace(0.0, 1.0, LAW_PIECES + 1)
     index = np.minimum((strain * pieces).astype(int), pieces - 1)
     t = strain * pieces - index
@@ -86,113 +60,14 @@ def cubic_law(law: FloatArray) -> FloatArray:
 
 
 @kernel
-def pack(
-    u: float,
-    v: float,
-    w: float,
-    geometry: Geometry,
-    cells: FloatArray,
-    frame: FloatArray,
-    scale: float,
-    columns: FloatArray,
-    lines: FloatArray,
-    owners: IntArray,
-    packed: FloatArray,
-) -> int:
-    """Gather the footprint's cells into ``packed`` [PLANES, n]; returns n.
-
-    ``cells`` [rows, CELL_PLANES, cols] is what :func:`kinematics.cells.face_integrals` gives;
-    ``columns`` [cols + 1, 2], ``lines`` and ``owners`` are scratch, see :class:`Scratch`.
-    """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    rows, cols = frame.shape
-    ends = extremes(u, v, w, a)
-    if not ends[0] < ends[1]:
-        return 0
-    first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
-    last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), first_row), rows)
-    j0 = min(max(math.floor((ends[3] - x_first) / pitch_x), 0), cols)
-    j1 = min(max(math.ceil((ends[5] - x_first) / pitch_x), j0), cols)
-    for j in range(j0, j1 + 1):
-        columns[j, 0], columns[j, 1] = line_span(u, w, v, a, x_first + j * pitch_x)
-    capacity = lines.shape[1] - LINES_A_CELL
-    # The outline's lowest point over the base plane: where it comes near to the rim.
-    cosine2 = 1.0 / (1.0 + v * v + w * w)
-    rho2 = max(a * a - u * u * cosine2, 0.0)
-    low = u * cosine2 - math.sqrt(rho2 * (1.0 - cosine2)) < 0.2 * a
-    count = 0
-    line = 0
-    waiting = 0
-    above = line_span(u, v, w, a, y_first + first_row * pitch_y)
-    for i in range(first_row, last_row):
-        y0 = y_first + i * pitch_y
-        y1 = y0 + pitch_y
-        below = above
-        above = line_span(u, v, w, a, y1)
-        first, inner_first, inner_last, last = band_columns(
-            u, v, w, a, ends, below, above, y0, y1, x_first, pitch_x, cols
-        )
-        first = max(first, j0)
-        last = min(last, j1)
-        y_far = max(-y0, y1)
-        for side in range(2):
-            begin = first if side == 0 else max(inner_last, first)
-            stop = min(inner_first, last) if side == 0 else last
-            for j in range(begin, stop):
-                x0 = x_first + j * pitch_x
-                x_far = max(-x0, x0 + pitch_x)
-                far2 = x_far * x_far + y_far * y_far
-                level = COARSE
-                if far2 > 0.81 * a * a:
-                    level = FINEST if low and far2 > 0.97 * a * a else FINE
-                crossings = (columns[j, 0], columns[j, 1], columns[j + 1, 0], columns[j + 1, 1])
-                line = push_lines(lines, line, x0, y0, y1, ends[0], ends[1], crossings, level)
-                live = cells[i, LIVE, j]
-                packed[READING, count] = frame[i, j] * scale if live > 0.0 else 0.0
-                packed[WEIGHT, count] = live
-                owners[0, waiting] = count
-                owners[1, waiting] = line
-                waiting += 1
-                count += 1
-                if line > capacity or waiting == owners.shape[1]:
-                    flush(lines, owners, line, waiting, u, v, w, a, pitch_x, pitch_y, packed)
-                    line = 0
-                    waiting = 0
-        n = inner_last - inner_first
-        if n > 0:
-            copy_whole(
-                cells[i, :, inner_first:inner_last],
-                frame[i, inner_first:inner_last],
-                scale,
-                u,
-                v,
-                w,
-                packed[:, count : count + n],
-            )
-            count += n
-    flush(lines, owners, line, waiting, u, v, w, a, pitch_x, pitch_y, packed)
-    return count
-
-
-@fast_kernel
-def copy_whole(
-    cells: FloatArray, row: FloatArray, scale: float, u: float, v: float, w: float, out: FloatArray
-) -> None:
-    """Whole cells of one row, planes ``cells`` and readings ``row``, into ``out`` [PLANES, n]."""
-    for k in range(row.shape[0]):
-        out[SHARE, k] = 1.0
-        out[PLAIN, k] = cells[PLAIN_MEAN, k]
-        out[ALONG_X, k] = cells[X_MEAN, k]
-        out[ALONG_Y, k] = cells[Y_MEAN, k]
-        out[VARIANCE, k] = (
-            u * (u * cells[PLAIN_VAR, k] - 2.0 * (v * cells[PLAIN_X, k] + w * cells[PLAIN_Y, k]))
-            + v * (v * cells[X_VAR, k] + 2.0 * w * cells[X_Y, k])
-            + w * w * cells[Y_VAR, k]
-        )
-        reading = row[k]
-        live = cells[LIVE, k]
-        out[READING, k] = reading * scale if live > 0.0 else 0.0
-        out[WEIGHT, k] = live
+def is_bent(law: FloatArray) -> bool:
+    """Whether a law as :func:`fit_law` gives it is curved, so that the strain's variance counts."""
+    if law.shape[0] != 2:
+        return True
+    bent = False
+    for k in range(2, POLYNOMIAL):
+        bent |= law[k // 4, k % 4] != 0.0
+    return bent
 
 
 @fast_kernel
@@ -205,6 +80,45 @@ def footprint_energy(packed: FloatArray, count: int) -> tuple[float, float]:
         energy += weight * packed[READING, k] * packed[READING, k]
         number += weight
     return energy, number
+
+
+@inlined_kernel
+def _polynomial(c: Eight, strain: float) -> tuple[float, float, float]:
+    """A polynomial, its slope and half its second derivative."""
+    value, slope, half = c[7], 0.0, 0.0
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[6]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[5]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[4]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[3]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[2]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[1]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[0]
+    return value, slope, half
+
+
+@inlined_kernel
+def _compared(
+    stress: float,
+    gain: float,
+    reading: float,
+    saturation: float,
+    floor: float,
+    clip: float,
+    clipped: bool,
+) -> tuple[float, float, float]:
+    """(reading − model, the model's response to pressure, 1 for a cell that counts)."""
+    model = gain * stress
+    residual = max(reading, floor) - model
+    response = 1.0
+    if clipped:
+        z = min(model * (1.0 / clip), CLIP_END)
+        above = 1.0 - z * (1.0 / CLIP_END)
+        base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
+        rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
+        residual -= clip * above * above * base
+        response = 1.0 + above * (above * rise - (2.0 / CLIP_END) * base)
+    counts = ((reading < saturation) | (model < saturation)) & (model >= floor)
+    return residual, response, 1.0 if counts else 0.0
 
 
 @fast_kernel
@@ -230,41 +144,44 @@ def accumulate(
     sends 0 for it, and no reading is less; −inf for none. ``clip`` > 0 is the noise of cells that
     can't read below 0 [Pa].
     """
-    pieces = law.shape[0] - 1
-    clipped = 1.0 if clip > 0.0 else 0.0
-    per_clip = 1.0 / clip if clip > 0.0 else 0.0
+    # Neither changes within the loop, of which the compiler makes four.
+    polynomial = law.shape[0] == 2
+    clipped = clip > 0.0
+    c = (law[0, 0], law[0, 1], law[0, 2], law[0, 3], law[1, 0], law[1, 1], law[1, 2], law[1, 3])
     s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
     r0 = r1 = r2 = r3 = rr = yy = ww = 0.0
     for k in range(count):
-        share = packed[0, k]
-        g = packed[1, k]
-        g_x = packed[2, k]
-        g_y = packed[3, k]
-        t = (1.0 - (u * g - v * g_x - w * g_y) / share) * pieces
-        t = min(max(t, 0.0), float(pieces))
-        piece = np.int32(t)
-        t -= piece
-        c1 = law[piece, 1]
-        c2 = law[piece, 2]
-        c3 = law[piece, 3]
-        stress = law[piece, 0] + t * (c1 + t * (c2 + t * c3))
-        slope = (c1 + t * (2.0 * c2 + t * 3.0 * c3)) * pieces
-        bend = (2.0 * c2 + 6.0 * t * c3) * pieces * pieces
-        stress = share * (stress + 0.5 * bend * packed[4, k])
-        reading = packed[5, k]
-        weight = packed[6, k]
-        model = gain * stress
-        z = min(model * per_clip, CLIP_END)
-        above = 1.0 - z / CLIP_END
-        base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
-        rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
-        residual = max(reading, floor) - model - clip * above * above * base
-        response = 1.0 + clipped * above * (above * rise - 2.0 / CLIP_END * base)
-        full = (reading >= saturation and model >= saturation) or model < floor
-        squares = weight * reading * reading
-        weight = 0.0 if full else weight
-        stress *= response
-        slope *= response
+        # Arrays are read here alone: a function that took one would keep the loop out of lanes.
+        share = packed[SHARE, k]
+        g = packed[PLAIN, k]
+        g_x = packed[ALONG_X, k]
+        g_y = packed[ALONG_Y, k]
+        strain = min(max(1.0 - (u * g - v * g_x - w * g_y), 0.0), 1.0)
+        if polynomial:
+            stress, slope, half = _polynomial(c, strain)
+        else:
+            t = strain * LAW_PIECES
+            piece = np.int32(t)
+            t -= piece
+            c1 = law[piece, 1]
+            c2 = law[piece, 2]
+            c3 = law[piece, 3]
+            stress = law[piece, 0] + t * (c1 + t * (c2 + t * c3))
+            slope = (c1 + t * (2.0 * c2 + t * 3.0 * c3)) * LAW_PIECES
+            half = (c2 + 3.0 * t * c3) * (LAW_PIECES * LAW_PIECES)
+        # From a strain of 1 on the stress stays, and what varies there doesn't show.
+        half = half if strain < 1.0 else 0.0
+        stress = share * (stress + half * packed[VARIANCE, k])
+        slope *= share
+        reading = packed[READING, k]
+        residual, response, counts = _compared(
+            stress, gain, reading, saturation, floor, clip, clipped
+        )
+        squares = packed[WEIGHT, k] * reading * reading
+        weight = packed[WEIGHT, k] * counts
+        if clipped:
+            stress *= response
+            slope *= response
         a1 = slope * g
         a2 = slope * g_x
         a3 = slope * g_y

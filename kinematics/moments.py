@@ -16,19 +16,16 @@ import math
 import numpy as np
 
 from kinematics.activity import neighbourhood
-from kinematics.cells import LIVE
 from kinematics.contact import Fingertip
-from kinematics.footprint import (
-    FloatArray,
-    Geometry,
-    IntArray,
-    band_columns,
-    extremes,
-    line_span,
-    plane,
-)
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.footprint import FloatArray, Geometry, IntArray, extremes, plane
+from kinematics.kernels import kernel
+from kinematics.lanes import address
 from kinematics.material import Material
+from kinematics.middles import FIRST, LAST, X, Y, next_above, sums_above, sums_inside
+
+# How much wider than the footprint the cells' middles are looked for, in a cell's diagonals: so all
+# that touch it are in, even where the contact moved a little.
+_MARGIN = 0.75
 
 RATIO_POINTS = 33
 RATIO_END = 0.8  # of the radius
@@ -83,122 +80,95 @@ def _ratio(ratios: FloatArray, a: float, d: float, column: int) -> float:
     return float(ratios[k, column] * (1.0 - t) + ratios[k + 1, column] * t)
 
 
-@fast_kernel
-def _row_moments(
-    row: FloatArray, live: FloatArray, level: float
-) -> tuple[float, float, float, float]:
-    """Σp, Σp k, Σp k² and the number of live cells of a row's part with p > level."""
-    s0 = 0.0
-    s1 = 0.0
-    s2 = 0.0
-    n = 0.0
-    for k in range(row.shape[0]):
-        value = row[k]
-        weight = live[k]
-        weight = weight if value > level else 0.0
-        value = value if weight > 0.0 else 0.0
-        x = float(k)
-        s0 += value
-        s1 += value * x
-        s2 += value * x * x
-        n += weight
-    return s0, s1, s2, n
-
-
-@kernel
-def row_moments(
-    frame: FloatArray, cells: FloatArray, i: int, first: int, last: int, level: float
-) -> tuple[float, float, float, float]:
-    """Σp, Σp j, Σp j² and the number of live cells first..last of row i with p > level."""
-    s0, s1, s2, n = _row_moments(frame[i, first:last], cells[i, LIVE, first:last], level)
-    return s0, s1 + first * s0, s2 + first * (2.0 * s1 + first * s0), n
-
-
 @kernel
 def footprint_moments(
-    frame: FloatArray, cells: FloatArray, geometry: Geometry, u: float, v: float, w: float
+    frame: FloatArray,
+    middles: FloatArray,
+    bounds: IntArray,
+    geometry: Geometry,
+    u: float,
+    v: float,
+    w: float,
 ) -> tuple[float, float, float, float, float]:
-    """(Σp, centroid x, y, trace of the covariance, cells) over the cells that touch the footprint.
+    """(Σp, centroid x, y, trace of the covariance, cells) over the cells that the face presses.
 
-    Lengths in m from the tip's centre, the cells' own variance pitch²/12 already taken off.
+    Those whose middle lies in the footprint of (u, v, w). Lengths in m from the tip's centre, the
+    cells' own variance pitch²/12 already taken off.
     """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
+    a, _, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape
+    total = sum_x = sum_y = square = number = 0.0
     ends = extremes(u, v, w, a)
-    total = sum_x = sum_y = sum_xx = sum_yy = number = 0.0
     if ends[0] < ends[1]:
+        # Only the rows of the footprint's box.
         first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
         last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), first_row), rows)
-        above = line_span(u, v, w, a, y_first + first_row * pitch_y)
-        for i in range(first_row, last_row):
-            y0 = y_first + i * pitch_y
-            below = above
-            above = line_span(u, v, w, a, y0 + pitch_y)
-            first, _, _, last = band_columns(
-                u, v, w, a, ends, below, above, y0, y0 + pitch_y, x_first, pitch_x, cols
-            )
-            s0, s1, s2, n = row_moments(frame, cells, i, first, last, -math.inf)
-            total += s0
-            sum_x += s1
-            sum_xx += s2
-            sum_y += s0 * i
-            sum_yy += s0 * (i * i)
-            number += n
+        total, sum_x, sum_y, square, number = sums_inside(
+            address(frame),
+            address(middles),
+            rows * cols,
+            max(first_row * cols, bounds[FIRST]),
+            min(last_row * cols, bounds[LAST]),
+            u,
+            v,
+            w,
+        )
     if not total > 0.0:
         return 0.0, 0.0, 0.0, 0.0, number
-    mean_x = sum_x / total
-    mean_y = sum_y / total
-    return (
-        total,
-        x_first + pitch_x * (mean_x + 0.5),
-        y_first + pitch_y * (mean_y + 0.5),
-        pitch_x * pitch_x * (sum_xx / total - mean_x * mean_x - 1.0 / 12.0)
-        + pitch_y * pitch_y * (sum_yy / total - mean_y * mean_y - 1.0 / 12.0),
-        number,
-    )
+    x = sum_x / total
+    y = sum_y / total
+    own = (pitch_x * pitch_x + pitch_y * pitch_y) / 12.0
+    return total, x, y, square / total - x * x - y * y - own, number
 
 
 @kernel
-def from_extent(a: float, trace: float, reach: float, ratios: FloatArray) -> float:
-    """d from the trace of the pressure's covariance and the centroid's distance ``reach``."""
-    d = 2.0 * a - math.sqrt(max(4.0 * a * a - 6.0 * max(trace, 0.0), a * a))
-    for _ in range(6):
+def from_extent(a: float, trace: float, reach: float, ratios: FloatArray, start: float) -> float:
+    """d from the trace of the pressure's covariance and the centroid's distance ``reach``.
+
+    Newton's iteration from d = ``start``, to 1e-9 of the radius.
+    """
+    d = min(max(start, 0.01 * a), 0.9 * a)
+    for _ in range(8):
         s = min(reach / (_ratio(ratios, a, d, 1) * (a - d / 3.0)), 0.95)
         slope = (4.0 * a - 2.0 * d) / 6.0 - s * s * (12.0 * a - 10.0 * d) / 36.0
         miss = closed_trace(a, d, s) - trace / _ratio(ratios, a, d, 2)
+        before = d
         d = min(max(d - miss / slope, 0.0), 0.95 * a)
+        if abs(d - before) < 1e-9 * a:
+            break
     return d
 
 
 @kernel
 def coarse(
     frame: FloatArray,
-    cells: FloatArray,
+    middles: FloatArray,
+    bounds: IntArray,
     geometry: Geometry,
-    runs: IntArray,
     level: float,
     row: int,
     col: int,
 ) -> tuple[float, float, float]:
-    """(d, n_x, n_y) from the cells above ``level`` in the tip's disc: their centroid and number."""
-    total = sum_x = sum_y = number = 0.0
-    for i in range(frame.shape[0]):
-        s0, s1, _, n = row_moments(frame, cells, i, runs[i, 0], runs[i, 1], level)
-        total += s0
-        sum_x += s1
-        sum_y += s0 * i
-        number += n
+    """(d, n_x, n_y) from the cells above ``level``: their centroid and number.
+
+    (row, col) is the largest cell, taken where there is no other.
+    """
+    rows, cols = frame.shape
+    total, sum_x, sum_y, number = sums_above(
+        address(frame), address(middles), rows * cols, bounds[FIRST], bounds[LAST], level
+    )
     if not total > 0.0:
-        total, sum_x, sum_y, number = 1.0, float(col), float(row), 1.0
+        at = row * cols + col
+        total, sum_x, sum_y, number = 1.0, middles[X, at], middles[Y, at], 1.0
     return _from_area(geometry, sum_x / total, sum_y / total, number)
 
 
 @kernel
 def coarse_weak(
     frame: FloatArray,
-    cells: FloatArray,
+    middles: FloatArray,
+    bounds: IntArray,
     geometry: Geometry,
-    runs: IntArray,
     level: float,
     patch_level: float,
     row: int,
@@ -206,36 +176,34 @@ def coarse_weak(
 ) -> tuple[float, float, float]:
     """As :func:`coarse` for pressures of a few times the noise, where lone cells mislead.
 
-    Takes the cells above ``level`` whose neighbourhood stands above ``patch_level``, both in the
-    frame's unit.
+    Takes the cells of ``level`` or more whose neighbourhood stands above ``patch_level``, both in
+    the frame's unit.
     """
+    rows, cols = frame.shape
+    readings = address(frame)
+    height = address(middles)
+    last = bounds[LAST]
     total = sum_x = sum_y = number = 0.0
-    for i in range(frame.shape[0]):
-        for j in range(runs[i, 0], runs[i, 1]):
-            value = frame[i, j]
-            if (
-                value > level
-                and cells[i, LIVE, j] > 0.0
-                and neighbourhood(frame, cells, i, j) > patch_level
-            ):
-                total += value
-                sum_x += value * j
-                sum_y += value * i
-                number += 1.0
+    at = next_above(readings, height, bounds[FIRST], last, level)
+    while at < last:
+        if neighbourhood(readings, height, rows, cols, at // cols, at % cols) > patch_level:
+            value = readings[at]
+            total += value
+            sum_x += value * middles[X, at]
+            sum_y += value * middles[Y, at]
+            number += 1.0
+        at = next_above(readings, height, at + 1, last, level)
     if not total > 0.0:
-        total, sum_x, sum_y, number = 1.0, float(col), float(row), 1.0
+        at = row * cols + col
+        total, sum_x, sum_y, number = 1.0, middles[X, at], middles[Y, at], 1.0
     # Of a weak contact's cells about three quarters pass.
     return _from_area(geometry, sum_x / total, sum_y / total, 1.3 * number)
 
 
 @kernel
-def _from_area(
-    geometry: Geometry, col: float, row: float, number: float
-) -> tuple[float, float, float]:
-    """(d, n_x, n_y) of a contact of so many cells round a place [cells]."""
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    x = x_first + pitch_x * (col + 0.5)
-    y = y_first + pitch_y * (row + 0.5)
+def _from_area(geometry: Geometry, x: float, y: float, number: float) -> tuple[float, float, float]:
+    """(d, n_x, n_y) of a contact of so many cells round a place [m]."""
+    a, _, _, pitch_x, pitch_y = geometry
     # The footprint's area is π ρ² cos θ with ρ² = 2 a d − d².
     rho2 = min(number * pitch_x * pitch_y / math.pi, 0.75 * a * a)
     d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
@@ -255,7 +223,8 @@ def bounded(n_x: float, n_y: float) -> tuple[float, float]:
 @kernel
 def refine(
     frame: FloatArray,
-    cells: FloatArray,
+    middles: FloatArray,
+    bounds: IntArray,
     geometry: Geometry,
     ratios: FloatArray,
     modulus: float,
@@ -274,25 +243,48 @@ def refine(
     where nothing presses.
     """
     a = geometry[0]
-    margin = math.hypot(geometry[3], geometry[4]) * 0.5
+    margin = _MARGIN * math.hypot(geometry[3], geometry[4])
     rho = min(math.sqrt(max(d * (2.0 * a - d), 0.0)) + margin, 0.99 * a)
     u, v, w = plane(a, a - math.sqrt(a * a - rho * rho), n_x, n_y)
-    total, x, y, trace, number = footprint_moments(frame, cells, geometry, u, v, w)
+    moments = footprint_moments(frame, middles, bounds, geometry, u, v, w)
     covariance[:] = 0.0
-    if not total > 0.0:
-        return d, n_x, n_y, 0.0
+    gain = 0.0
+    if moments[0] > 0.0:
+        d, n_x, n_y, gain = _contact(
+            moments, geometry, ratios, modulus, fixed_gain, noise, d, n_x, n_y, rho, covariance
+        )
+    return d, n_x, n_y, gain
+
+
+@kernel
+def _contact(
+    moments: tuple[float, float, float, float, float],
+    geometry: Geometry,
+    ratios: FloatArray,
+    modulus: float,
+    fixed_gain: float,
+    noise: float,
+    d: float,
+    n_x: float,
+    n_y: float,
+    rho: float,
+    covariance: FloatArray,
+) -> tuple[float, float, float, float]:
+    """What :func:`refine` gives, from what :func:`footprint_moments` gave within ``rho``."""
+    a = geometry[0]
+    total, x, y, trace, number = moments
     force = total * geometry[3] * geometry[4]
     cosine = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     relative = noise * noise * number / (total * total)  # variance of the force over its square
+    gain = fixed_gain
     if fixed_gain > 0.0:
         plain = force * cosine / (math.pi * modulus * fixed_gain)
         for _ in range(4):
             d = math.sqrt(plain / _ratio(ratios, a, d, 0))
             d = min(max(d, 1e-4 * a), 0.95 * a)
         covariance[0] = 0.25 * relative * d * d
-        gain = fixed_gain
     else:
-        d = max(from_extent(a, trace, math.hypot(x, y), ratios), 1e-4 * a)
+        d = max(from_extent(a, trace, math.hypot(x, y), ratios, d), 1e-4 * a)
     reach = _ratio(ratios, a, d, 1) * (a - d / 3.0)
     n_x, n_y = bounded(x / reach, y / reach)
     if fixed_gain <= 0.0:

@@ -9,8 +9,9 @@ import pytest
 
 from kinematics.activity import activity
 from kinematics.cut_cells import PLANES
-from kinematics.likelihood import SUMS, accumulate, cubic_law
+from kinematics.likelihood import SUMS, accumulate, fit_law, is_bent
 from kinematics.material import Material
+from kinematics.middles import cell_middles
 
 LINEAR = Material.constant(0.304e6)
 MEASURED = Material.table_i()
@@ -20,32 +21,32 @@ def test_activity_matches_its_plain_twin():
     rng = np.random.default_rng(12)
     weights = np.outer([1, 2, 2, 2, 1], [1, 2, 2, 2, 1]).astype(float)
     weights[2, 2] = 0.0
-    cells = np.ones((20, 10, 24))
-    runs = np.tile(np.array([2, 22]), (20, 1))
+    # Columns 2 … 21 are in reach, and rows 2 … 17.
+    live = np.zeros((20, 24), bool)
+    live[2:18, 2:22] = True
+    middles, bounds = cell_middles((1.0, 0.0, 0.0, 0.01, 0.01), live, 2.0)
+    assert bounds[2] == live.sum()
     seen = set()
     for k in range(200):
         frame = rng.normal(0.0, 1.0, (20, 24))
         i, j = rng.integers(4, 16), rng.integers(4, 20)
         frame[i - 1 : i + 2, j - 1 : j + 2] += 0.02 * k
         expected = False
-        for r in range(20):
-            for c in range(2, 22):
-                if frame[r, c] > 3.0:
-                    total = squares = 0.0
-                    for y in range(-2, 3):
-                        for x in range(-2, 3):
-                            if 0 <= r + y < 20 and 0 <= c + x < 24:
-                                w = weights[y + 2, x + 2]
-                                total += w * frame[r + y, c + x]
-                                squares += w * w
-                    expected |= total / math.sqrt(squares) > 4.0
-        contact, row, col, peak, mean, finite = activity(frame, cells, runs, 1.0, 3.0, 4.0)
+        for r, c in np.argwhere(live & (frame > 3.0)):
+            part = np.s_[r - 2 : r + 3, c - 2 : c + 3]
+            w = weights * live[part]
+            expected |= (w * frame[part]).sum() / math.sqrt((w**2).sum()) > 4.0
+        frame[0, 5], frame[3, 0] = math.nan, 1e9
+        found = activity(frame, middles, bounds, 1.0, 3.0, 4.0)
+        contact, row, col, peak, mean, energy, finite = found
         assert contact == expected
         assert finite
-        inner = frame[:, 2:22]
+        inner = frame[live]
         assert mean == pytest.approx(inner.mean())
-        if inner.max() > 3.0:
-            assert peak == inner.max() == frame[row, col]
+        assert energy == pytest.approx((inner**2).sum())
+        assert peak == inner.max()
+        if peak > 3.0:
+            assert frame[row, col] == peak
         seen.add(expected)
     assert seen == {True, False}
 
@@ -56,7 +57,7 @@ def test_normal_equations_match_their_plain_twin():
     packed = np.zeros((PLANES, n))
     packed[0] = rng.uniform(0.2, 1.0, n)
     u, v, w, gain = 0.017, 0.2, -0.1, 1.3
-    g = rng.uniform(35.0, 50.0, n) * packed[0]
+    g = rng.uniform(35.0, 50.0, n)
     packed[1], packed[2], packed[3] = g, g * rng.uniform(-0.01, 0.01, n), g * 0.004
     packed[4] = rng.uniform(0.0, 1e-3, n)
     packed[5] = rng.uniform(0.0, 5e4, n)
@@ -64,8 +65,8 @@ def test_normal_equations_match_their_plain_twin():
     sums = np.zeros(SUMS)
     saturation = 2e4
     floor = 1.3e4
-    accumulate(packed, n, u, v, w, gain, saturation, floor, 0.0, cubic_law(MEASURED.law), sums)
-    strain = 1.0 - (u * packed[1] - v * packed[2] - w * packed[3]) / packed[0]
+    accumulate(packed, n, u, v, w, gain, saturation, floor, 0.0, fit_law(MEASURED.law), sums)
+    strain = 1.0 - (u * packed[1] - v * packed[2] - w * packed[3])
     step = 1e-4
     stress = MEASURED.stress(strain)
     slope = (MEASURED.stress(strain + step) - MEASURED.stress(strain - step)) / (2 * step)
@@ -74,6 +75,7 @@ def test_normal_equations_match_their_plain_twin():
     free = (packed[5] < saturation) | (gain * mean < saturation)
     free &= gain * mean >= floor
     weight = packed[6] * free
+    slope = slope * packed[0]
     jacobian = np.stack([mean, slope * packed[1], slope * packed[2], slope * packed[3]])
     residual = np.maximum(packed[5], floor) - gain * mean
     normal = (jacobian * weight) @ jacobian.T
@@ -92,13 +94,18 @@ def test_the_estimators_law_follows_any_material():
         1e5 * np.linspace(0.0, 1.0, 12) ** 1.3 + 5e4 * np.linspace(0, 1, 12),
     )
     for material in (LINEAR, MEASURED, points):
-        law = cubic_law(material.law)
+        law = fit_law(material.law)
         strain = np.linspace(0.0, 0.999999, 3001)
-        t = strain * (len(law) - 1)
-        k = t.astype(int)
-        c = law[k].T
-        t = t - k
-        value = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+        if len(law) == 2:
+            value = np.polynomial.Polynomial(law.ravel())(strain)
+        else:
+            t = strain * (len(law) - 1)
+            k = t.astype(int)
+            c = law[k].T
+            t = t - k
+            value = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
         np.testing.assert_allclose(
             value, material.stress(strain), atol=1e-7 * material.reference_modulus
         )
+        assert is_bent(law) == (material is not LINEAR)
+    assert [len(fit_law(each.law)) for each in (LINEAR, MEASURED, points)] == [2, 2, 129]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from kinematics import ladder
 from kinematics.estimator import ContactEstimator
 from kinematics.kernels import kernel
+from kinematics.middles import BOUNDS, HEIGHT
 
 FloatArray = NDArray[np.float64]
 OUTPUTS = 4  # d, tilt_x, tilt_y, 1 for a valid contact
@@ -46,7 +47,9 @@ def run_frames(
 
 def whole_grid(estimator: ContactEstimator) -> ContactEstimator:
     """The same estimator made to look at all cells, not only at those of the tip's disc."""
-    integers = estimator.compiled_arguments()[5]
-    rows, cols = estimator.grid.shape
-    integers[: 2 * rows].reshape(rows, 2)[:] = (0, cols)
+    floats, integers = estimator.compiled_arguments()[4:]
+    size = estimator.grid.rows * estimator.grid.cols
+    height = floats[HEIGHT * size : (HEIGHT + 1) * size]
+    height[:] = np.maximum(height, 0.0)
+    integers[:BOUNDS] = 0, size, size
     return estimator

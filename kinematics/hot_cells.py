@@ -1,0 +1,93 @@
+"""Cells that read high alone, as no contact can make them: found and left out, as kernels."""
+
+from __future__ import annotations
+
+import math
+
+from kinematics.activity import activity
+from kinematics.cells import LIVE
+from kinematics.footprint import FloatArray, IntArray
+from kinematics.kernels import kernel
+from kinematics.lanes import Pointer, address
+from kinematics.middles import HEIGHT, NUMBER, X, Y
+from kinematics.workspace import SPIKES, SPIKES_MAX
+
+
+@kernel
+def is_spike(
+    frame: Pointer,
+    height: Pointer,
+    rows: int,
+    cols: int,
+    i: int,
+    j: int,
+    noise: float,
+    confined: float,
+) -> bool:
+    """Whether the cell stands alone as no contact can: a hot cell.
+
+    ``confined`` is what a contact about as wide as a cell could press at most: a wider one never
+    has a cell that stands at twice its neighbours.
+    """
+    total = 0.0
+    number = 0
+    for k, m in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+        if 0 <= k < rows and 0 <= m < cols and height[k * cols + m] >= 0.0:
+            total += frame[k * cols + m]
+            number += 1
+    reading = frame[i * cols + j]
+    return bool(
+        number > 0
+        and reading > 10.0 * noise + confined
+        and reading > 2.0 * max(total, 0.0) / max(number, 1) + 12.0 * noise
+    )
+
+
+@kernel
+def without_spikes(
+    frame: FloatArray,
+    noise: float,
+    peak_level: float,
+    patch_level: float,
+    confined: float,
+    cells: FloatArray,
+    middles: FloatArray,
+    integers: IntArray,
+) -> tuple[int, tuple[bool, int, int, float, float, float, bool]]:
+    """The number of hot cells, and what :func:`activity` says without them.
+
+    ``confined`` as for :func:`is_spike`. They are marked dead until :func:`revive`; their places
+    are left in ``integers``.
+    """
+    rows, cols = frame.shape
+    rejected = 0
+    seen = activity(frame, middles, integers, noise, peak_level, patch_level)
+    while (
+        seen[1] >= 0
+        and rejected < SPIKES_MAX
+        and is_spike(
+            address(frame), address(middles), rows, cols, seen[1], seen[2], noise, confined
+        )
+    ):
+        cells[seen[1], LIVE, seen[2]] = 0.0
+        middles[HEIGHT, seen[1] * cols + seen[2]] = -math.inf
+        integers[NUMBER] -= 1
+        integers[SPIKES + rejected] = seen[1] * cols + seen[2]
+        rejected += 1
+        seen = activity(frame, middles, integers, noise, peak_level, patch_level)
+    return rejected, seen
+
+
+@kernel
+def revive(
+    rejected: int, a: float, cells: FloatArray, middles: FloatArray, integers: IntArray
+) -> None:
+    """Make the hot cells of :func:`_without_spikes` live again."""
+    cols = cells.shape[2]
+    for k in range(rejected):
+        at = integers[SPIKES + k]
+        cells[at // cols, LIVE, at % cols] = 1.0
+        x = middles[X, at]
+        y = middles[Y, at]
+        middles[HEIGHT, at] = math.sqrt(max(a * a - x * x - y * y, 0.0))
+        integers[NUMBER] += 1
