@@ -45,7 +45,7 @@ class Broadcast:
         self._schedule = Schedule(settings)
         self._period = 1.0 / settings.loop.rate
         self._scene = Parts.of(settings)
-        self._published = [0, 0]  # newest frame of each finger that went out
+        self._published = [-1, -1]  # of which n frames one went out, for each finger
         self._states = self._maps = 0  # messages that went out
         self._told = _Counts()  # when the rates were last told
 
@@ -56,24 +56,25 @@ class Broadcast:
             publisher.refresh()
         if publisher.wants_state and schedule.state.due(seq):
             self._states += 1
-            publisher.state(state, self._scene)
-        if publisher.wants_tactile and schedule.tactile.due(seq):
+            publisher.state(state, self._scene, schedule.state.every)
+        if publisher.wants_tactile:
             for perception in self._perceptions:
                 self._frame(state, perception)
         if schedule.stats.due(seq):
             rates = self._rates(state)
             if publisher.wants_stats:
-                publisher.stats(state, self._period, rates, self._statistics)
+                publisher.stats(state, self._period, rates, self._statistics, schedule.stats.every)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:
         frame = perception.frame
-        if frame is None or frame.seq == self._published[perception.finger]:
+        every = self._schedule.tactile_every
+        if frame is None or frame.seq // every == self._published[perception.finger]:
             return
-        self._published[perception.finger] = frame.seq
+        self._published[perception.finger] = frame.seq // every
         self._maps += 1
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.shown(frame)
-        self._publisher.tactile(frame, data, perception.finger, perception.facts, wall)
+        self._publisher.tactile(frame, data, perception.finger, perception.facts, wall, every)
 
     def _rates(self, state: State) -> Rates:
         """Rates [Hz] since they were last asked for."""

@@ -3,35 +3,7 @@
 A map has string keys. A field that is a float is always sent as a float, a field is never left out,
 and fields are only ever added. SI units.
 
-``hand/state``
-    ``schema, seq, timestamp`` (Unix s), ``mono_ns, mode, fault, fault_name, torque, tick_s,
-    compute_s, wake_late_s, overruns``; under ``left`` and ``right``: ``valid`` (the finger takes
-    part and what it has of servos and sensors gave fresh, sound numbers), ``q`` [rad], ``dq``
-    [rad/s], ``current`` [A], ``temperature`` [°C] and ``voltage`` [V] (0 while not known),
-    ``goal_q`` [rad], ``goal_current`` [A], ``d`` [m], ``theta`` [rad], ``tilt_y`` [rad], ``force``
-    [N], ``energy`` [J], ``d_std, theta_std, gain, contact, frame_seq, frame_age_s``;
-    under ``object``: ``valid, angle`` [rad], ``width`` [m].
-``hand/tactile``
-    ``schema, seq, timestamp, mono_ns`` (both of the board's scan), ``delay_s`` (from then until the
-    frame had come), ``valid`` (false: the board is gone, this is its last frame again), ``finger,
-    rows, cols``; ``data``: rows × cols little-endian uint16, row-major, rows along y, in steps of
-    ``scale`` [Pa]. Where the cells are: ``pitch`` [m] from column to column, ``pitch_y`` from row
-    to row, ``centre_x, centre_y`` [m], the tip's centre off the grid's, ``rotation`` [rad] of the
-    sensor's axes against the finger's.
-    ``unit``: ``"count"``, the board's own counts, of which ``scale`` makes a pressure as well as
-    one factor for all cells can; or ``"Pa"``, where ``stream.tactile_unit`` asks for it: data ×
-    scale is the pressure that the estimator was given, by the tare and the calibration if there is
-    one (``calibrated``). ``calibration``: name and date of the calibration that the estimator goes
-    by, whatever the unit; empty when there is none.
-``hand/stats``
-    once a second: ``schema, seq, timestamp, mono_ns, ticks`` (since the start, as all but the
-    rates), ``overruns, period_s``; under each of ``wake`` (a tick's start after its deadline),
-    ``compute`` (all of a tick's work), ``bus`` (reading and writing servos) and ``publish``:
-    ``p50, p99, p999, max`` [s]; under ``rates`` what the last second had [Hz]: ``tick``, ``left``
-    and ``right`` (tactile frames that came), ``state`` and ``tactile`` (messages that went out).
-``hand/event``
-    ``schema, seq, timestamp, mono_ns, level`` (``info``, ``warning``, ``error``), ``kind, text``.
-    A limit's ``kind``, as a fault's ``fault_name``, is its name in :mod:`daemon.limits`.
+`daemon.contract` tells every field with its unit and meaning; ``daemon/STREAM.md`` is its page.
 """
 
 from __future__ import annotations
@@ -98,8 +70,8 @@ class Rates(NamedTuple):
     tactile: float
 
 
-def state_message(state: State, scene: Parts) -> dict[str, Any]:
-    """The ``hand/state`` map."""
+def state_message(state: State, scene: Parts, step: int = 1) -> dict[str, Any]:
+    """The ``hand/state`` map; one of ``step`` ticks is sent."""
     timing = state.timing
     reading = state.reading
     joints = zip(
@@ -120,6 +92,7 @@ def state_message(state: State, scene: Parts) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "seq": state.seq,
+        "seq_step": step,
         "timestamp": state.wall,
         "mono_ns": int(state.t * 1e9),
         "mode": state.mode,
@@ -171,16 +144,23 @@ def _finger(
 
 
 def tactile_message(
-    frame: Frame, data: NDArray[np.uint16], finger: int, facts: SensorFacts, wall: float
+    frame: Frame,
+    data: NDArray[np.uint16],
+    finger: int,
+    facts: SensorFacts,
+    wall: float,
+    step: int = 1,
 ) -> dict[str, Any]:
     """The ``hand/tactile`` map of one finger's frame; ``wall`` is the Unix time it was sampled.
 
-    ``data`` [rows, cols] is the frame's, in steps as ``facts`` tells.
+    ``data`` [rows, cols] is the frame's, in steps as ``facts`` tells; one of ``step`` frames is
+    sent.
     """
     rows, cols = data.shape
     return {
         "schema": SCHEMA,
         "seq": frame.seq,
+        "seq_step": step,
         "timestamp": wall,
         "mono_ns": int(frame.t_sample * 1e9),
         "delay_s": frame.t_arrival - frame.t_sample,
@@ -194,13 +174,14 @@ def tactile_message(
 
 
 def stats_message(
-    state: State, period: float, rates: Rates, statistics: Statistics
+    state: State, period: float, rates: Rates, statistics: Statistics, step: int = 1
 ) -> dict[str, Any]:
-    """The ``hand/stats`` map."""
+    """The ``hand/stats`` map, sent every ``step`` ticks."""
     spreads = {name: spread._asdict() for name, spread in statistics.spreads().items()}
     return {
         "schema": SCHEMA,
         "seq": state.seq,
+        "seq_step": step,
         "timestamp": state.wall,
         "mono_ns": int(state.t * 1e9),
         "ticks": statistics.ticks,

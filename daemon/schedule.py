@@ -3,7 +3,7 @@
 The servo tick is the base. What is rarer is done on exactly every n-th tick, counted by ``seq``,
 with the n whose rate is nearest to the wanted one, and on ticks of its own where n allows it, so
 that no tick carries all of it. Tactile frames have their sensor's rate: every tick looks whether
-there is a new one, and only a new one is estimated.
+there is a new one, only a new one is estimated, and of every n one is published.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Schedule:
         self.rate = settings.loop.rate
         self._frames = settings.tactile.rate if settings.tactile.backend != "none" else 0.0
         stream = settings.stream
+        self.tactile_every = max(round(settings.tactile.rate / stream.tactile_rate), 1)  # frames
         #                         what          wanted rate [Hz]     phase
         self.state = self._turn("hand/state", stream.state_rate, 0)
-        self.tactile = self._turn("hand/tactile", stream.tactile_rate, 1)
         self.look = self._turn("look for subscribers", _LOOK, 2)
         self.stats = self._turn("hand/stats", _STATS, 3)
 
@@ -47,7 +47,7 @@ class Schedule:
 
     def turns(self) -> tuple[Turn, ...]:
         """All of them, from frequent to rare."""
-        turns = (self.state, self.tactile, self.look, self.stats)
+        turns = (self.state, self.look, self.stats)
         return tuple(sorted(turns, key=lambda turn: turn.every))
 
     def __str__(self) -> str:
@@ -55,6 +55,8 @@ class Schedule:
         parts = [f"every tick ({self.rate:g} Hz) read, feel, decide, bound, write"]
         if self._frames:
             parts[0] += f", tactile frames as they come ({self._frames:g} Hz)"
+            rate = self._frames / self.tactile_every
+            parts.append(f"every {self.tactile_every} frames hand/tactile ({rate:.4g} Hz)")
         parts += [
             f"every {turn.every} {turn.what} ({self.rate / turn.every:.4g} Hz)"
             for turn in self.turns()

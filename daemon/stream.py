@@ -53,9 +53,9 @@ class Publisher:
     def _wanted(self, topic: bytes) -> bool:
         return any(topic.startswith(prefix) for prefix in self._subscriptions)
 
-    def state(self, state: State, scene: messages.Parts) -> None:
-        """Publish ``hand/state``."""
-        self._send(messages.STATE, messages.state_message(state, scene))
+    def state(self, state: State, scene: messages.Parts, step: int = 1) -> None:
+        """Publish ``hand/state``, every ``step`` ticks."""
+        self._send(messages.STATE, messages.state_message(state, scene, step))
 
     def tactile(
         self,
@@ -64,16 +64,23 @@ class Publisher:
         finger: int,
         facts: messages.SensorFacts,
         wall: float,
+        step: int = 1,
     ) -> None:
         """Publish one finger's frame on ``hand/tactile``, see `daemon.messages.tactile_message`."""
-        message = messages.tactile_message(frame, data, finger, facts, wall)
+        message = messages.tactile_message(frame, data, finger, facts, wall, step)
         self._send(messages.TACTILE, message)
 
     def stats(
-        self, state: State, period: float, rates: messages.Rates, statistics: Statistics
+        self,
+        state: State,
+        period: float,
+        rates: messages.Rates,
+        statistics: Statistics,
+        step: int = 1,
     ) -> None:
-        """Publish ``hand/stats``."""
-        self._send(messages.STATS, messages.stats_message(state, period, rates, statistics))
+        """Publish ``hand/stats``, every ``step`` ticks."""
+        message = messages.stats_message(state, period, rates, statistics, step)
+        self._send(messages.STATS, message)
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""

@@ -32,7 +32,10 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "energy": 12.34e-3,
         "d_std": 0.02e-3,
         "theta_std": math.radians(0.1),
+        "tilt_y": 0.0,
+        "gain": 1.0,
         "contact": True,
+        "frame_seq": 7,
         "frame_age_s": 0.012,
     }
 
@@ -41,6 +44,7 @@ def state(t: float, seq: int) -> dict[str, Any]:
     return {
         "schema": 1,
         "seq": seq,
+        "seq_step": 5,
         "timestamp": time.time(),
         "mono_ns": time.monotonic_ns(),
         "mode": "holding",

@@ -44,3 +44,19 @@ def seconds(text: str) -> float:
     if not 0.0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"expected a time above 0 s, found {text!r}")
     return value
+
+
+def moment(text: str) -> float:
+    """A time of 0 s or more. Raises ArgumentTypeError with what was found."""
+    return 0.0 if text.strip() in ("0", "0.0") else seconds(text)
+
+
+def megabytes(text: str) -> float:
+    """A size above 0 MB. Raises ArgumentTypeError with what was found."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"expected a size above 0 MB, found {text!r}")
+    return value

@@ -17,6 +17,7 @@ SUBCOMMANDS = {
     "emulate": "a stand-in hand in a process of its own: servos and tactile boards on ptys",
     "send": "send one command to the running daemon",
     "monitor": "live terminal page of the running daemon",
+    "record": "record the running daemon's stream into an MCAP file",
     "doctor": "check ports, servos, boards and this machine, and tell what mends them",
     "scan": "find the servos on a port, at any rate",
     "calibrate": "calibrate the pressure sensor under a tip, step by step",

@@ -66,6 +66,7 @@ class HandState:
 
     schema: int
     seq: int  # the tick
+    seq_step: int  # one of so many is sent
     timestamp: float  # Unix time [s]
     mono_ns: int  # the daemon's own clock [ns]
     mode: str

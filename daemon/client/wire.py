@@ -48,15 +48,16 @@ class Gaps:
         self._last: dict[str, int] = {}
 
     def take(self, message: dict[str, Any]) -> None:
-        """Look at one more message. ``seq_step`` is how far apart neighbours are, 1 if untold."""
+        """Look at one more message; of ``seq_step`` (1 if untold) one is sent."""
         seq, step, source = message.get("seq"), message.get("seq_step", 1), message.get("finger")
         if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
             return
         key = source if isinstance(source, str) else ""
-        last = self._last.get(key)
-        if last is not None and seq > last + step:
-            self.lost += (seq - last - 1) // step
-        self._last[key] = seq
+        place = seq // step
+        last = self._last.get(key, place)
+        if place > last:
+            self.lost += place - last - 1
+        self._last[key] = place
 
 
 class Decoder:

@@ -1,0 +1,254 @@
+"""``softfinger record FILE.mcap``: the running daemon's stream into a recording."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from daemon.settings import Stream
+from tools.arguments import megabytes, moment, seconds
+from tools.recordings.errors import RecordingError
+
+_EPILOG = """\
+Ends with Ctrl-C, after --duration, or at --to; prints what it wrote and what was lost on the way.
+With --split-size or --split-time it goes on in FILE-2.mcap, FILE-3.mcap and so on.
+Exit status: 0 written, 1 not or not all, with the reason."""
+
+_WAIT = 2.0  # s without a message until the waiting is told, or --no-wait gives up
+_LOOK = 0.1  # s between two looks at the clock
+_SHOW = 0.5  # s between two progress lines
+_BATCH = 1000  # messages between two looks at the clock
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``record``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not be there yet")
+    parser.add_argument("--address", default=Stream().address, help="the stream's socket")
+    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
+    parser.add_argument(
+        "--from",
+        type=moment,
+        default=0.0,
+        metavar="S",
+        dest="start",
+        help="leave out what comes before S seconds of the stream",
+    )
+    parser.add_argument(
+        "--to", type=seconds, metavar="S", dest="end", help="and end S seconds after its start"
+    )
+    parser.add_argument("--split-size", type=megabytes, metavar="MB", help="a new file after MB")
+    parser.add_argument(
+        "--split-time", type=seconds, metavar="S", help="a new file after S seconds"
+    )
+    parser.add_argument(
+        "--no-wait", action="store_true", help="end with an error when nothing comes within 2 s"
+    )
+    parser.add_argument(
+        "--recover", action="store_true", help="close a FILE that was cut short, and record nothing"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Record until told to end; 1 with one line when something went wrong."""
+    try:
+        if arguments.recover:
+            return _recover(arguments.file)
+        with _Ending() as ending:
+            return _Recorder(arguments, ending).record()
+    except RecordingError as error:
+        print(f"record: {error}", file=sys.stderr)
+        return 1
+
+
+def _recover(path: Path) -> int:
+    from tools.recordings.recover import recover
+
+    messages, damage = recover(path)
+    print(
+        f"{path}: {messages} messages; " + (f"cut short ({damage}), closed" if damage else "sound")
+    )
+    return 0
+
+
+class _Recorder:
+    """One call of ``record``: the socket, the files one after the other, and the account."""
+
+    def __init__(self, arguments: argparse.Namespace, ending: _Ending) -> None:
+        from daemon.client.wire import Gaps
+        from tools.recordings.writer import RecordingWriter
+
+        self._arguments = arguments
+        self._ending = ending
+        self._gaps: dict[bytes, Gaps] = {}
+        self._new_gaps = Gaps
+        self._new_writer = RecordingWriter
+        self._writer = RecordingWriter(arguments.file)
+        self._files = [arguments.file]
+        self._first: float | None = None  # the stream's first timestamp
+        self._opened = time.monotonic()
+        self._messages = 0
+        self._bytes = 0  # in the files before this one
+        self._unreadable = 0
+        self._told_waiting = False
+
+    def record(self) -> int:
+        """Take messages until the end."""
+        import zmq
+
+        from daemon.client.wire import prepare
+
+        arguments = self._arguments
+        context: zmq.Context[Any] = zmq.Context()
+        socket = context.socket(zmq.SUB)
+        began = shown = heard = time.monotonic()
+        failure = ""
+        try:
+            prepare(socket, arguments.address, b"hand/")
+            while not self._ending.asked:
+                waiting = socket.poll(int(_LOOK * 1e3))
+                now = time.monotonic()
+                if waiting:
+                    heard = now
+                    self._take_batch(socket)
+                elif self._first is None and now - began > _WAIT:
+                    if arguments.no_wait:
+                        failure = f"nothing from {arguments.address} within {_WAIT:g} s"
+                        break
+                    self._tell_waiting()
+                if arguments.duration is not None and now - began >= arguments.duration:
+                    break
+                if now - shown >= _SHOW:
+                    self._writer.flush()
+                    self._show(now - began, now - heard)
+                    shown = now
+            self._writer.close()
+        except zmq.ZMQError as error:
+            failure = f"{arguments.address}: {error}"
+        except RecordingError as error:
+            failure = str(error)
+        finally:
+            context.destroy(linger=0)
+            self._clear_line()
+        return self._account(failure)
+
+    def _take_batch(self, socket: Any) -> None:
+        import zmq
+
+        for _ in range(_BATCH):
+            try:
+                frames = socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._take(frames)
+            if self._ending.asked:
+                return
+
+    def _take(self, frames: list[bytes]) -> None:
+        import msgpack
+
+        try:
+            topic, payload = frames
+            message = msgpack.unpackb(payload)
+            if not isinstance(message, dict):
+                raise ValueError("not a map")
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+            self._unreadable += 1
+            return
+        arguments = self._arguments
+        stamp = message.get("timestamp")
+        when = stamp if isinstance(stamp, float) else time.time()
+        if self._first is None:
+            self._first = when
+        if when - self._first < arguments.start:
+            return
+        if arguments.end is not None and when - self._first > arguments.end:
+            self._ending.asked = True
+            return
+        gaps = self._gaps.get(topic)
+        if gaps is None:
+            gaps = self._gaps[topic] = self._new_gaps()
+        gaps.take(message)
+        self._split_if_due()
+        self._writer.add(topic, message)
+        self._messages += 1
+
+    def _split_if_due(self) -> None:
+        arguments, writer = self._arguments, self._writer
+        full = arguments.split_size is not None and writer.size >= arguments.split_size * 1e6
+        age = time.monotonic() - self._opened
+        if not full and (arguments.split_time is None or age < arguments.split_time):
+            return
+        path = arguments.file
+        path = path.with_name(f"{path.stem}-{len(self._files) + 1}{path.suffix}")
+        following = self._new_writer(path)  # before the old one ends: should it fail, that stands
+        self._bytes += writer.size
+        self._writer = following
+        writer.close()
+        self._files.append(path)
+        self._opened = time.monotonic()
+
+    # What is said of it
+
+    def _tell_waiting(self) -> None:
+        if not self._told_waiting:
+            self._told_waiting = True
+            print(f"record: waiting for a stream from {self._arguments.address}", file=sys.stderr)
+
+    def _show(self, elapsed: float, silent: float) -> None:
+        if not sys.stderr.isatty():
+            return
+        size = (self._bytes + self._writer.size) / 1e6
+        line = (
+            f"{elapsed:8.1f} s  {self._messages} messages  {size:.1f} MB  "
+            f"{size / max(elapsed, 1e-3):.2f} MB/s  {self._lost()} lost"
+        )
+        if silent > _WAIT:
+            line += f"  silent for {silent:.0f} s"
+        print(f"\r{line:<79.79}", end="", file=sys.stderr, flush=True)
+
+    def _clear_line(self) -> None:
+        if sys.stderr.isatty():
+            print(f"\r{'':<79}\r", end="", file=sys.stderr, flush=True)
+
+    def _lost(self) -> int:
+        return sum(gaps.lost for gaps in self._gaps.values())
+
+    def _account(self, failure: str) -> int:
+        for path in self._files:
+            if path.exists():
+                print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+        lost = ", ".join(
+            f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
+        )
+        print(f"{self._messages} messages written; lost on the way: {lost or 'none'}")
+        if self._unreadable:
+            print(f"{self._unreadable} messages could not be read and were left out")
+        if failure:
+            print(f"record: {failure}", file=sys.stderr)
+        return 1 if failure else 0
+
+
+class _Ending:
+    """Whether it is time to end; SIGINT and SIGTERM ask for it meanwhile."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> _Ending:
+        self._old = {
+            number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        return self
+
+    def _ask(self, *_: object) -> None:
+        self.asked = True
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)

@@ -1,0 +1,17 @@
+"""What can be wrong with a recording."""
+
+from __future__ import annotations
+
+
+class RecordingError(Exception):
+    """The recording can't be written or read. The message names the file and what is wrong."""
+
+
+class NoMcap(RecordingError):
+    """The packages for recordings are not installed. The message says what to install."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "recordings need mcap and orjson, the extra 'record'; from the project's folder: "
+            "pip install '.[record]'"
+        )

@@ -1,0 +1,206 @@
+"""`Recording`: an MCAP file's summary, and its messages in the order in which they came."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tools.recordings.errors import NoMcap, RecordingError
+from tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
+
+if TYPE_CHECKING:
+    from mcap.records import Chunk
+    from mcap.summary import Summary
+
+_RECORD_LIMIT = 256 * 1024 * 1024  # bytes; our own chunks are a thousandth of it
+
+
+class Recording:
+    """A recording that is there. Raises RecordingError when it is none.
+
+    ``counts`` messages by channel, ``start`` and ``end`` [Unix s] (NaN when empty) and
+    ``attachments`` come from the summary at the file's end. A file without one, as a killed
+    recorder leaves it, is ``truncated``: it is read through once instead.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import mcap.reader  # noqa: F401
+            import orjson  # noqa: F401
+        except ImportError:
+            raise NoMcap from None
+        self.path = path
+        self.truncated = False
+        self.damage = ""  # what ended the reading of a truncated file
+        self.counts: dict[str, int] = {}
+        self.start = math.nan
+        self.end = math.nan
+        self.chunks = 0
+        self.attachments: dict[str, bytes] = {}
+        self._names: dict[int, str] = {}  # channel's number → its name
+        try:
+            self.size = path.stat().st_size
+            if self.size == 0:
+                raise RecordingError(f"{path}: empty")
+            summary = self._summary()
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror}") from None
+        if summary is None:
+            self._damaged(None)
+            self._scan()
+        else:
+            self._take(summary)
+
+    @property
+    def duration(self) -> float:
+        """From the first message to the last [s]; 0 when empty."""
+        return 0.0 if math.isnan(self.start) else self.end - self.start
+
+    @property
+    def total(self) -> int:
+        """Messages of all channels."""
+        return sum(self.counts.values())
+
+    def count(self, topic: bytes) -> int:
+        """Messages of one topic."""
+        return sum(n for name, n in self.counts.items() if topic_of(name) == topic)
+
+    def messages(
+        self,
+        topics: Collection[bytes] | None = None,
+        start: float = -math.inf,
+        end: float = math.inf,
+        progress: Callable[[int], None] | None = None,
+    ) -> Iterator[tuple[bytes, dict[str, Any]]]:
+        """Topic and map of each message, as it came off the wire, from ``start`` to ``end`` s.
+
+        Times count from the recording's first message. ``progress`` is told the bytes of the file
+        that are behind. A truncated file ends where its sound part ends.
+        """
+        import orjson
+        from mcap.records import Message
+        from mcap.stream_reader import breakup_chunk
+
+        loads = orjson.loads
+        first = 0.0 if math.isnan(self.start) else self.start
+        begin = _nanoseconds(first + start, 0)
+        finish = _nanoseconds(first + end, 2**63)
+        wanted: dict[int, tuple[bytes, Converter]] = {}
+        for number, name in self._names.items():
+            topic = topic_of(name)
+            if topics is None or topic in topics:
+                wanted[number] = topic, from_json(topic)
+        for chunk in self._chunks(progress):
+            if chunk.message_end_time < begin or chunk.message_start_time > finish:
+                continue
+            try:
+                records = breakup_chunk(chunk)
+            except Exception as error:  # the format's, the compression's and more of their kinds
+                self._damaged(error)
+                return
+            for record in records:
+                if not isinstance(record, Message) or record.channel_id not in wanted:
+                    continue
+                if not begin <= record.log_time <= finish:
+                    continue
+                topic, convert = wanted[record.channel_id]
+                try:
+                    message = convert(loads(record.data))
+                except (ValueError, TypeError, AttributeError) as error:
+                    self._damaged(error)
+                    return
+                yield topic, message
+
+    def _chunks(self, progress: Callable[[int], None] | None = None) -> Iterator[Chunk]:
+        from mcap.records import Attachment, Chunk, DataEnd
+        from mcap.stream_reader import StreamReader
+
+        with self.path.open("rb") as file:
+            reader = StreamReader(file, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
+            try:
+                for record in reader.records:
+                    if isinstance(record, Chunk):
+                        if progress is not None:
+                            progress(file.tell())
+                        yield record
+                    elif isinstance(record, Attachment):
+                        self.attachments[record.name] = record.data
+                    elif isinstance(record, DataEnd):
+                        return
+            except Exception as error:
+                self._damaged(error)
+
+    def _damaged(self, error: Exception | None) -> None:
+        self.truncated = True
+        self.damage = str(error or "") or "its end is missing"
+
+    def _summary(self) -> Summary | None:
+        from mcap.exceptions import EndOfFile, InvalidMagic
+        from mcap.reader import SeekingReader
+
+        with self.path.open("rb") as file:
+            magic = file.read(8)
+            if magic[:1] != b"\x89" or magic[1:5] != b"MCAP":
+                raise RecordingError(f"{self.path}: not an MCAP file")
+            file.seek(0)
+            try:
+                reader = SeekingReader(file, record_size_limit=_RECORD_LIMIT)
+                header = reader.get_header()
+                if header.profile != PROFILE:
+                    raise RecordingError(
+                        f"{self.path}: profile {header.profile!r}, expected {PROFILE!r}: "
+                        "not a recording of this stream"
+                    )
+                summary = reader.get_summary()
+                if summary is not None and summary.statistics is not None:
+                    for attachment in reader.iter_attachments():
+                        self.attachments[attachment.name] = attachment.data
+                    return summary
+            except (InvalidMagic, EndOfFile):
+                pass  # cut short: no summary
+            except RecordingError:
+                raise
+            except Exception as error:
+                self._damaged(error)
+        return None
+
+    def _take(self, summary: Summary) -> None:
+        statistics = summary.statistics
+        assert statistics is not None
+        for number, channel in summary.channels.items():
+            if channel.message_encoding == ENCODING:
+                self._names[number] = channel.topic
+                self.counts[channel.topic] = statistics.channel_message_counts.get(number, 0)
+        self.chunks = statistics.chunk_count
+        if statistics.message_count:
+            self.start = statistics.message_start_time * 1e-9
+            self.end = statistics.message_end_time * 1e-9
+
+    def _scan(self) -> None:
+        from mcap.records import Channel, Message
+        from mcap.stream_reader import breakup_chunk
+
+        names = self._names
+        start, end = 2**63, 0
+        for chunk in self._chunks():
+            try:
+                records = breakup_chunk(chunk, validate_crc=True)
+            except Exception as error:
+                self._damaged(error)
+                break
+            self.chunks += 1
+            for record in records:
+                if isinstance(record, Message) and record.channel_id in names:
+                    name = names[record.channel_id]
+                    self.counts[name] = self.counts.get(name, 0) + 1
+                    start, end = min(start, record.log_time), max(end, record.log_time)
+                elif isinstance(record, Channel) and record.message_encoding == ENCODING:
+                    names[record.id] = record.topic
+        if end:
+            self.start, self.end = start * 1e-9, end * 1e-9
+
+
+def _nanoseconds(seconds: float, otherwise: int) -> int:
+    return int(seconds * 1e9) if math.isfinite(seconds) else otherwise

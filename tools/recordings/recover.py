@@ -1,0 +1,37 @@
+"""A recording that was cut short, closed: its sound part in a file with an end."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+from tools.recordings.writer import RecordingWriter
+
+
+def recover(path: Path) -> tuple[int, str]:
+    """Close the recording in place; how many messages it has, and what ended its reading.
+
+    A sound file is left as it is. The new file takes the old one's place only once it is whole.
+    Raises RecordingError.
+    """
+    recording = Recording(path)
+    if not recording.truncated:
+        return recording.total, ""
+    closed = path.with_name(path.name + ".recovered")
+    closed.unlink(missing_ok=True)
+    writer = RecordingWriter(closed)
+    try:
+        for name, data in recording.attachments.items():
+            writer.attach(name, "application/json", data)
+        for topic, message in recording.messages():
+            writer.add(topic, message)
+        writer.close()
+        closed.replace(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            closed.unlink(missing_ok=True)
+    return writer.messages, recording.damage
