@@ -19,6 +19,9 @@ from kinematics.workspace import GRID, INTEGERS, INVERSE, OWNED, QUEUES, STEP, S
 # Places in what a fit leaves in ``result``.
 D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)
 RESULT = 8
+# Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
+# square over what a straight model gives rises so.
+GAIN_CURVATURE = 6.0
 
 
 @kernel
@@ -124,6 +127,29 @@ def covariance_of(
 
 
 @kernel
+def free_noise(square: float, floor: float) -> float:
+    """A cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
+
+    They read it from ``floor`` [Pa] on and 0 below, so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ:
+    half of the variance without a floor. Where none is above it the noise is below a third of it.
+    """
+    if not floor > 0.0:
+        return math.sqrt(2.0 * square)
+    target = square / (floor * floor)
+    low = 0.05
+    high = 3.2
+    for _ in range(9):
+        tau = 0.5 * (low + high)
+        share = tau * math.exp(-0.5 * tau * tau) / math.sqrt(2.0 * math.pi)
+        share += 0.5 * math.erfc(tau / math.sqrt(2.0))
+        if share > target * tau * tau:
+            low = tau
+        else:
+            high = tau
+    return 2.0 * floor / (low + high)
+
+
+@kernel
 def fit(
     frame: FloatArray,
     scale: float,
@@ -148,7 +174,7 @@ def fit(
 
     ``variance`` [Pa²] is a cell's, ``saturation`` [Pa] its end;
     ``floor`` as for :func:`kinematics.likelihood.accumulate`;
-    ``clipped``: cells can't read below 0. ``energy`` and ``number`` are Σ p² [Pa²] and the number
+    ``clipped``: none reads below the floor. ``energy`` and ``number`` are Σ p² [Pa²] and the number
     of the live cells in the tip's disc. Stops when the promised decrement
     is below ``tolerance`` · variance, that is the step is that part of the noise floor, squared.
     ``floats`` and ``integers`` are scratch, see workspace.py.
@@ -197,13 +223,13 @@ def fit(
         )
         clip = 0.0
         if clipped:
-            # Free cells that end at 0 show half of the noise's variance; where a board sends no
-            # noise at all there is nothing to correct.
+            # Free cells show how much of the noise there is; where a board sends none at all
+            # there is nothing to correct.
             inside, inside_number = footprint_energy(packed, count)
             clip = math.sqrt(variance)
             if number - inside_number >= 16.0:
                 free_square = max(energy - inside, 0.0) / (number - inside_number)
-                clip = min(clip, math.sqrt(2.0 * free_square))
+                clip = min(clip, free_noise(free_square, floor))
         accumulate(packed, count, u, v, w, gain, saturation, floor, clip, law, sums)
         now = sums[14] - sums[15]
         if solved and not now <= cost + variance and halvings < 5:
@@ -249,5 +275,10 @@ def fit(
             # A misfit beyond its own scatter widens the covariance.
             excess = max(result[CHI2] - 3.0 * math.sqrt(2.0 / max(freedom, 1.0)), 1.0)
             covariance_of(inverse, a, u, v, w, variance * excess, covariance)
+            if free:
+                # The more d is uncertain, the less straight it is in the gain.
+                wider = 1.0 + GAIN_CURVATURE * min(covariance[0] / (d * d), 1.0)
+                for k in range(16):
+                    covariance[k] *= wider
             return bool(freedom > 0.0)
     return False

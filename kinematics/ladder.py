@@ -61,6 +61,8 @@ STATE = COVARIANCE + 16
 ) = range(5, 18)
 OPTIONS = 18
 
+# Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
+CLIPPED_MORE = 0.5
 WEAK = 15.0  # noise: a largest cell below is looked for together with its neighbours
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
@@ -198,7 +200,7 @@ def _likelihood(
             law,
             free,
             plan[SATURATION] * scale,
-            plan[FLOOR] * scale if plan[FLOOR] > 0.0 else -math.inf,
+            plan[FLOOR] * scale if clipped or plan[FLOOR] > 0.0 else -math.inf,
             clipped,
             energy,
             number,
@@ -338,8 +340,9 @@ def estimate_frame(
     state[ITERATIONS] = 0.0
     # A contact no wider than a cell strains it by about pitch²/2a² at most; gains up to 3.
     confined = 6.0 * plan[MODULUS] * (max(plan[3], plan[4]) / plan[0]) ** 2 / scale
+    patch_level = plan[PATCH_LEVEL] + (CLIPPED_MORE if step > 0.0 else 0.0)
     rejected, seen = without_spikes(
-        frame, noise, plan[PEAK_LEVEL], plan[PATCH_LEVEL], confined, cells, middles, integers
+        frame, noise, plan[PEAK_LEVEL], patch_level, confined, cells, middles, integers
     )
     contact, row, col, peak, mean, energy, finite = seen
     state[PEAK] = peak * scale

@@ -20,10 +20,12 @@ from kinematics.kernels import fast_kernel, inlined_kernel, kernel
 SUMS = 17
 Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 
-# A cell that can't read below 0 reads more than the pressure on average, by E[max(z + e, 0)] − z
-# standard deviations at a pressure of z, e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this
-# polynomial, within 3e-4.
+# A cell that can't read below its floor (0, or the smallest count sent) reads more than the
+# pressure on average, by E[max(z + e, 0)] − z standard deviations at a pressure of z above it,
+# e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this polynomial, within 3e-4. E[max(e − z, 0)] is the same
+# number. Cells more than CLIP_BELOW below the floor tell next to nothing.
 CLIP_END = 3.5
+CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 LAW_PIECES = 128
 POLYNOMIAL = 8
@@ -110,14 +112,19 @@ def _compared(
     model = gain * stress
     residual = max(reading, floor) - model
     response = 1.0
+    least = floor
     if clipped:
-        z = min(model * (1.0 / clip), CLIP_END)
+        # As much below the floor as above it, a cell reads as much more than the larger of both.
+        depth = (model - floor) * (1.0 / clip)
+        z = min(abs(depth), CLIP_END)
         above = 1.0 - z * (1.0 / CLIP_END)
         base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
         rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
-        residual -= clip * above * above * base
-        response = 1.0 + above * (above * rise - (2.0 / CLIP_END) * base)
-    counts = ((reading < saturation) | (model < saturation)) & (model >= floor)
+        rise = above * (above * rise - (2.0 / CLIP_END) * base)
+        residual = max(reading, floor) - max(model, floor) - clip * above * above * base
+        response = 1.0 + rise if depth >= 0.0 else -rise
+        least = floor - CLIP_BELOW * clip
+    counts = ((reading < saturation) | (model < saturation)) & (model >= least)
     return residual, response, 1.0 if counts else 0.0
 
 
@@ -140,9 +147,9 @@ def accumulate(
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
     factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
     sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
-    below its end. A cell that the model puts below ``floor`` [Pa] doesn't count, as the board
-    sends 0 for it, and no reading is less; −inf for none. ``clip`` > 0 is the noise of cells that
-    can't read below 0 [Pa].
+    below its end. No reading is less than ``floor`` [Pa], below which a board sends 0; −inf for
+    none. ``clip`` > 0 is the noise [Pa] of cells that end there; without it a cell that the model
+    puts below the floor doesn't count.
     """
     # Neither changes within the loop, of which the compiler makes four.
     polynomial = law.shape[0] == 2
