@@ -119,7 +119,7 @@ class RunningBus:
     def _serve(self) -> None:
         while self._running:
             now = time.monotonic()
-            wait = max(0.0, self.port.next_event(now) - now)
+            wait = max(0.0, self.port.next_event() - now)
             ports = [self.port] if self.port.fileno() >= 0 else []
             ready, _, _ = select.select([*ports, self._wake_read], [], [], wait)
             if self._wake_read in ready:

@@ -256,6 +256,15 @@ def test_a_signal_ends_it_cleanly(tmp_path, number):
     assert list((tmp_path / "new").iterdir()) == []
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_it_cleanly_while_it_starts(tmp_path, number):
+    with Process("--dir", tmp_path / "new", "--config", HIL) as process:
+        # The folder is taken as the first thing, long before anything answers.
+        until((tmp_path / "new" / ".emulator.lock").exists)
+        assert process.end(number) == (0, "", "")
+    assert list((tmp_path / "new").iterdir()) == []
+
+
 def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived(tmp_path):
     options = ("--model", "XL330-M288", "--ids", "7,3")
     with Process("--dir", tmp_path, *options) as process:

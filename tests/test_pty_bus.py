@@ -46,7 +46,7 @@ class Wire:
     def when(self, seconds: float) -> bytes:
         """Let time pass, serving at every event that is due in it."""
         end = self.t + seconds
-        while (due := self.port.next_event(self.t)) <= end:
+        while (due := self.port.next_event()) <= end:
             self.t = max(due, self.t + 1e-7)
             self.port.service(self.t)
         self.t = end

@@ -16,8 +16,9 @@ from daemon.simulation import protocol
 from daemon.simulation.bus_faults import FaultError
 from daemon.simulation.free_joints import FreeJoints
 from daemon.simulation.protocol import BROADCAST, Parser, frame
-from daemon.simulation.servo import OVERLOAD_TIME, REBOOT_TIME
+from daemon.simulation.servo import REBOOT_TIME
 from daemon.simulation.servo_bus import ServoBus
+from daemon.simulation.servo_health import OVERLOAD_TIME
 from tests.fuzz_servo_bus import fuzz
 from tests.servo_harness import RADIAN, make_bus
 
@@ -124,8 +125,8 @@ def test_published_exchanges_that_end_with_a_bare_status(request_packet: str) ->
 
 def test_published_bulk_read_and_bulk_write() -> None:
     bus = make_bus()
-    bus.servos[0].voltage = 11.9
-    bus.servos[1].temperature = 36.0
+    bus.servos[0].health.voltage = 11.9
+    bus.servos[1].health.temperature = 36.0
     assert bus.feed(hexes("FFFFFD00FE0D00 92 0190000200 0292000100 1A05"), 0.0) == hexes(
         "FFFFFD00010600 55 00 7700 C369", "FFFFFD00020500 55 00 24 8BA9"
     )
@@ -147,7 +148,7 @@ def test_published_fast_sync_read() -> None:
 
 def test_published_fast_bulk_read() -> None:
     bus = make_bus("XC330-T288", (3, 7, 4), counts=(166, 0, 0))
-    bus.servos[2].temperature = 31.0
+    bus.servos[2].health.temperature = 31.0
     pwm = bus.servos[1]
     pwm.table.set(reg.TORQUE_ENABLE, 1)
     bus.plant.current[1] = 421 / 885 * pwm.model.stall_current

@@ -17,7 +17,7 @@ from daemon.servos.base import Servos
 from daemon.servos.models import by_name
 from daemon.servos.simulated import SimulatedServos
 from daemon.settings import Settings
-from daemon.simulation.servo import THERMAL_RISE, THERMAL_TIME
+from daemon.simulation.servo_health import THERMAL_RISE, THERMAL_TIME
 from tests.conftest import until
 from tests.servo_harness import RunningBus
 
@@ -51,8 +51,8 @@ def test_temperature_and_supply_come_with_the_joints(bus: RunningBus, servos: Se
     assert reading.valid
     assert reading.temperature == [25.0, 25.0]
     assert reading.voltage == pytest.approx([12.75, 12.75], abs=0.06)
-    bus.call(lambda: setattr(bus.servo(1), "temperature", 55.0))
-    bus.call(lambda: setattr(bus.servo(0), "voltage", 11.0))
+    bus.call(lambda: setattr(bus.servo(1).health, "temperature", 55.0))
+    bus.call(lambda: setattr(bus.servo(0).health, "voltage", 11.0))
     start = time.monotonic()
     until(lambda: read(servos, reading).temperature[1] > 54.0, 2.0)
     assert time.monotonic() - start > 0.1, "not with every read"

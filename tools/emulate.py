@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -23,6 +26,23 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
   @SECONDS         when it starts; at once without
 
 softfinger emulate --dir DIR --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
+
+what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
+begins the record anew, --send "report forget" does both without a gap:
+  t, monotonic     the hand's time now [s], and time.monotonic() then
+  servos           by ID:
+    torque, mode, q, hardware_error, watchdog (time armed for [s], 0 when it is not, null after it
+                   stopped the motor), stopped_by_watchdog: the state now
+    goal_q, goal_current
+                   least and greatest goal that came [rad, A; positive closes], refused ones too;
+                   null when none came
+    goals_refused  how many writes with a goal the servo refused
+    torque_on      count, t of the last; far: how often the goal was more than 0.05 rad away,
+                   farthest [rad], current: greatest goal current in force [A]
+    quiet, longest_quiet
+                   time since the last instruction with torque on, null while it is off, and the
+                   longest such [s]
+    watchdog_fired count, t of the last
 """
 
 
@@ -63,7 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--send",
         metavar="WORDS",
-        help="tell the emulator that runs in DIR what goes wrong from now on, and end",
+        help="tell the emulator that runs in DIR what goes wrong from now on, or ask for a report, "
+        "and end",
     )
     parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
@@ -92,7 +113,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT or SIGTERM; 1 with one line when it can't be set up."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
     if arguments.send is not None:
         return _send(arguments.dir, arguments.send)
     try:
@@ -100,8 +121,18 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
+    signals = _Signals()
+    try:
+        return _serve(settings, arguments, signals)
+    except Interrupted:
+        return 0
+
+
+def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals) -> int:
     # What follows imports numpy and numba: wrong settings are told without waiting for them.
-    from daemon.realtime import settle
+    from daemon.realtime import RealTime, hold_collector
+
+    hold_collector()
     from daemon.simulation.emulator import Emulator, EmulatorError
     from tools.run import cache_folder
 
@@ -114,22 +145,67 @@ def run(arguments: argparse.Namespace) -> int:
             prepared=not arguments.factory,
             faults=arguments.fault,
             table_cache=cache_folder(),
+            undisturbed=signals.held,
         )
     except (EmulatorError, SettingsError) as error:
         print(f"softfinger: {error}", file=sys.stderr)
         return 1
-
-    def ready() -> None:
-        settle()
-        print("ready", flush=True)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: emulator.stop())
     try:
-        emulator.run(ready)
+        signals.hand_over(emulator)
+        with RealTime(_unhurried(settings, arguments.baud > 0)):
+            emulator.run(lambda: print("ready", flush=True))
     finally:
         emulator.close()
     return 0
+
+
+def _unhurried(settings: Settings, paced: bool) -> Settings:
+    """``settings`` with the real-time measures that suit a pseudo-terminal.
+
+    Not SCHED_FIFO, which holds up the kernel's worker that carries the bytes across. Idle states
+    are held off where servos have a wire's time, since they sleep as little as a wire does.
+    """
+    changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
+    held = paced and settings.realtime.hold_latency
+    realtime = settings.realtime.model_copy(update={**changes, "hold_latency": held})
+    loop = settings.loop.model_copy(update={"clock": "real"})
+    return settings.model_copy(update={"realtime": realtime, "loop": loop})
+
+
+class Interrupted(BaseException):
+    """A signal asked for the end before anything answered."""
+
+
+class _Signals:
+    """SIGINT, SIGTERM and SIGHUP (the terminal is gone) end, quietly, at whatever stage."""
+
+    def __init__(self) -> None:
+        self._emulator: Any = None
+        self._ended = self._held = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._end)
+
+    def hand_over(self, emulator: Any) -> None:
+        """From now on signals speak to the emulator. Raises Interrupted when one came before."""
+        self._emulator = emulator
+        if self._ended:
+            raise Interrupted
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Signals wait meanwhile."""
+        self._held = True
+        yield
+        self._held = False
+        if self._ended:
+            raise Interrupted
+
+    def _end(self, _number: int, _frame: Any) -> None:
+        self._ended = True
+        if self._emulator is not None:
+            self._emulator.stop()
+        elif not self._held:
+            raise Interrupted
 
 
 def _send(folder: Path, words: str) -> int:
@@ -139,10 +215,12 @@ def _send(folder: Path, words: str) -> int:
         reply = send_words(folder, words)
     except NoEmulator as error:
         reply = f"error: {error}"
-    if reply == "ok":
-        return 0
-    print(f"softfinger: {reply.removeprefix('error: ')}", file=sys.stderr)
-    return 1
+    if reply.startswith("error: "):
+        print(f"softfinger: {reply.removeprefix('error: ')}", file=sys.stderr)
+        return 1
+    if reply != "ok":
+        print(reply)
+    return 0
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:

@@ -14,7 +14,7 @@ from daemon.servos.modes import current_toward, mode_number
 from daemon.servos.units import JointScale
 from daemon.settings import Settings
 from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.servo import AMBIENT, THERMAL_RISE, THERMAL_TIME
+from daemon.simulation.servo_health import AMBIENT, THERMAL_RISE, THERMAL_TIME
 
 _HEALTH_EVERY = 0.25  # s between two looks at temperature and supply
 

@@ -240,6 +240,19 @@ class ControlTable:
             plan.append((item, value))
         return protocol.OK, plan
 
+    def values(self, address: int, data: bytes) -> dict[int, int]:
+        """What a write has for each register that it holds whole, allowed or not."""
+        places = [self.resolve(i) for i in range(address, min(address + len(data), self.size))]
+        found = {}
+        for i, place in enumerate(places):
+            item = self.at.get(place)
+            if item is not None and places[i : i + item.size] == list(
+                range(place, place + item.size)
+            ):
+                raw = data[i : i + item.size]
+                found[place] = int.from_bytes(raw, "little", signed=item.signed)
+        return found
+
     def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
         """Which items a span writes, with their places in its data, or the error it makes."""
         known = self._layouts.get((address, length))

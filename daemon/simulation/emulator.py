@@ -8,12 +8,15 @@ before it looks for bytes again. Here live that loop and its time.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import select
 import socket
 import time
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 from daemon.model import make_material, make_table
 from daemon.records import FINGERS
@@ -30,6 +33,7 @@ from daemon.simulation.tactile_board import BoardFault, TactileBoard
 from daemon.tactile.simulated import SimulatedTactile
 
 _STEP = 0.002  # s, longest that the physics lags behind
+_ASKS = ("report", "forget")  # words to the control socket that are no fault
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
 # The board that stands in where a profile names none: that of config/hil.toml.
 DEFAULT_BOARD = {
@@ -90,23 +94,29 @@ class Emulator:
         prepared: bool = True,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
+        undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
         ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
         with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
         rate. ``faults``: see :class:`Faults`.
-        ``table_cache``: a folder where the contact table is kept. Raises EmulatorError, and
-        SettingsError when the settings' material is no stress-strain law.
+        ``table_cache``: a folder where the contact table is kept. ``undisturbed``: what keeps
+        exceptions of signal handlers out while something is made that is to be taken away.
+        Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
+        self._undisturbed = undisturbed
+        self._watched: list[int | TactileBoard | socket.socket] | None = None
         try:
-            self._build(
-                with_board(settings), folder, (baud, latency), prepared, faults, table_cache
-            )
+            self._ids = settings.servos.ids
+            self._events = Faults(faults, self._ids).events
+            with undisturbed():
+                self._take(folder)
+            self._build(with_board(settings), (baud, latency), prepared, table_cache)
         except (FolderError, FaultError) as error:
             self.close()
             raise EmulatorError(str(error)) from None
@@ -114,28 +124,27 @@ class Emulator:
             self.close()
             raise
 
+    def _take(self, folder: Path) -> None:
+        self._links = LinkFolder(folder)
+        self._closers.append(self._links.close)
+        self._control = ControlPort(folder, self.tell)
+        self._closers.append(self._control.close)
+
     def _build(
         self,
         settings: Settings,
-        folder: Path,
         pace: tuple[int, float],
         prepared: bool,
-        words: Iterable[str],
         table_cache: Path | None,
     ) -> None:
-        self._ids = settings.servos.ids
-        self._events = Faults(words, self._ids).events
-        links = self._links = LinkFolder(folder)
-        self._closers.append(links.close)
-        self._control = ControlPort(folder, self.tell)
-        self._closers.append(self._control.close)
         self.clock = EmulatorClock()
         table = make_table(settings, make_material(settings.material), table_cache)
         self.hand = SimulatedHand(settings, 0.0, table)
         self._servos: PtyServoBus | None = None
         if settings.servos.backend != "none":
-            self._servos = self._make_servos(settings, links, pace, prepared)
-            self._closers.append(self._servos.close)
+            with self._undisturbed():
+                self._servos = self._make_servos(settings, pace, prepared)
+                self._closers.append(self._servos.close)
         self._boards: dict[str, TactileBoard] = {}
         self._sources: list[SimulatedTactile] = []
         tactile = settings.tactile
@@ -153,11 +162,12 @@ class Emulator:
                 self._sources.append(source)
                 self._boards[FINGERS[finger]] = board
                 self._closers.append(board.close)
-                links.link(f"tactile-{FINGERS[finger]}", board.path)
+                with self._undisturbed():
+                    self._links.link(f"tactile-{FINGERS[finger]}", board.path)
         self._advance_due = 0.0
 
     def _make_servos(
-        self, settings: Settings, links: LinkFolder, pace: tuple[int, float], prepared: bool
+        self, settings: Settings, pace: tuple[int, float], prepared: bool
     ) -> PtyServoBus:
         baud, latency = pace
         try:
@@ -166,7 +176,7 @@ class Emulator:
             raise EmulatorError(f"servos.model: {error.args[0]}") from None
         except ValueError as error:
             raise EmulatorError(str(error)) from None
-        link = links.path / "servos"
+        link = self._links.path / "servos"
         return PtyServoBus(bus, link, baud=baud, latency=latency, clock=self.clock.now)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
@@ -197,27 +207,22 @@ class Emulator:
     def _turn(self) -> None:
         """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
         servos, boards = self._servos, self._boards.values()
-        t = self.clock.now()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
-        watched: list[int | TactileBoard | socket.socket] = [
-            self._wake[0],
-            *self._control.sockets(),
-            *[board for board in boards if board.plugged],
-        ]
         if servos is not None:
-            due = min(due, servos.next_event(t))
-            if servos.fileno() >= 0:
-                watched.append(servos.fileno())
-        ready, _, _ = select.select(watched, (), (), max(due - t, 0.0))
+            due = min(due, servos.next_event())
+        if self._watched is None:
+            self._watched = self._watch()
+        start = self.clock.now()
+        ready, _, _ = select.select(self._watched, (), (), max(due - start, 0.0))
         t = self.clock.now()
-        if servos is not None and (servos.fileno() in ready or servos.next_event(t) <= t):
-            servos.service(t)
-        for board in boards:
-            if board in ready:
-                board.hear()
-        asked = [each for each in ready if isinstance(each, socket.socket)]
-        if asked:
-            self._control.serve(asked)
+        if servos is not None and (servos.fileno() in ready or servos.next_event() <= t):
+            servos.service(t, start)
+        for each in ready:
+            if isinstance(each, TactileBoard):
+                each.hear()
+            elif isinstance(each, socket.socket):
+                self._control.serve([each])
+                self._watched = None
         late = [board for board in boards if board.next_event() <= t]
         if late:
             self._advance(t)
@@ -225,9 +230,21 @@ class Emulator:
         elif self._advance_due <= t:
             self._advance(t)
 
+    def _watch(self) -> list[int | TactileBoard | socket.socket]:
+        """What bytes may come from."""
+        watched: list[int | TactileBoard | socket.socket] = [
+            self._wake[0],
+            *self._control.sockets(),
+            *[board for board in self._boards.values() if board.plugged],
+        ]
+        if self._servos is not None and self._servos.fileno() >= 0:
+            watched.append(self._servos.fileno())
+        return watched
+
     def _advance(self, t: float) -> None:
         while self._events and self._events[0].after <= t:
             self._apply(self._events.pop(0), t)
+            self._watched = None
         if self._servos is not None:
             self._servos.bus.advance(t)
         else:
@@ -237,17 +254,31 @@ class Emulator:
     def tell(self, text: str) -> str:
         """Take words from the control socket; ``ok``, or ``error: `` and why none of them counts.
 
-        A time behind a word counts from now.
+        A time behind a word counts from now. With ``report`` among them the answer is
+        :meth:`report` as JSON; ``forget`` lets the record begin anew.
         """
+        words = text.split()
         try:
-            fresh = Faults(text.split(), self._ids).events
+            fresh = Faults([word for word in words if word not in _ASKS], self._ids).events
         except FaultError as error:
             return f"error: {error}"
         now = self.clock.now()
+        reply = json.dumps(self.report(now)) if "report" in words else "ok"
+        if "forget" in words and self._servos is not None:
+            self._servos.bus.forget(now)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
-        self._advance_due = now  # so that what starts now does
-        return "ok"
+        self._advance(now)  # what starts now does so before the reply
+        return reply
+
+    def report(self, t: float) -> dict[str, Any]:
+        """What was on the servos' wire, and their state; times are the hand's [s].
+
+        ``monotonic`` is time.monotonic() at ``t``, for whoever compares with a time of his own.
+        """
+        bus = self._servos.bus if self._servos is not None else None
+        servos = bus.report(t) if bus is not None else {}
+        return {"t": t, "monotonic": time.monotonic(), "servos": servos}
 
     def _apply(self, event: Event, t: float) -> None:
         servos = self._servos

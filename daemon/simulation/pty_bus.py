@@ -2,7 +2,8 @@
 
 It owns the terminal and the time on the wire: replies leave when their last byte would have
 arrived at the client's baud rate, return delays and a USB adapter's latency included; or at once,
-unpaced. What the bytes mean is :mod:`daemon.simulation.servo_bus`'s affair.
+unpaced. Times on the wire are absolute: where this process was kept from running, which no servo
+ever is, that does not count. What the bytes mean is :mod:`daemon.simulation.servo_bus`'s affair.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
+from daemon.simulation.run_delay import RunDelay
 from daemon.simulation.servo_bus import ServoBus
 
 _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control characters, two speeds
@@ -64,6 +66,7 @@ class PtyServoBus:
         self._latency = latency
         self._spin = spin
         self._clock = clock
+        self._run_delay: RunDelay | None = None
         self._master = self._slave = -1
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
@@ -108,6 +111,8 @@ class PtyServoBus:
     def close(self) -> None:
         """Take the port away for good."""
         self.unplug()
+        if self._run_delay is not None:
+            self._run_delay.close()
 
     def client_baud(self) -> int:
         """The rate that the terminal is set to."""
@@ -115,29 +120,39 @@ class PtyServoBus:
         fcntl.ioctl(self._master, _TCGETS2, raw, True)
         return int(_TERMIOS2.unpack(raw)[-1])
 
-    def next_event(self, t: float) -> float:
-        """When :meth:`service` is needed next [s] though no byte came; t is the time now."""
+    def next_event(self) -> float:
+        """When :meth:`service` is needed next [s] though no byte came."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
-    def service(self, t: float) -> None:
-        """Take what has arrived by time t [s], let the servos act, send what is due."""
+    def service(self, t: float, since: float | None = None) -> None:
+        """Take what has arrived by time t [s], let the servos act, send what is due.
+
+        ``since``: when the caller began to wait, as it had nothing to take; now, if it is not told.
+        """
         if self._master < 0:
             self.bus.advance(t)
             return
+        arrived = self._arrival(t, t if since is None else since) if self._baud else t
         for _ in range(_AT_A_TIME):
             try:
                 data = os.read(self._master, _READ_SIZE)
             except OSError:  # nothing there
                 break
-            self._receive(data, t)
+            self._receive(data, t, arrived)
             # A client's next request often comes while its last write is being done.
-            t = max(t, self._clock())
+            arrived = t = max(t, self._clock())
         if t > self.bus.now:
             self.bus.advance(t)
         self._send()
 
-    def _receive(self, data: bytes, t: float) -> None:
+    def _arrival(self, t: float, since: float) -> float:
+        """When bytes seen at time t came, if others had the processor from then on."""
+        if self._run_delay is None:
+            self._run_delay = RunDelay()
+        return min(t, max(since, t - self._run_delay.since_last()))
+
+    def _receive(self, data: bytes, t: float, arrived: float) -> None:
         if not self._baud:
             for reply in self.bus.exchange(data, t):
                 if reply.late:
@@ -149,7 +164,7 @@ class PtyServoBus:
         if baud <= 0:
             return
         byte_time = _BITS_PER_BYTE / baud
-        free_at = max(self._free_at, t - PASSAGE) + len(data) * byte_time
+        free_at = max(self._free_at, arrived - PASSAGE) + len(data) * byte_time
         for reply in self.bus.exchange(data, t, baud):
             free_at += reply.delay + len(reply.data) * byte_time
             due = free_at + reply.late

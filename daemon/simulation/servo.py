@@ -3,13 +3,13 @@
 Holds the behaviour behind the control table: torque, operating modes, limits, profiles, bus
 watchdog, hardware errors and shutdown, reboot, backup. Packets are the bus's affair
 (:mod:`daemon.simulation.servo_bus`). Choices of our own, where the manuals say nothing: a write
-that breaks any rule changes nothing at all; torque on after a shutdown is refused with RESULT_FAIL;
-overload is OVERLOAD_TIME of current at the configured limit.
+that breaks any rule changes nothing at all; torque on after a shutdown is refused with RESULT_FAIL.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from daemon.servos import registers as reg
 from daemon.servos.models import ServoModel
@@ -17,15 +17,13 @@ from daemon.servos.units import JointScale
 from daemon.simulation import protocol
 from daemon.simulation.control_table import ControlTable, Item
 from daemon.simulation.joint_plant import JointPlant
+from daemon.simulation.servo_health import SENSE, ServoHealth
 from daemon.simulation.servo_joint import STEP, ServoJoint
 from daemon.simulation.servo_rules import refusal, shut_down
+from daemon.simulation.table_backup import TableBackup
+from daemon.simulation.wire_watch import WireWatch
 
 REBOOT_TIME = 0.34  # s without an answer
-OVERLOAD_TIME = 2.0  # s at the current limit
-SENSE = 0.010  # s: temperature, voltage and overload
-AMBIENT = 25.0  # °C
-THERMAL_TIME = 120.0  # s
-THERMAL_RISE = 90.0  # °C over ambient at stall current, in the long run
 # Registers whose writing does more than change them.
 _EFFECTIVE = frozenset(
     (
@@ -47,8 +45,8 @@ class EmulatedServo:
     """A servo on joint ``joint`` of ``plant``, factory-new unless ``prepared``.
 
     ``prepared`` brings it up as the backend wants it: in operating mode ``mode`` where the model
-    has it, and with no return delay. ``voltage`` and ``temperature`` may be set from outside, and
-    ``silent`` makes it deaf and dumb.
+    has it, and with no return delay. What ``health`` has may be set from outside, and ``silent``
+    makes it deaf and dumb.
     """
 
     def __init__(
@@ -70,17 +68,16 @@ class EmulatedServo:
         self.fast_reads = model.fast_read(self.firmware)  # answers fast sync and fast bulk read
         self.table = ControlTable(model, self.firmware)
         self.silent = False
-        self.voltage = (model.voltage_min + model.voltage_max) / 2 * reg.VOLTAGE_UNIT
-        self.temperature = AMBIENT
+        self.health = ServoHealth(model)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
+        self.watch = WireWatch(t)
         self._registered: tuple[int, bytes] | None = None
-        self._backup: dict[int, int] | None = None
+        self._backup = TableBackup(self.table)
         self._watched = 0.0  # time of the last packet the watchdog knows of
         self._booted = t
         self._boot_at = -math.inf  # a reboot ends then
         self._next_step = math.inf
         self._next_sense = t
-        self._overload = 0.0
         self.table.set(reg.ID, servo_id)
         self.table.set(reg.BAUD_RATE, baud_index)
         if prepared:
@@ -140,6 +137,7 @@ class EmulatedServo:
     def heard(self, t: float) -> None:
         """An instruction packet went by: the bus watchdog starts anew."""
         self._watched = t
+        self.watch.heard(t, self.torque_on)
 
     def next_event(self) -> float:
         """When :meth:`act` next has something to do [s]."""
@@ -163,6 +161,7 @@ class EmulatedServo:
         armed = 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on
         if armed and t >= self._watched + ticks * reg.WATCHDOG_UNIT:
             self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
+            self.watch.fired(t)
             self._stop()
         if t >= self._next_step:
             if self.torque_on and self._joint.moves_by_itself():
@@ -184,7 +183,7 @@ class EmulatedServo:
         if address >= reg.PRESENT_CURRENT and address + length <= _MOTION_END:
             self._joint.refresh_motion()
         elif table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
-            self._joint.refresh(t - self._booted, self.voltage, self.temperature)
+            self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
@@ -192,6 +191,7 @@ class EmulatedServo:
         error, plan = self._checked(address, data)
         if error:
             return error
+        limp = not self.torque_on
         for item, value in plan:
             self.table.put(item, value)
         for item, value in plan:
@@ -199,6 +199,8 @@ class EmulatedServo:
                 self._effect(item.address, value, t)
         if self.torque_on and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)
+        if limp and self.torque_on:
+            self._note_torque(t)
         self._joint.drive()
         return protocol.OK
 
@@ -243,7 +245,7 @@ class EmulatedServo:
             return protocol.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
             return protocol.DATA_RANGE
-        self._joint.refresh(t - self._booted, self.voltage, self.temperature)
+        self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
         if self.table.memory[reg.MOVING]:
             return protocol.RESULT_FAIL
         shift = self._joint.forget_turns()
@@ -261,16 +263,11 @@ class EmulatedServo:
         if self.torque_on:
             return protocol.RESULT_FAIL
         if parameters[0] == 1:
-            self._backup = {
-                item.address: self.table.get(item.address)
-                for item in self.table.items
-                if item.writable and (item.saved or item.backed_up)
-            }
-            self.table.set(reg.BACKUP_READY, 1)
+            self._backup.store()
             return protocol.OK
-        if self._backup is None:
+        if not self._backup.held:
             return protocol.RESULT_FAIL
-        self._restore(saved=True)
+        self._backup.restore(saved=True)
         self.reboot(t)
         return protocol.OK
 
@@ -282,22 +279,51 @@ class EmulatedServo:
             self.table.set(reg.TORQUE_ENABLE, 0)
             self._joint.drive()
 
+    def forget(self, t: float) -> None:
+        """Begin the record anew."""
+        self.watch = WireWatch(t)
+
+    def report(self, t: float) -> dict[str, Any]:
+        """Its state, and what it was told since the record began."""
+        ticks = self.table.memory[reg.BUS_WATCHDOG]
+        return {
+            "torque": self.torque_on,
+            "mode": self.mode,
+            "hardware_error": self.table.memory[reg.HARDWARE_ERROR_STATUS],
+            "watchdog": ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else None,
+            "stopped_by_watchdog": ticks == reg.WATCHDOG_ERROR,
+            "q": self._joint.goal_angle(self._joint.position()),
+            **self.watch.report(t, self._joint, self.torque_on),
+        }
+
     def recover(self) -> None:
         """Cool down and bring the supply back; a latched hardware error stays until a reboot."""
-        self.temperature = AMBIENT
-        self.voltage = (self.model.voltage_min + self.model.voltage_max) / 2 * reg.VOLTAGE_UNIT
+        self.health.recover()
 
     # --- rules of writing ------------------------------------------------------------------
 
     def _checked(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
         error, plan = self.table.plan(address, data)
-        if error:
-            return error, []
         for item, value in plan:
-            error = refusal(self.table, self.model, item, value)
-            if error:
-                return error, []
+            self.watch.goal(item.address, value)
+            error = error or refusal(self.table, self.model, item, value)
+        if error:
+            self._note_refused(address, data)
+            return error, []
         return protocol.OK, plan
+
+    def _note_refused(self, address: int, data: bytes) -> None:
+        """Goals that were on the wire though the table would not have them."""
+        values = self.table.values(address, data)
+        if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
+            self.watch.refused()
+        for each, value in values.items():
+            self.watch.goal(each, value)
+
+    def _note_torque(self, t: float) -> None:
+        current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
+        goals = self.table.get(reg.GOAL_POSITION), current
+        self.watch.torque_on(t, self._joint, self.mode, goals)
 
     def _effect(self, address: int, value: int, t: float) -> None:
         if address == reg.TORQUE_ENABLE:
@@ -336,14 +362,15 @@ class EmulatedServo:
     def _start(self, t: float) -> None:
         """Power-up, or the end of a reboot."""
         table = self.table
-        startup = table.memory[reg.STARTUP_CONFIGURATION] if self._has_startup() else 0
+        known = reg.STARTUP_CONFIGURATION in table.at
+        startup = table.memory[reg.STARTUP_CONFIGURATION] if known else 0
         table.reset_ram()
-        if startup & 2 and self._backup is not None:
-            self._restore(saved=False)
-        if self._backup is not None:
-            table.set(reg.BACKUP_READY, 1)
+        if self._backup.held:
+            if startup & 2:
+                self._backup.restore(saved=False)
+            self._backup.tell()
         self._registered = None
-        self._overload = 0.0
+        self.health.restart()
         self._booted = self._watched = t
         self._joint.forget_turns()
         self._reset_goals()
@@ -353,15 +380,6 @@ class EmulatedServo:
         if startup & 1:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.drive()
-
-    def _has_startup(self) -> bool:
-        return reg.STARTUP_CONFIGURATION in self.table.at
-
-    def _restore(self, saved: bool) -> None:
-        assert self._backup is not None
-        for address, value in self._backup.items():
-            if self.table.at[address].saved == saved:
-                self.table.set(address, value)
 
     # --- what happens by itself ------------------------------------------------------------
 
@@ -380,17 +398,7 @@ class EmulatedServo:
         self._joint.drive()
 
     def _sense(self) -> None:
-        table = self.table
         current = self._joint.current
-        share = current / self.model.stall_current
-        warm = AMBIENT + THERMAL_RISE * share * share
-        self.temperature += (warm - self.temperature) * SENSE / THERMAL_TIME
-        if self.temperature > table.get(reg.TEMPERATURE_LIMIT):
-            self.fail(2)
-        low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
-        if not low <= round(self.voltage / reg.VOLTAGE_UNIT) <= high:
-            self.fail(0)
         pressed = self.torque_on and current >= 0.99 * self._joint.current_limit
-        self._overload = self._overload + SENSE if pressed else 0.0
-        if self._overload >= OVERLOAD_TIME:
-            self.fail(5)
+        for bit in self.health.sense(self.table, current, pressed):
+            self.fail(bit)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from daemon.servos import registers as reg
 from daemon.servos.models import ServoModel, by_name
@@ -204,15 +204,25 @@ class ServoBus:
         if kind == "reboot":
             servo.reboot(t)
         elif kind == "overheat":
-            servo.temperature = servo.table.get(reg.TEMPERATURE_LIMIT) + 5.0
+            servo.health.temperature = servo.table.get(reg.TEMPERATURE_LIMIT) + 5.0
         elif kind == "overload":
             servo.fail(5)
         elif kind == "undervoltage":
-            servo.voltage = (model.voltage_min - 10) * reg.VOLTAGE_UNIT
+            servo.health.voltage = (model.voltage_min - 10) * reg.VOLTAGE_UNIT
         elif kind == "recover":
             servo.recover()
         else:
             servo.silent = kind == "silent"
+
+    def report(self, t: float) -> dict[str, dict[str, Any]]:
+        """Each servo's state, and what it was told since the record began, by its ID."""
+        self.advance(t)
+        return {str(servo.id): servo.report(t) for servo in self.servos}
+
+    def forget(self, t: float) -> None:
+        """Begin the record anew."""
+        for servo in self.servos:
+            servo.forget(t)
 
     # --- instructions ----------------------------------------------------------------------
 

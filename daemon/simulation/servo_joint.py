@@ -93,6 +93,14 @@ class ServoJoint:
         within = self.sign * (position - _I32(self._table.memory, reg.HOMING_OFFSET)[0])
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
+    def goal_angle(self, counts: int) -> float:
+        """Joint angle [rad] that a goal position means."""
+        return self._angle(counts)
+
+    def goal_current(self, counts: int) -> float:
+        """Current [A] that a goal current means, positive closing; in a bound its sign is void."""
+        return self._scale.amperes(self.sign * counts)
+
     # --- trajectory --------------------------------------------------------------------------
 
     def hold(self) -> None:
