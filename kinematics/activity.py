@@ -35,15 +35,15 @@ def neighbourhood(frame: Pointer, height: Pointer, rows: int, cols: int, i: int,
     for k in range(max(i - 2, 0), min(i + 3, rows)):
         row_weight = 1.0 if abs(k - i) == 2 else 2.0
         for m in range(max(j - 2, 0), min(j + 3, cols)):
-            if height[k * cols + m] >= 0.0 and not (k == i and m == j):
-                weight = row_weight if abs(m - j) == 2 else 2.0 * row_weight
-                total += weight * frame[k * cols + m]
-                squares += weight * weight
+            weight = row_weight if abs(m - j) == 2 else 2.0 * row_weight
+            counts = (height[k * cols + m] >= 0.0) & ((k != i) | (m != j))
+            total += weight * frame[k * cols + m] if counts else 0.0
+            squares += weight * weight if counts else 0.0
     return total / math.sqrt(squares)
 
 
 @kernel
-def _weak_contact(
+def _walk(
     frame: Pointer,
     height: Pointer,
     rows: int,
@@ -52,14 +52,19 @@ def _weak_contact(
     last: int,
     level: float,
     patch: float,
-) -> bool:
-    """Whether any cell of ``level`` or more has a neighbourhood above ``patch``."""
+    peak: float,
+) -> tuple[bool, int]:
+    """Whether a cell of ``level`` or more has neighbours above ``patch``; where the peak is."""
+    contact = False
+    place = -1
     at = next_above(frame, height, first, last, level)
     while at < last:
-        if neighbourhood(frame, height, rows, cols, at // cols, at % cols) > patch:
-            return True
+        place = at if frame[at] == peak else place
+        contact = contact or (
+            neighbourhood(frame, height, rows, cols, at // cols, at % cols) > patch
+        )
         at = next_above(frame, height, at + 1, last, level)
-    return False
+    return contact, place
 
 
 @kernel
@@ -87,19 +92,19 @@ def activity(
     total, energy, peak = totals(readings, height, first, last)
     finite = math.isfinite(total) and math.isfinite(peak)
     contact = False
-    row = -1
-    col = -1
-    if finite and peak >= peak_level * noise:
-        at = next_above(readings, height, first, last, peak)
-        if at < last:
-            row = at // cols
-            col = at - row * cols
-            patch = patch_level * noise
-            contact = neighbourhood(readings, height, rows, cols, row, col) > patch
-            if not contact:
-                contact = _weak_contact(
-                    readings, height, rows, cols, first, last, peak_level * noise, patch
-                )
+    place = -1
+    level = peak_level * noise
+    patch = patch_level * noise
+    if finite and peak >= level:
+        if peak > _STRONG * noise:
+            place = next_above(readings, height, first, last, peak)
+            contact = (
+                neighbourhood(readings, height, rows, cols, place // cols, place % cols) > patch
+            )
+        if not contact:
+            contact, place = _walk(readings, height, rows, cols, first, last, level, patch, peak)
+    row = place // cols if place >= 0 else -1
+    col = place - row * cols if place >= 0 else -1
     return contact, row, col, peak, total / max(float(bounds[NUMBER]), 1.0), energy, finite
 
 

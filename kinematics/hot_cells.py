@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
-
 from kinematics.activity import activity
 from kinematics.cells import LIVE
 from kinematics.footprint import FloatArray, IntArray
 from kinematics.kernels import kernel
 from kinematics.lanes import Pointer, address
-from kinematics.middles import HEIGHT, NUMBER, X, Y
+from kinematics.middles import HEIGHT, NUMBER
 from kinematics.workspace import SPIKES, SPIKES_MAX
+
+_DEAD = 1e3  # m below: no face is ever there
 
 
 @kernel
@@ -63,14 +63,15 @@ def without_spikes(
     rejected = 0
     seen = activity(frame, middles, integers, noise, peak_level, patch_level)
     while (
-        seen[1] >= 0
+        seen[3] > 10.0 * noise + confined
+        and seen[1] >= 0
         and rejected < SPIKES_MAX
         and is_spike(
             address(frame), address(middles), rows, cols, seen[1], seen[2], noise, confined
         )
     ):
         cells[seen[1], LIVE, seen[2]] = 0.0
-        middles[HEIGHT, seen[1] * cols + seen[2]] = -math.inf
+        middles[HEIGHT, seen[1] * cols + seen[2]] -= _DEAD
         integers[NUMBER] -= 1
         integers[SPIKES + rejected] = seen[1] * cols + seen[2]
         rejected += 1
@@ -79,15 +80,11 @@ def without_spikes(
 
 
 @kernel
-def revive(
-    rejected: int, a: float, cells: FloatArray, middles: FloatArray, integers: IntArray
-) -> None:
-    """Make the hot cells of :func:`_without_spikes` live again."""
+def revive(rejected: int, cells: FloatArray, middles: FloatArray, integers: IntArray) -> None:
+    """Make the hot cells of :func:`without_spikes` live again."""
     cols = cells.shape[2]
     for k in range(rejected):
         at = integers[SPIKES + k]
         cells[at // cols, LIVE, at % cols] = 1.0
-        x = middles[X, at]
-        y = middles[Y, at]
-        middles[HEIGHT, at] = math.sqrt(max(a * a - x * x - y * y, 0.0))
+        middles[HEIGHT, at] += _DEAD
         integers[NUMBER] += 1

@@ -10,6 +10,7 @@ import math
 
 from kinematics import gauss_newton
 from kinematics.activity import presses_outside
+from kinematics.borrowed import borrowed
 from kinematics.footprint import FloatArray, IntArray
 from kinematics.gauss_newton import RESULT, fit
 from kinematics.hot_cells import revive, without_spikes
@@ -132,7 +133,7 @@ def _moments(
     geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
     a = plan[0]
     fixed = 0.0 if plan[FREE_GAIN] > 0.0 else plan[FIXED_GAIN]
-    near = 0.25 * min(plan[3], plan[4])
+    near = 0.5 * min(plan[3], plan[4])
     for _ in range(8):
         d, n_x, n_y, gain = refine(
             frame,
@@ -329,6 +330,13 @@ def estimate_frame(
     of a count's quantum [Pa], 0 for none. ``cells`` are the grid's planes, ``tables`` the moments'
     ratios and the law, ``floats`` and ``integers`` what workspace.py says.
     """
+    frame = borrowed(frame)
+    plan = borrowed(plan)
+    cells = borrowed(cells)
+    tables = borrowed(tables)
+    state = borrowed(state)
+    floats = borrowed(floats)
+    integers = borrowed(integers)
     size = frame.size
     middles = floats[: MIDDLES * size].reshape(MIDDLES, size)
     scratch = floats[MIDDLES * size :]
@@ -376,7 +384,7 @@ def estimate_frame(
     state[VALID] = 1.0 if sound else 0.0
     state[WARM] = 1.0 if done else 0.0
     if rejected > 0:
-        revive(rejected, plan[0], cells, middles, integers)
+        revive(rejected, cells, middles, integers)
 
 
 # The fit leaves its result at the start of the state.

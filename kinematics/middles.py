@@ -16,8 +16,9 @@ from kinematics.footprint import FloatArray, Geometry, IntArray
 from kinematics.kernels import fast_kernel
 from kinematics.lanes import Pointer
 
-# Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's middle, 0
-# beyond the rim, −∞ for a cell that is dead or out of reach, and the middle's x and y.
+# Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's middle, or
+# over its nearest corner where the middle lies beyond the rim, and −∞ for a cell that is dead or
+# out of reach; the middle's x and y.
 HEIGHT, X, Y = range(3)
 PLANES = 3
 
@@ -41,7 +42,9 @@ def cell_middles(
     nearest_x = np.maximum(np.abs(x) - 0.5 * pitch_x, 0.0)
     nearest_y = np.maximum(np.abs(y) - 0.5 * pitch_y, 0.0)
     touched = nearest_x**2 + nearest_y**2 < reach * reach
-    height = np.sqrt(np.maximum(a * a - x * x - y * y, 0.0))
+    near = np.maximum(a * a - nearest_x**2 - nearest_y**2, 0.0)
+    inside = a * a - x * x - y * y
+    height = np.sqrt(np.where(inside > 0.0, inside, near))
     planes = np.stack([np.where(touched & live, height, -math.inf), x, y]).reshape(PLANES, -1)
     reached = np.flatnonzero(touched.any(axis=1))
     first, last = (int(reached[0]), int(reached[-1]) + 1) if len(reached) else (0, 0)
@@ -116,7 +119,7 @@ def sums_inside(
 
 
 @fast_kernel
-def _any_above(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
+def _any_of_64(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
     found = False
     for k in range(start, start + 64):
         found |= (frame[k] >= level) & (height[k] >= 0.0)
@@ -124,10 +127,20 @@ def _any_above(frame: Pointer, height: Pointer, start: int, level: float) -> boo
 
 
 @fast_kernel
+def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
+    found = False
+    for k in range(start, start + 8):
+        found |= (frame[k] >= level) & (height[k] >= 0.0)
+    return found
+
+
+@fast_kernel
 def next_above(frame: Pointer, height: Pointer, start: int, last: int, level: float) -> int:
     """The first cell in start..last that reads ``level`` or more; ``last`` if there is none."""
-    while start + 64 <= last and not _any_above(frame, height, start, level):
+    while start + 64 <= last and not _any_of_64(frame, height, start, level):
         start += 64
+    while start + 8 <= last and not _any_of_8(frame, height, start, level):
+        start += 8
     while start < last and not (frame[start] >= level and height[start] >= 0.0):
         start += 1
     return start

@@ -125,7 +125,8 @@ def footprint_moments(
 def from_extent(a: float, trace: float, reach: float, ratios: FloatArray, start: float) -> float:
     """d from the trace of the pressure's covariance and the centroid's distance ``reach``.
 
-    Newton's iteration from d = ``start``, to 1e-9 of the radius.
+    Newton's iteration from d = ``start``; its last step is below 1e-5 of the radius, so that what
+    is left is of 1e-10.
     """
     d = min(max(start, 0.01 * a), 0.9 * a)
     for _ in range(8):
@@ -134,7 +135,7 @@ def from_extent(a: float, trace: float, reach: float, ratios: FloatArray, start:
         miss = closed_trace(a, d, s) - trace / _ratio(ratios, a, d, 2)
         before = d
         d = min(max(d - miss / slope, 0.0), 0.95 * a)
-        if abs(d - before) < 1e-9 * a:
+        if abs(d - before) < 1e-5 * a:
             break
     return d
 
