@@ -26,6 +26,8 @@ Kind = Literal["power", "cubic"]
 
 DEAD = 0.2  # of the median response: cells below are dead
 _EXPONENTS = (0.3, 3.0)
+_RESTLESS = 8.0  # times the usual noise
+_FEW_CELLS = 4  # may be faulty
 _BINS = 24  # of strain
 _LEAST_TILT = math.radians(3.0)  # below it a tilt tells no direction
 
@@ -65,11 +67,18 @@ class Tare:
 
 
 def tare(frames: ArrayLike) -> Tare:
-    """The zero of each cell from unloaded frames [n, rows, cols]."""
+    """The zero of each cell from unloaded frames [n, rows, cols].
+
+    Raises CalibrationError when some cells vary far more than most: something presses meanwhile.
+    """
     stack = _stack(frames, "tare")
     if len(stack) < 2:
         raise CalibrationError("tare: one frame is too few, expected at least two")
-    return Tare(stack.mean(axis=0), stack.std(axis=0, ddof=1))
+    noise = stack.std(axis=0, ddof=1)
+    restless = np.count_nonzero(noise > _RESTLESS * max(float(np.median(noise)), 0.5))
+    if restless >= _FEW_CELLS:
+        raise CalibrationError(f"tare: {restless} cells don't rest; does something touch the tip?")
+    return Tare(stack.mean(axis=0), noise)
 
 
 @dataclass(frozen=True)
@@ -308,38 +317,60 @@ class Law:
 
 
 def fit_law(
-    frames: ArrayLike, d: ArrayLike, theta: ArrayLike, tip: Fingertip, grid: SensorGrid
+    frames: ArrayLike,
+    d: ArrayLike,
+    theta: ArrayLike,
+    tip: Fingertip,
+    grid: SensorGrid,
+    used: NDArray[np.bool_] | None = None,
 ) -> Law:
     """σ(ε) from a compression run: each cell under the tip is a measured point of it.
 
-    ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad. A cell's strain is the model's,
-    averaged over it; points are the means over narrow bands of strain. Raises CalibrationError when
-    the points make no law.
+    ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
+    out cells that don't tell, dead or saturated ones. A cell's strain is the model's, averaged over
+    it; points are the means over narrow bands of strain, bands that noise has put out of order
+    taken together. Raises CalibrationError when the points make no law.
     """
     stack = _stack(frames, "modulus")
     unit = Material.constant(1.0)
     strains, stresses = [], []
-    for frame, depth, tilt in zip(
-        stack, np.asarray(d, np.float64), np.asarray(theta, np.float64), strict=True
+    told = np.ones(stack.shape, np.bool_) if used is None else used
+    for frame, tells, depth, tilt in zip(
+        stack, told, np.asarray(d, np.float64), np.asarray(theta, np.float64), strict=True
     ):
         if depth <= 0.0:
             continue
         strain = grid.pressure(tip, unit, float(depth), float(tilt))
-        strains.append(strain[strain > 0.0])
-        stresses.append(frame[strain > 0.0])
+        inside = tells & (strain > 0.0)
+        strains.append(strain[inside])
+        stresses.append(frame[inside])
     if not strains:
         raise CalibrationError("modulus: no frame with d above 0")
     strain, stress = np.concatenate(strains), np.concatenate(stresses)
+    if not strain.size:
+        raise CalibrationError("modulus: no cell under the tip tells its pressure")
     edges = np.linspace(0.0, float(strain.max()) * (1 + 1e-12), _BINS + 1)
     place = np.digitize(strain, edges) - 1
     filled = np.flatnonzero(np.bincount(place, minlength=_BINS) >= 3)
-    means = np.array([[strain[place == k].mean(), stress[place == k].mean()] for k in filled])
+    means = _rising([(strain[place == k], stress[place == k]) for k in filled])
     try:
         material = Material.from_points(means[:, 0], means[:, 1])
     except (ValueError, IndexError) as error:
         raise CalibrationError(f"modulus: the run makes no stress-strain law: {error}") from None
     residual = _rms(material.stress(strain) - stress)
     return Law(means[:, 0], means[:, 1], material, residual)
+
+
+def _rising(bands: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """(mean strain, mean stress) of each band, neighbours whose stress falls pooled, [k, 2]."""
+    pooled: list[list[float]] = []  # count, sum of strain, sum of stress
+    for strain, stress in bands:
+        pooled.append([float(len(strain)), float(strain.sum()), float(stress.sum())])
+        while len(pooled) > 1 and pooled[-1][2] * pooled[-2][0] <= pooled[-2][2] * pooled[-1][0]:
+            last = pooled.pop()
+            pooled[-1] = [a + b for a, b in zip(pooled[-1], last, strict=True)]
+    sums = np.array(pooled).reshape(-1, 3)
+    return sums[:, 1:] / sums[:, :1]
 
 
 def _stack(frames: ArrayLike, step: str) -> FloatArray:

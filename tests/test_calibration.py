@@ -42,6 +42,15 @@ def test_tare_is_the_mean_of_each_cell():
     np.testing.assert_allclose(found.noise, noise, rtol=0.08)
 
 
+def test_a_tare_while_something_presses_is_refused():
+    frames = 10.0 + RNG.standard_normal((20, 8, 8))
+    frames[:, 2:4, 3] *= 20.0  # two faulty cells may be as they like
+    tare(frames)
+    frames[10:, 4:6, 4:7] += 100.0
+    with pytest.raises(CalibrationError, match="8 cells don't rest"):
+        tare(frames)
+
+
 def test_equilibration_makes_cells_alike_and_finds_the_dead():
     gain = 1.0 + 0.2 * RNG.standard_normal((8, 8))
     gain[2, 3] = 0.0
@@ -165,3 +174,15 @@ def test_clipped_noise_far_from_the_contact_is_cleared():
 def test_data_that_do_not_tell_are_refused(call, told):
     with pytest.raises(CalibrationError, match=told):
         call()
+
+
+def test_saturated_cells_and_bands_out_of_order_make_no_wrong_law():
+    d = np.linspace(0.0005, 0.007, 30)
+    frames = np.stack([GRID.pressure(TIP, LINEAR, float(x)) for x in d])
+    full = 60e3
+    clipped = np.minimum(frames + 2e3 * RNG.standard_normal(frames.shape), full)
+    law = fit_law(clipped, d, np.zeros(30), TIP, GRID, clipped < full)
+    assert law.material.stress(0.15) == pytest.approx(0.15 * E, rel=0.02)
+    assert (np.diff(law.stress) > 0.0).all()
+    with pytest.raises(CalibrationError, match="no cell under the tip tells"):
+        fit_law(frames, d, np.zeros(30), TIP, GRID, np.zeros(frames.shape, bool))

@@ -29,6 +29,8 @@ steps, in this order; each goes into FILE, where the others stay:
 
 Frames come live from the sensor of the profile, load by load, or from recordings: one for each
 load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
+A live modulus may come from one press at a known speed (--speed): its zero of d is fitted.
+Each step draws what it found and what is left over beside FILE, where matplotlib is installed.
 A new equilibrate drops curve and modulus, a new curve drops modulus: they were made with the old.
 """
 
@@ -60,8 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kind", choices=("power", "cubic"), default="power", help="of the curve")
     parser.add_argument("--law", action="store_true", help="modulus: the whole stress-strain curve")
     parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw the residuals (extra 'plot')"
+        "--speed", type=_speed, metavar="X", help="modulus, live: of one press [mm/s], instead of d"
     )
+    parser.add_argument(
+        "--plot", type=Path, metavar="PICTURE", help="where to (default: FILE's name, .STEP.png)"
+    )
+    parser.add_argument("--no-plot", action="store_true", help="draw nothing")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -78,14 +84,16 @@ def run(arguments: argparse.Namespace) -> int:
     from tools.calibration_frames import gather
 
     try:
-        draw = _drawer(arguments.plot)
+        if arguments.speed is not None and (arguments.step != "modulus" or arguments.d):
+            raise CalibrationError("--speed: only modulus takes it, instead of --d")
+        draw = _drawer(arguments)
         calibration = _begin(arguments, settings)
-        loads = gather(arguments, settings, calibration.sensor)
+        loads = gather(arguments, settings, calibration)
         calibration, line, picture = _STEP[arguments.step](arguments, settings, calibration, loads)
         save_calibration(arguments.file, calibration)
         print(f"{arguments.step}: {line}; written to {arguments.file}")
         if draw is not None:
-            draw(arguments.step, picture, arguments.plot)
+            _draw(draw, arguments, picture)
     except (SettingsError, TactileError, RecordingError, CalibrationError, _NoPlot) as error:
         print(f"calibrate: {error}", file=sys.stderr)
         return 1
@@ -96,9 +104,19 @@ class _NoPlot(Exception):
     """The picture can't be drawn."""
 
 
-def _drawer(path: Path | None) -> Any:
-    """The function that draws, known to work before anything is measured; None without --plot."""
-    if path is None:
+def _speed(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value <= 1000.0:
+        raise argparse.ArgumentTypeError(f"expected mm/s above 0, found {text}")
+    return value
+
+
+def _drawer(arguments: argparse.Namespace) -> Any:
+    """The function that draws, known to work before anything is measured; None to draw nothing.
+
+    Without matplotlib a picture that was asked for is refused; else it is told, and left out.
+    """
+    if arguments.no_plot:
         return None
     from tools.calibration_plot import draw
     from tools.figure_pages.style import NoMatplotlib, settings
@@ -106,8 +124,20 @@ def _drawer(path: Path | None) -> Any:
     try:
         settings()
     except NoMatplotlib as error:
-        raise _NoPlot(f"--plot: {error}") from None
+        if arguments.plot is not None:
+            raise _NoPlot(f"--plot: {error}") from None
+        print(f"calibrate: no picture is drawn: {error}", file=sys.stderr)
+        return None
     return draw
+
+
+def _draw(draw: Any, arguments: argparse.Namespace, picture: dict[str, Any]) -> None:
+    file = arguments.file
+    path = arguments.plot or file.with_name(f"{file.stem}.{arguments.step}.png")
+    try:
+        draw(arguments.step, picture, path)
+    except (OSError, ValueError) as error:  # ValueError: a kind of picture that there isn't
+        raise _NoPlot(f"{path}: no picture: {error}") from None
 
 
 def _begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
@@ -226,6 +256,9 @@ def _curve(
             [grid.pressure(tip, material, float(x), float(t)).sum() * area
              for x, t in zip(d, theta, strict=True)]
         )  # fmt: skip
+    for k, frames in enumerate(loads.frames):
+        if (frames >= sensor.full_count).any():
+            raise CalibrationError(f"curve: load {k + 1} saturates a cell, which hides its force")
     readings = _readings(settings, calibration, loads)
     full = float(sensor.full_count) * max(
         map(max, calibration.equilibrate.gain) if calibration.equilibrate else [1.0]
@@ -309,17 +342,21 @@ def _modulus(
         [each[reading > 0.0].sum() for each, reading in zip(pressure, readings, strict=True)]
     )
     force *= area
-    found = fit_modulus(d, theta, force)
+    full = np.stack([(each >= calibration.sensor.full_count).any(axis=0) for each in loads.frames])
+    whole = ~full.any(axis=(1, 2))  # a saturated cell hides a part of the force
+    found = fit_modulus(d[whole], theta[whole], force[whole])
     line = (
-        f"E = {found.modulus / 1e6:.4f} MPa from {len(d)} frames, zero of d at "
+        f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} frames, zero of d at "
         f"{found.offset * 1e3:.3f} mm, force met within {found.residual:.2%} rms"
     )
+    if not whole.all():
+        line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
     strain: list[float] = []
     stress: list[float] = []
     if arguments.law:
         grid = make_grid(settings, finger, calibration)
-        pressure[:, ~converter.live] = 0.0
-        law = fit_law(pressure, d - found.offset, theta, make_tip(settings), grid)
+        told = converter.live & ~full
+        law = fit_law(pressure, d - found.offset, theta, make_tip(settings), grid, told)
         strain, stress = law.strain.tolist(), law.stress.tolist()
         line += f"; law of {len(strain)} points, cells {law.residual:.0f} Pa rms from it"
     step = ModulusStep(
@@ -330,6 +367,7 @@ def _modulus(
         offset=found.offset,
         residual=found.residual,
     )
+    d, theta, force = d[whole], theta[whole], force[whole]
     picture = {"d": d, "theta": theta, "force": force, "fit": found, "law": (strain, stress)}
     return _put(calibration, modulus=step), line, picture
 
