@@ -6,6 +6,7 @@ and expected. A question is left out when one of its sections is wrong already.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -109,6 +110,19 @@ def _material(settings: Settings) -> Iterator[str]:
         yield f"material.strain, material.stress: {error}"
 
 
+def _wedge(settings: Settings) -> Iterator[str]:
+    simulation = settings.simulation
+    if simulation.object_shape != "wedge":
+        return
+    height, width = simulation.object_height, simulation.object_width
+    most = 2.0 * math.atan(width / height)
+    if abs(simulation.object_taper) >= most:
+        yield (
+            f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
+            f"{most:.3g}, at which this width and height make the faces meet"
+        )
+
+
 def _cells(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
     for index, cells in enumerate(tactile.dead):
@@ -191,6 +205,7 @@ _QUESTIONS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], .
     (("scene", "servos"), _servos),
     (("servos", "loop"), _timing),
     (("material",), _material),
+    (("simulation",), _wedge),
     (("tactile",), _cells),
     (("scene", "tactile"), _recordings),
     (("servos", "tactile", "loop"), _clock),

@@ -256,8 +256,11 @@ class Simulation(Section):
 
     seed: Annotated[int, Field(ge=0)] = 1
     object_mass: Factor = 0.10  # kg
-    object_width: Length = 0.040
+    object_shape: Literal["rectangle", "disc", "wedge", "none"] = "rectangle"
+    object_width: Length = 0.040  # of a wedge: at half its height
     object_height: Length = 0.060
+    object_radius: Length = 0.020  # of a disc
+    object_taper: Annotated[float, Field(ge=-1.5, le=1.5)] = 0.17  # rad between a wedge's faces
     object_position: tuple[Place, Place] = (0.0, 0.080)  # m, in the hand's plane
     object_angle: Angle = 0.0
     gravity: tuple[Acceleration, Acceleration] = (
@@ -281,6 +284,7 @@ class Simulation(Section):
     tactile_jitter: Delay = 0.0  # s that a frame may come later still
     tactile_dropped: Annotated[float, Field(ge=0, le=0.99)] = 0.0  # share of frames that never come
     palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
+    palm_friction: NonNegative = 0.3  # Coulomb, object on the palm
     tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
     joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
     joint_damping: NonNegative = 0.02  # N·m·s/rad

@@ -252,7 +252,11 @@ def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, fl
 
 
 @inlined_kernel
-def _lookup(p: Pointer, d: float, theta: float) -> Six:
+def lookup_at(p: Pointer, d: float, theta: float) -> Six:
+    """:func:`lookup` in the table whose :func:`~kinematics.lanes.address` is ``p``.
+
+    For kernels that call often: an array argument costs a reference count at each call.
+    """
     h = (p[RADIUS] - d) * p[INVERSE_RADIUS]
     rho2 = d * p[INVERSE_RADIUS] * (1.0 + h)
     s, c = _near_sine_cosine(theta)
@@ -275,7 +279,7 @@ def lookup(data: FloatArray, d: float, theta: float) -> Six:
     Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
     gives NaN out.
     """
-    return _lookup(address(data), d, theta)
+    return lookup_at(address(data), d, theta)
 
 
 @inlined_kernel
@@ -321,7 +325,7 @@ def lookups(
             y = work[k - start]
             if math.isnan(y):
                 out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
-                    _lookup(p, d[k], theta[k])
+                    lookup_at(p, d[k], theta[k])
                 )
                 continue
             r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0

@@ -144,7 +144,8 @@ def test_stop_turns_torque_off_at_the_same_tick(make: Make) -> None:
 
 
 def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:
-    daemon = make(simulation={"object_position": (0.0, 0.5)})
+    # The fingers end before their tips meet.
+    daemon = make(simulation={"object_shape": "none"}, hand={"q_max": (0.3, 0.3)})
     events: list[tuple[str, str, str]] = []
     daemon.loop._on_event = lambda *event: events.append(event)
     command(daemon, "arm")

@@ -13,6 +13,8 @@ from daemon.simulation import layout
 from daemon.simulation.hand import SimulatedHand
 from daemon.simulation.tip import evaluate_tip
 from kinematics.fingers import HandGeometry
+from kinematics.kernels import kernel
+from kinematics.lanes import address
 from tests.fuzz_plant import abuse
 from tests.plant_harness import (
     BOUNDED,
@@ -31,26 +33,33 @@ from tests.plant_harness import (
 # One tip alone.
 
 
+@kernel
+def evaluate_one(memory, data, finger, q, way, slope, turn, shear):
+    evaluate_tip(
+        address(memory),
+        address(data),
+        layout.TIP,
+        finger,
+        layout.VELOCITY,
+        math.cos(q),
+        math.sin(q),
+        slope[0],
+        slope[1],
+        way[0],
+        way[1],
+        math.cos(turn),
+        math.sin(turn),
+        shear,
+    )
+
+
 def tip_row(hand: SimulatedHand, finger: int, q, pose, shear: float) -> np.ndarray:
     """Evaluate one tip at rest; a copy of its row."""
     geometry = HandGeometry()
     tip = geometry.tips([q, q])[finger]
     slope = geometry.tip_jacobian([q, q])[finger]
     hand.memory[layout.VELOCITY : layout.VELOCITY + 5] = 0.0
-    evaluate_tip(
-        hand.memory,
-        hand.table.data,
-        layout.TIP,
-        finger,
-        layout.VELOCITY,
-        math.cos(q),
-        math.sin(q),
-        *slope,
-        *(tip - pose[:2]),
-        math.cos(pose[2]),
-        math.sin(pose[2]),
-        shear,
-    )
+    evaluate_one(hand.memory, hand.table.data, finger, q, tip - pose[:2], slope, pose[2], shear)
     return hand.memory[layout.TIP : layout.TIP + layout.TIP_ROW].copy()
 
 

@@ -1,4 +1,4 @@
-"""All forces on the simulated hand: tips, stops, palm, friction; and the currents asked for.
+"""All forces on the simulated hand, summed over its contacts; and the currents asked for.
 
 The servo's own position loop (proportional and derivative, in its current limit) is here too, since
 it runs inside the plant's sub-steps as it runs inside a real servo. Only kernels live here.
@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from daemon.simulation import layout
-from daemon.simulation.tip import evaluate_tip
+from daemon.simulation.coupled import clear_extra
+from daemon.simulation.mutual import evaluate_mutual, mutual_rows, tips_are_far
+from daemon.simulation.palm import evaluate_palm, palm_is_far
+from daemon.simulation.tip import clear_row, evaluate_tip
 from kinematics.kernels import kernel
-
-FloatArray = NDArray[np.float64]
-
-PALM_STIFFNESS = 1e5  # N/m, each corner of the object on the palm
-PALM_LOSS = 1e-3  # s, its damping over its stiffness
+from kinematics.lanes import Pointer
 
 
 @kernel
-def current_reference(memory: FloatArray, joint: int, q: float, rate: float) -> float:
+def current_reference(memory: Pointer, joint: int, q: float, rate: float) -> float:
     """Current [A] that a servo asks of its motor: its mode's law within all that bounds it.
 
     The supply's bound falls linearly from the stall current at rest to none at no-load speed.
@@ -47,7 +43,7 @@ def current_reference(memory: FloatArray, joint: int, q: float, rate: float) -> 
 
 
 @kernel
-def current_slopes(memory: FloatArray, joint: int, g: float) -> tuple[float, float]:
+def current_slopes(memory: Pointer, joint: int, g: float) -> tuple[float, float]:
     """How steeply the reference falls with angle [A/rad] and with velocity [A·s/rad].
 
     For the integrator's matrix, and only where a step of ``g`` makes them stiff. They are then
@@ -67,7 +63,7 @@ def current_slopes(memory: FloatArray, joint: int, g: float) -> tuple[float, flo
 
 
 @kernel
-def stop_stiffness(memory: FloatArray, joint: int) -> float:
+def stop_stiffness(memory: Pointer, joint: int) -> float:
     """Stiffness [N·m/rad] of the end stop that the joint is on or will be within a step, else 0."""
     stiffness: float = 0.0
     q = memory[layout.POSITION + joint]
@@ -80,7 +76,7 @@ def stop_stiffness(memory: FloatArray, joint: int) -> float:
 
 
 @kernel
-def script_place(memory: FloatArray, t: float) -> float:
+def script_place(memory: Pointer, t: float) -> float:
     """x [m] of a held object at ``t``: from its start onto the left tip, back, the right, back."""
     x: float = memory[layout.SCRIPT_X]
     left = memory[layout.SCRIPT_LEFT]
@@ -95,64 +91,74 @@ def script_place(memory: FloatArray, t: float) -> float:
 
 
 @kernel
-def evaluate_palm(memory: FloatArray, position: int, velocity: int) -> tuple[float, float]:
-    """Force along y and torque of the palm on the object's corners; a spring with loss each.
-
-    Writes its energy and, in stage 1, its stiffness as it will be at the step's end.
-    """
-    height = memory[position + 3] - memory[layout.PALM]
-    half_width = memory[layout.HALF_WIDTH]
-    half_height = memory[layout.HALF_HEIGHT]
-    force = 0.0
-    torque = 0.0
-    energy = 0.0
-    stiff_y = 0.0
-    stiff_both = 0.0
-    stiff_turn = 0.0
-    y_rate = memory[velocity + 3]
-    h = memory[layout.STEP]
-    if height - half_width - half_height < h * abs(y_rate):
-        nx = math.cos(memory[position + 4])
-        ny = math.sin(memory[position + 4])
+def touch_palm(
+    memory: Pointer,
+    position: int,
+    velocity: int,
+    shears: int,
+    nx: float,
+    ny: float,
+    stage: int,
+) -> None:
+    """Add the palm's forces where the object may meet it."""
+    if palm_is_far(memory, position, velocity):
         for corner in range(4):
-            u = half_width if corner % 2 else -half_width
-            v = half_height if corner < 2 else -half_height
-            # Height of the corner and its derivative by φ, its place along x.
-            depth = -(height + u * ny + v * nx)
-            lever = u * nx - v * ny
-            rate = -(y_rate + lever * memory[velocity + 4])
-            if max(depth, depth + h * rate) <= 0.0:
-                continue
-            stiff_y += PALM_STIFFNESS
-            stiff_both += PALM_STIFFNESS * lever
-            stiff_turn += PALM_STIFFNESS * lever * lever
-            if depth > 0.0:
-                push = max(PALM_STIFFNESS * (depth + PALM_LOSS * rate), 0.0)
-                energy += 0.5 * PALM_STIFFNESS * depth * depth
-                force += push
-                torque += push * lever
-    memory[layout.PALM_ENERGY] = energy
-    if position == layout.POSITION:
-        memory[layout.PALM_STIFFNESS] = stiff_y
-        memory[layout.PALM_STIFFNESS + 1] = stiff_both
-        memory[layout.PALM_STIFFNESS + 2] = stiff_turn
-    return force, torque
+            memory[layout.EXTRA_RATE + 6 * stage + corner] = 0.0
+        if stage == 0 and memory[layout.PALM_ENERGY] != 0.0:
+            memory[layout.PALM_ENERGY] = 0.0
+            for corner in range(4):
+                memory[shears + corner] = 0.0
+    else:
+        evaluate_palm(memory, position, velocity, shears, nx, ny, stage)
+
+
+@kernel
+def touch_each_other(
+    memory: Pointer,
+    data: Pointer,
+    position: int,
+    velocity: int,
+    shears: int,
+    stage: int,
+) -> None:
+    """Add the tips' torques on each other where they may meet; without an object always."""
+    row = layout.MUTUAL + 2 * stage * layout.TIP_ROW
+    near = not tips_are_far(memory) or memory[layout.SHAPE] == layout.NO_OBJECT
+    touching = near and evaluate_mutual(memory, data, row, position, velocity, shears + 4)
+    for finger in range(2):
+        rate = memory[row + finger * layout.TIP_ROW + layout.SHEAR_RATE] if touching else 0.0
+        memory[layout.EXTRA_RATE + 6 * stage + 4 + finger] = rate
+    if stage == 0:
+        if memory[layout.MUTUAL_NEAR] != 0.0 and not near:
+            for finger in range(2):
+                clear_row(memory, layout.MUTUAL + finger * layout.TIP_ROW)
+                memory[layout.MUTUAL_SHEAR + finger] = 0.0
+        memory[layout.MUTUAL_NEAR] = 1.0 if near else 0.0
+        if touching:
+            if memory[layout.COUPLED] == 0.0:
+                clear_extra(memory, 0, layout.PALM_ROWS)
+            memory[layout.COUPLED] = 1.0
+            mutual_rows(memory)
+        elif memory[layout.COUPLED] != 0.0:
+            clear_extra(memory, layout.PALM_ROWS, layout.EXTRA_ROWS)
 
 
 @kernel
 def evaluate_hand(
-    memory: FloatArray,
-    data: FloatArray,
+    memory: Pointer,
+    data: Pointer,
     position: int,
     velocity: int,
-    row: int,
+    shears: int,
+    stage: int,
     shear1: float,
     shear2: float,
 ) -> None:
-    """Evaluate both tips into the rows from ``row`` on, then all forces but the motors'.
+    """Evaluate all contacts into the rows of ``stage`` 0 or 1, and all forces but the motors'.
 
-    ``position`` and ``velocity`` are where the five coordinates and their rates stand. The drag is
-    friction over velocity, in the forces already.
+    ``position`` and ``velocity`` are where the five coordinates and their rates stand, ``shears``
+    where those of palm and mutual contact do; ``shear1`` and ``shear2`` are the tips' on the
+    object. The drag is friction over velocity, in the forces already.
     """
     angle = memory[position + 4]
     nx = math.cos(angle)
@@ -163,15 +169,20 @@ def evaluate_hand(
     speed = math.sqrt(vx * vx + vy * vy + memory[layout.TABLE_SPEED] ** 2)
     drag = memory[layout.TABLE_FORCE] / speed
     spin_drag = memory[layout.TABLE_TORQUE] / math.sqrt(spin**2 + memory[layout.TABLE_SPIN] ** 2)
-    force_x = memory[layout.MASS] * memory[layout.GRAVITY] + memory[layout.PUSH] - drag * vx
-    force_y = memory[layout.MASS] * memory[layout.GRAVITY + 1] + memory[layout.PUSH + 1] - drag * vy
-    torque = memory[layout.PUSH + 2] - spin_drag * spin
-    palm_force, palm_torque = evaluate_palm(memory, position, velocity)
-    force_y += palm_force
-    torque += palm_torque
+    mass = memory[layout.MASS]
+    memory[layout.FORCES + 2] = mass * memory[layout.GRAVITY] + memory[layout.PUSH] - drag * vx
+    memory[layout.FORCES + 3] = (
+        mass * memory[layout.GRAVITY + 1] + memory[layout.PUSH + 1] - drag * vy
+    )
+    memory[layout.FORCES + 4] = memory[layout.PUSH + 2] - spin_drag * spin
     memory[layout.DRAG + 2] = drag
     memory[layout.DRAG + 3] = drag
     memory[layout.DRAG + 4] = spin_drag
+    with_object = memory[layout.SHAPE] != layout.NO_OBJECT
+    if stage == 0:
+        memory[layout.COUPLED] = 0.0
+    if with_object:
+        touch_palm(memory, position, velocity, shears, nx, ny, stage)
     for finger in range(2):
         q = memory[position + finger]
         rate = memory[velocity + finger]
@@ -186,7 +197,6 @@ def evaluate_hand(
             resisting += math.sqrt(memory[layout.STOP_STIFFNESS] * memory[layout.JOINT_INERTIA])
         memory[layout.DRAG + finger] = resisting
         joint_torque = -resisting * rate - memory[layout.STOP_STIFFNESS] * beyond
-        out = row + finger * layout.TIP_ROW
         if memory[layout.PRESENT + finger] != 0.0:
             cq = math.cos(q)
             sq = math.sin(q)
@@ -194,29 +204,34 @@ def evaluate_hand(
             inward = memory[layout.LENGTH] * sq + memory[layout.OFFSET] * cq
             ahead = memory[layout.LENGTH] * cq - memory[layout.OFFSET] * sq
             side = 1.0 - 2.0 * finger
-            rx = side * (inward - memory[layout.HALF_SEPARATION]) - memory[position + 2]
-            ry = ahead - memory[position + 3]
-            evaluate_tip(
-                memory,
-                data,
-                out,
-                finger,
-                velocity,
-                cq,
-                sq,
-                side * ahead,
-                -inward,
-                rx,
-                ry,
-                nx,
-                ny,
-                shear1 if finger == 0 else shear2,
-            )
-            joint_torque += memory[out + layout.Q]
-            force_x += memory[out + layout.Q + 1]
-            force_y += memory[out + layout.Q + 2]
-            torque += memory[out + layout.Q + 3]
+            place = layout.TIP_PLACE + 4 * finger
+            x = side * (inward - memory[layout.HALF_SEPARATION])
+            memory[place] = x
+            memory[place + 1] = ahead
+            memory[place + 2] = side * ahead
+            memory[place + 3] = -inward
+            if with_object:
+                out = layout.TIP + (2 * stage + finger) * layout.TIP_ROW
+                evaluate_tip(
+                    memory,
+                    data,
+                    out,
+                    finger,
+                    velocity,
+                    cq,
+                    sq,
+                    side * ahead,
+                    -inward,
+                    x - memory[position + 2],
+                    ahead - memory[position + 3],
+                    nx,
+                    ny,
+                    shear1 if finger == 0 else shear2,
+                )
+                joint_torque += memory[out + layout.Q]
+                memory[layout.FORCES + 2] += memory[out + layout.Q + 1]
+                memory[layout.FORCES + 3] += memory[out + layout.Q + 2]
+                memory[layout.FORCES + 4] += memory[out + layout.Q + 3]
         memory[layout.FORCES + finger] = joint_torque
-    memory[layout.FORCES + 2] = force_x
-    memory[layout.FORCES + 3] = force_y
-    memory[layout.FORCES + 4] = torque
+    if memory[layout.PRESENT] != 0.0 and memory[layout.PRESENT + 1] != 0.0:
+        touch_each_other(memory, data, position, velocity, shears, stage)

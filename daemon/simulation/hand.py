@@ -22,6 +22,9 @@ FloatArray = NDArray[np.float64]
 SPARE_SAMPLES = 8
 LONGEST_ADVANCE = 10.0  # s of simulated time in one kernel call
 
+_ROWS = tuple(
+    row + finger * layout.TIP_ROW for row in (layout.TIP, layout.MUTUAL) for finger in range(2)
+)
 _MODES = (
     layout.CURRENT_MODE,
     layout.POSITION_MODE,
@@ -31,6 +34,9 @@ _MODES = (
 
 class SimulatedHand:
     """Two jointed fingers with soft tips and the object between them, in one plane.
+
+    Tips touch the object, or each other where it isn't between them; what a tip tells is the
+    contact that presses more. The object may lie on the palm.
 
     Which tips take part is ``settings.scene.fingers``. With one finger the object is fixed to the
     bench, as in a compression test. Without servos (``settings.servos.backend`` is ``none``) the
@@ -85,6 +91,7 @@ class SimulatedHand:
         self.shear = self._pair(layout.SHEAR)  # d_t [m]
         # How far the backing plate's rim is pressed into the object: > 0 is past the tip's limit.
         self.rim = self._pair(layout.CONTACT_RIM)  # m
+        self.mutual = self._pair(layout.CONTACT_MUTUAL)  # 1 where the other tip is felt
         self._run(0)
 
     @property
@@ -150,7 +157,10 @@ class SimulatedHand:
         return len(self._ring)
 
     def sample(self, number: int) -> FloatArray:
-        """Row of layout.SAMPLE columns: seq, t since start, then d, θ and gain of both tips.
+        """Row of layout.SAMPLE columns: seq, t since start, d, θ, gain and curvature of both tips.
+
+        The gain is the force's over that on a plane at d and θ; the curvature [1/m] is that of what
+        is touched, across the hand's plane.
 
         Raises LookupError for one that is not taken yet or has left the ring.
         """
@@ -171,7 +181,7 @@ class SimulatedHand:
             0.5 * inertia @ rates**2
             - mass * self._pair(layout.GRAVITY) @ self.object_pose[:2]
             + 0.5 * m[layout.STOP_STIFFNESS] * beyond @ beyond
-            + self._pair(layout.CONTACT_ENERGY).sum()
+            + sum(m[row + layout.ENERGY] for row in _ROWS)
             + m[layout.PALM_ENERGY]
         )
 

@@ -14,6 +14,8 @@ from daemon.records import FINGERS
 from daemon.servos.models import by_name
 from daemon.settings import Settings, SettingsError
 from daemon.simulation import layout
+from daemon.simulation.ledger import LOSSLESS_TOLERANCE
+from daemon.simulation.shapes import shape_of
 from kinematics.fingers import HandGeometry
 from kinematics.table import ContactTable
 
@@ -41,14 +43,6 @@ def geometry_of(settings: Settings) -> HandGeometry:
     )
 
 
-def mean_distance(width: float, height: float) -> float:
-    """Mean distance of a rectangle's points from its centre [m]: the lever of spinning friction."""
-    nodes, weights = np.polynomial.legendre.leggauss(32)
-    x = 0.25 * width * (nodes + 1.0)
-    y = 0.25 * height * (nodes + 1.0)
-    return float(0.25 * weights @ np.hypot(x[:, None], y[None, :]) @ weights)
-
-
 def stiff_step(settings: Settings, table: ContactTable) -> float:
     """Sub-step [s] from the stiffest oscillation of the object on the tips, deeply grasped."""
     simulation = settings.simulation
@@ -56,9 +50,12 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     c = table(np.array([d]), np.array([0.0]))
     # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d[0]), 2.0 * c.force[0] / d)
-    half = 0.5 * simulation.object_width
-    turning = 12.0 * half * half / (simulation.object_width**2 + simulation.object_height**2)
-    fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
+    shape = shape_of(simulation)
+    if shape.kind == layout.NO_OBJECT:
+        fastest = geometry_of(settings).reach * math.sqrt(stiffness / simulation.joint_inertia)
+    else:
+        turning = (shape.half_width / shape.gyration) ** 2
+        fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
     step = min(max(PHASE_A_STEP / fastest, SHORTEST_STEP), LONGEST_STEP)
     # A whole number of sub-steps to the millisecond keeps ticks and frames on the grid.
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
@@ -74,8 +71,8 @@ def set_parameters(p: FloatArray, settings: Settings, table: ContactTable, step:
     p[layout.FRICTION] = simulation.tip_friction
     p[layout.LOSS] = simulation.tip_loss
     p[layout.MODULUS] = modulus * simulation.modulus_scale
+    p[layout.TOLERANCE] = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
     p[layout.RIM_STIFFNESS] = RIM_STIFFNESS
-    p[layout.D_MAX] = table.data[4] * radius * (1.0 - 1e-12)
 
     p[layout.STEP] = step
     p[layout.HALF_SEPARATION] = 0.5 * settings.hand.pivot_separation
@@ -91,27 +88,31 @@ def set_parameters(p: FloatArray, settings: Settings, table: ContactTable, step:
 
 def _object(p: FloatArray, settings: Settings) -> None:
     simulation = settings.simulation
-    width, height, mass = (
-        simulation.object_width,
-        simulation.object_height,
-        simulation.object_mass,
-    )
+    shape, mass = shape_of(simulation), simulation.object_mass
     p[layout.PALM] = simulation.palm
-    p[layout.HALF_WIDTH] = 0.5 * width
-    p[layout.HALF_HEIGHT] = 0.5 * height
+    p[layout.PALM_FRICTION] = simulation.palm_friction
+    p[layout.SHAPE] = shape.kind
+    p[layout.HALF_WIDTH] = 0.5 * simulation.object_width
+    p[layout.HALF_HEIGHT] = 0.5 * simulation.object_height
+    p[layout.ROUNDNESS] = shape.roundness
+    p[layout.EXTENT] = shape.extent
+    p[layout.OUTLINE : layout.OUTLINE + 4 * layout.EDGE] = shape.edges().ravel()
+    # κ of a face with that radius, see tip.py.
+    curved = shape.roundness
+    p[layout.SHARE] = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
     p[layout.MASS] = mass
-    p[layout.INERTIA] = mass * (width * width + height * height) / 12.0
+    p[layout.INERTIA] = mass * shape.gyration**2
     p[layout.GRAVITY : layout.GRAVITY + 2] = simulation.gravity
     # What gravity doesn't pull along the plane presses the object on the table.
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
-    lever = mean_distance(width, height)
     p[layout.TABLE_FORCE] = simulation.table_friction * mass * pressing
-    p[layout.TABLE_TORQUE] = p[layout.TABLE_FORCE] * lever
+    p[layout.TABLE_TORQUE] = p[layout.TABLE_FORCE] * shape.lever
     p[layout.TABLE_SPEED] = TABLE_SPEED
-    p[layout.TABLE_SPIN] = TABLE_SPEED / lever
+    p[layout.TABLE_SPIN] = TABLE_SPEED / shape.lever
     # One finger alone can't hold anything: the object is then fixed to the bench.
     p[layout.OBJECT_HELD] = float(
-        len(settings.scene.fingers) == 1
+        shape.kind == layout.NO_OBJECT
+        or len(settings.scene.fingers) == 1
         or (settings.servos.backend == "none" and simulation.compression_speed > 0.0)
     )
 
@@ -150,9 +151,8 @@ def _script(p: FloatArray, settings: Settings) -> None:
         return
     p[layout.SCRIPT_SPEED] = simulation.compression_speed
     pose = (*simulation.object_position, simulation.object_angle)
-    contacts = geometry_of(settings).contacts(
-        settings.hand.open_angle, pose, simulation.object_width
-    )
+    width = 2.0 * shape_of(simulation).half_width
+    contacts = geometry_of(settings).contacts(settings.hand.open_angle, pose, width)
     ways = COMPRESSION_DEPTH * settings.tip.radius - contacts.d
     ways = np.maximum(ways / max(math.cos(simulation.object_angle), 0.1), 0.0)
     for finger, place in enumerate((layout.SCRIPT_LEFT, layout.SCRIPT_RIGHT)):
