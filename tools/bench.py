@@ -15,13 +15,19 @@ MEASUREMENTS = {
     "contact": "the contact model, run time against error",
     "estimator": "pressure grid to d and tilt, run time against error",
     "tick": "one tick without serial",
+    "scenes": "the tick of each kind of scene, and what each skipping step saves",
     "control": "grasping, turning and holding on the simulated hand",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
     "hil": "one tick over the stand-in hand's ptys",
     "startup": "start to the first published state",
 }
 # Too long for a run that names nothing.
-ON_DEMAND = {"sustained": "a minute of 500 Hz on two servos at 2 Mbaud"}
+ON_DEMAND = {
+    "sustained": "a minute of 500 Hz on two servos at 2 Mbaud",
+    "wakeup": "wake-ups of the loop beside cyclictest and time.sleep, three minutes",
+    "neighbours": "the tick beside busy processes, many subscribers and noisy sensors",
+    "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, some minutes",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -151,19 +151,27 @@ class MismatchRow:
         return asdict(self)
 
 
+OTHER_MODELS = ("radial springs", "Hertz", "Table I's law")
+
+
+def frame_of(model: str, grid: SensorGrid, d: float, theta: float) -> FloatArray:
+    """What ``grid`` would read of one of OTHER_MODELS, with the linear model's force [Pa]."""
+    if model == "Table I's law":
+        frame = grid.pressure(TIP, Material.table_i(), d, theta)
+    else:
+        frame = _projected(grid, _radial if model == "radial springs" else _hertz, d, theta)
+    force = math.pi * MODULUS * d * d / math.cos(theta)
+    return np.asarray(frame * (force / (frame.sum() * PITCH * PITCH)))
+
+
 def mismatches() -> list[MismatchRow]:
-    """Frames of radial springs, of Hertz and of Table I's law, with the linear model's force."""
+    """Frames of radial springs, of Hertz and of Table I's law, estimated as linear."""
     grid = SensorGrid(SIZE, SIZE, PITCH)
-    measured = Material.table_i()
     rows = []
-    for name, shape in (("radial springs", _radial), ("Hertz", _hertz), ("Table I's law", None)):
+    for name in OTHER_MODELS:
         for d, degrees in ((0.002, 0.0), (0.004, 0.0), (0.004, 15.0), (0.008, 30.0)):
             theta = math.radians(degrees)
-            if shape is None:
-                frame = grid.pressure(TIP, measured, d, theta)
-            else:
-                frame = _projected(grid, shape, d, theta)
-            frame *= math.pi * MODULUS * d * d / math.cos(theta) / (frame.sum() * PITCH * PITCH)
+            frame = frame_of(name, grid, d, theta)
             noise = 0.002 * MODULUS
             found = ContactEstimator(TIP, LINEAR, grid, noise, free_gain=True)(frame)
             rows.append(

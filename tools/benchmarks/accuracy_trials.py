@@ -1,0 +1,208 @@
+"""Trials of the estimator: many frames of one contact, and what the bound says of it.
+
+Holds the contacts of the envelope, the Cramér-Rao bound with cells left out, and the loop that
+adds noise, counts as a board would, and estimates by the calls that the daemon makes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinematics.estimator import ContactEstimator
+from kinematics.kernels import kernel
+from kinematics.pressure import SensorGrid
+from tools.benchmarks.estimator_bounds import (
+    LINEAR,
+    MARGIN,
+    MODULUS,
+    NOISES,
+    PITCH,
+    SIZE,
+    SMALL,
+    TIP,
+    tilts,
+)
+
+FloatArray = NDArray[np.float64]
+
+# Columns of a trial's frames.
+D, TILT_X, TILT_Y, GAIN, CONTACT, VALID, CHI2, CELLS = range(8)
+COVARIANCE = 8
+COLUMNS = COVARIANCE + 16
+
+_GOLDEN = 0.6180339887498949
+_SILVER = 0.7548776662466927  # with its square: points that fill a square evenly
+_STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
+
+
+@dataclass(frozen=True)
+class Board:
+    """How a board counts: Pa a count, largest count, smallest count sent. 0 Pa: float frames."""
+
+    pascal_per_count: float = 0.0
+    full_count: int = 65535
+    threshold: int = 0
+
+
+FLOAT = Board()
+
+
+@dataclass(frozen=True)
+class Place:
+    """A contact of the envelope: m, rad, and the tip's centre in cells off the grid's."""
+
+    d: float
+    theta: float
+    azimuth: float
+    offset: tuple[float, float]
+
+    @property
+    def truth(self) -> tuple[float, float, float, float]:
+        """(d, tilt_x, tilt_y, gain)."""
+        return (self.d, *tilts(self.theta, self.azimuth), 1.0)
+
+    @property
+    def grid(self) -> SensorGrid:
+        """The 44 × 44 cells under it."""
+        return SensorGrid(SIZE, SIZE, PITCH, (self.offset[0] * PITCH, self.offset[1] * PITCH))
+
+    @property
+    def inside(self) -> bool:
+        """Three degrees or more short of the rim."""
+        return self.theta <= math.asin((TIP.radius - self.d) / TIP.radius) - MARGIN
+
+    def __str__(self) -> str:
+        return (
+            f"d {self.d * 1e3:g} mm, θ {math.degrees(self.theta):g}° towards "
+            f"{math.degrees(self.azimuth):.0f}°, {self.offset[0]:+.2f} {self.offset[1]:+.2f} cells"
+        )
+
+
+def places(depths: tuple[float, ...], degrees: tuple[float, ...], around: int) -> Iterator[Place]:
+    """For each d [m] and θ [degrees] ``around`` azimuths, evenly round, each with its offset.
+
+    Azimuths and offsets differ from one (d, θ) to the next, so that together they fill the circle
+    and the cell evenly; no azimuth is left out that a sensor's symmetry might hide.
+    """
+    number = 0
+    for d in depths:
+        for theta in degrees:
+            turned = number * _GOLDEN % 1.0
+            for k in range(around):
+                number += 1
+                yield Place(
+                    d,
+                    math.radians(theta),
+                    2.0 * math.pi * (k + turned) / around,
+                    (number * _SILVER % 1.0 - 0.5, number * _SILVER**2 % 1.0 - 0.5),
+                )
+
+
+def jacobian(place: Place) -> FloatArray:
+    """∂ pressure/∂(d, tilt_x, tilt_y, gain) [cells, 4], by central differences."""
+    columns = []
+    for k, step in enumerate(_STEPS):
+        ends = []
+        for sign in (1.0, -1.0):
+            at = list(place.truth)
+            at[k] += sign * step
+            ends.append(place.grid.pressure(TIP, LINEAR, at[0], at[1], at[2], at[3]))
+        columns.append(((ends[0] - ends[1]) / (2.0 * step)).ravel())
+    return np.stack(columns, axis=1)
+
+
+def bound(
+    slopes: FloatArray, noise: float, free: bool, live: NDArray[np.bool_] | None = None
+) -> FloatArray:
+    """The Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from the ``live`` cells."""
+    used = slopes if live is None else slopes[live.ravel()]
+    used = used[:, : 4 if free else 3]
+    return np.asarray(np.linalg.inv(used.T @ used) * noise**2)
+
+
+def is_small(place: Place, covariance: FloatArray) -> bool:
+    """Whether the bound is small there and the rim is not near."""
+    return bool(math.sqrt(covariance[0, 0]) <= SMALL * place.d and place.inside)
+
+
+def estimator(
+    place: Place, noise: float, free: bool, board: Board = FLOAT, **more: Any
+) -> ContactEstimator:
+    """An estimator as the daemon would make it for that board."""
+    return ContactEstimator(
+        TIP,
+        LINEAR,
+        place.grid,
+        noise,
+        free_gain=free,
+        saturation=float(board.full_count) if board.pascal_per_count > 0.0 else None,
+        threshold=float(board.threshold),
+        **more,
+    )
+
+
+def run(
+    made: ContactEstimator, clean: FloatArray, noise: float, bank: FloatArray, board: Board = FLOAT
+) -> FloatArray:
+    """Estimate ``clean`` + ``noise`` · each of ``bank`` [n, rows, cols]; float64 [n, COLUMNS]."""
+    out = np.zeros((len(bank), COLUMNS))
+    scale = board.pascal_per_count or 1.0
+    counted = board.pascal_per_count > 0.0
+    ends = (board.threshold, board.full_count)
+    frame = np.zeros(clean.shape, np.uint16 if counted else np.float64)
+    for normals, row in zip(bank, out, strict=True):
+        if counted:
+            _count(clean, noise, normals, scale, ends, frame)
+        else:
+            _add(clean, noise, normals, frame)
+        e = made.update(frame, scale)
+        valid = e.contact and e.valid
+        row[:COVARIANCE] = (
+            e.d,
+            e.tilt_x,
+            e.tilt_y,
+            e.gain,
+            e.contact,
+            valid,
+            e.chi2,
+            e.cells,
+        )
+        if valid:
+            row[COVARIANCE:] = e.covariance.ravel()
+    return out
+
+
+@kernel
+def _add(clean: FloatArray, noise: float, normals: FloatArray, frame: FloatArray) -> None:
+    rows, cols = frame.shape
+    for i in range(rows):
+        for j in range(cols):
+            frame[i, j] = clean[i, j] + noise * normals[i, j]
+
+
+@kernel
+def _count(
+    clean: FloatArray,
+    noise: float,
+    normals: FloatArray,
+    scale: float,
+    ends: tuple[int, int],
+    frame: NDArray[np.uint16],
+) -> None:
+    rows, cols = frame.shape
+    for i in range(rows):
+        for j in range(cols):
+            value = (clean[i, j] + noise * normals[i, j]) / scale
+            value = min(max(value + 0.5, 0.0), ends[1] + 0.5)
+            frame[i, j] = np.uint16(value if value >= ends[0] else 0.0)
+
+
+def noises() -> tuple[float, ...]:
+    """Standard deviations of a cell [Pa]."""
+    return tuple(share * MODULUS for share in NOISES)
