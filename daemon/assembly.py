@@ -6,8 +6,10 @@ are compiled and warm before the loop exists, and so before torque can be on.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -17,7 +19,15 @@ import zmq
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.loop import EventSink, Loop
-from daemon.model import make_grid, make_material, make_models, make_table, make_tip
+from daemon.messages import Facts
+from daemon.model import (
+    FingerModel,
+    make_grid,
+    make_material,
+    make_models,
+    make_table,
+    make_tip,
+)
 from daemon.perception import FingerPerception
 from daemon.prediction import Prediction
 from daemon.records import FINGERS, Contact, ObjectPose, Reading
@@ -76,6 +86,8 @@ class Daemon:
         self.loop = Loop(
             settings, self.clock, self.servos, perceptions, prediction, publisher, server, on_event
         )
+        if publisher is not None:
+            publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
         context: zmq.Context[Any] = zmq.Context()
@@ -139,6 +151,24 @@ class Daemon:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> Facts:
+    """What subscribers are told of this hand once: settings, calibrations, tables' certificates."""
+    calibrations = [
+        "" if model.calibration is None else model.calibration.model_dump_json() for model in models
+    ]
+    tables = [
+        json.dumps(
+            {
+                "form": model.table.form.name,
+                "tolerance": model.table.tolerance,
+                "certificate": model.table.certificate._asdict(),
+            }
+        )
+        for model in models
+    ]
+    return Facts(version("softfinger"), settings.model_dump_json(), *calibrations, *tables)
 
 
 def warm_up(

@@ -54,6 +54,7 @@ class Broadcast:
         publisher, schedule, seq = self._publisher, self._schedule, state.seq
         if schedule.look.due(seq):
             publisher.refresh()
+        publisher.repeat()
         if publisher.wants_state and schedule.state.due(seq):
             self._states += 1
             publisher.state(state, self._scene, schedule.state.every)

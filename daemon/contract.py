@@ -101,9 +101,35 @@ _TACTILE = (
     Field("data", "bin", "", "rows × cols little-endian uint16, row by row"),
 )
 
-_EVENT = (
-    *_ALL,
+_TOLD = (
+    *_ALL[:2],
+    Field("again", "bool", "", "told again for a late subscriber, with its first seq and times"),
+    *_ALL[2:],
     Field("mono_ns", "int", "ns", "the daemon's monotonic clock"),
+)
+
+_SETTINGS = (
+    *_TOLD,
+    Field("version", "str", "", "of softfinger"),
+    Field("settings", "str", "", "all settings, as JSON"),
+    Field("calibration_left", "str", "", "the left sensor's calibration as JSON, or empty"),
+    Field("calibration_right", "str", "", "the right sensor's"),
+    Field("table_left", "str", "", "the left tip's contact table: form, tolerance, certificate"),
+    Field("table_right", "str", "", "the right tip's"),
+)
+
+_COMMAND = (
+    *_TOLD,
+    Field("tick", "int", "", "seq of the tick at which it was answered"),
+    Field("command", "str", "", "its name"),
+    Field("client", "str", "", "who sent it, empty for all who give no name"),
+    Field("request", "str", "", "all of it, as JSON"),
+    Field("ok", "bool", "", "carried out"),
+    Field("error", "str", "", "why it was refused, empty when it was carried out"),
+)
+
+_EVENT = (
+    *_TOLD,
     Field("level", "str", "", "info, warning or error"),
     Field("kind", "str", "", "what it is about: mode, fault, servos, …"),
     Field("text", "str", "", "one line for a person"),
@@ -151,13 +177,17 @@ TOPICS: dict[bytes, tuple[Field, ...]] = {
     messages.TACTILE: _TACTILE,
     messages.EVENT: _EVENT,
     messages.STATS: _STATS,
+    messages.SETTINGS: _SETTINGS,
+    messages.COMMAND: _COMMAND,
 }
 
 _SUMMARY = {
     messages.STATE: "What the hand is, does and feels, every n-th tick (`stream.state_rate`).",
     messages.TACTILE: "The grids' raw frames (`stream.tactile_rate`), one finger a message.",
-    messages.EVENT: "What happened: modes, faults, warnings.",
+    messages.EVENT: "What happened: modes, faults, warnings; the last 50 again for whoever comes.",
     messages.STATS: "Once a second, how the loop keeps its time.",
+    messages.SETTINGS: "Once, and again for whoever subscribes later: what this hand is.",
+    messages.COMMAND: "Each command that was answered, by whomever; `status` is left out.",
 }
 
 _JSON: dict[Kind, dict[str, Any]] = {
@@ -194,9 +224,9 @@ def page() -> str:
         "",
         "Written from `daemon/contract.py` by `python -m daemon.contract`; a test keeps it true.",
         "",
-        f"Schema {messages.SCHEMA}. A message has two frames, topic and msgpack map with text keys,",
-        "in SI units. Fields are only ever added, none is ever left out and none changes its type: a",
-        "float is always sent as a float. A field named `left.q` is `q` in the map `left`.",
+        f"Schema {messages.SCHEMA}. Two frames a message, topic and msgpack map with text keys,",
+        "in SI units. Fields are only ever added, none is left out, and none changes its type:",
+        "a float is always sent as a float. A field named `left.q` is `q` in the map `left`.",
     ]
     for topic, fields in TOPICS.items():
         lines += [

@@ -283,6 +283,20 @@ class Loop:
 
     def command(self, request: dict[str, Any]) -> dict[str, Any]:
         """Carry out one request at the present tick. Raises Refused with the reason."""
+        try:
+            reply = self._carry_out(request)
+        except Refused as refusal:
+            self._tell(request, str(refusal))
+            raise
+        self._tell(request, "")
+        return reply
+
+    def _tell(self, request: dict[str, Any], error: str) -> None:
+        if self._publisher is not None and request["command"] != "status":
+            state = self.state
+            self._publisher.command(state.wall, state.t, state.seq, request, error)
+
+    def _carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
         control = self._control
         command = parse(request, control.mode)
         self._lease.check(command, self.state.t)

@@ -8,6 +8,7 @@ and fields are only ever added. SI units.
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgpack
@@ -25,6 +26,8 @@ STATE = b"hand/state"
 TACTILE = b"hand/tactile"
 EVENT = b"hand/event"
 STATS = b"hand/stats"
+SETTINGS = b"hand/settings"
+COMMAND = b"hand/command"
 
 pack = msgpack.Packer(use_bin_type=True).pack
 
@@ -58,6 +61,17 @@ class SensorFacts(NamedTuple):
     scale: float
     calibrated: bool
     calibration: str
+
+
+class Facts(NamedTuple):
+    """What doesn't change while a daemon runs; texts of JSON, empty where there is nothing."""
+
+    version: str
+    settings: str
+    calibration_left: str
+    calibration_right: str
+    table_left: str
+    table_right: str
 
 
 class Rates(NamedTuple):
@@ -196,12 +210,34 @@ def event_message(
     seq: int, wall: float, t: float, level: str, kind: str, text: str
 ) -> dict[str, Any]:
     """The ``hand/event`` map."""
+    return {**_told(seq, wall, t), "level": level, "kind": kind, "text": text}
+
+
+def settings_message(seq: int, wall: float, t: float, facts: Facts) -> dict[str, Any]:
+    """The ``hand/settings`` map."""
+    return {**_told(seq, wall, t), **facts._asdict()}
+
+
+def command_message(
+    seq: int, wall: float, t: float, tick: int, request: dict[str, Any], error: str
+) -> dict[str, Any]:
+    """The ``hand/command`` map; ``error`` is why it was refused, empty when it was carried out."""
+    return {
+        **_told(seq, wall, t),
+        "tick": tick,
+        "command": str(request.get("command", "")),
+        "client": str(request.get("client", "")),
+        "request": json.dumps(request, default=str),
+        "ok": not error,
+        "error": error,
+    }
+
+
+def _told(seq: int, wall: float, t: float) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "seq": seq,
+        "again": False,
         "timestamp": wall,
         "mono_ns": int(t * 1e9),
-        "level": level,
-        "kind": kind,
-        "text": text,
     }

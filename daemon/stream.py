@@ -2,11 +2,13 @@
 
 A subscriber that comes late, stops reading or dies changes nothing here: sends never wait, and a
 slow subscriber's queue is bounded, beyond which its messages are dropped. Topics that nobody
-subscribes to are not packed.
+subscribes to are not packed. Who comes late is told the settings and the last events again, with
+``again`` true, one message a tick.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from daemon.sockets import Bound
 from daemon.statistics import Statistics
 
 _CHANGES = 16  # subscriptions taken in at a time; more wait for the next look
+_KEPT = 50  # events that a late subscriber is told
 _LONGEST_TOPIC = 64  # bytes; whoever subscribes to more gets nothing
 
 
@@ -32,7 +35,11 @@ class Publisher:
         self.wants_state = False
         self.wants_tactile = False
         self.wants_stats = False
-        self._events = 0
+        self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
+        self._told = {messages.EVENT: 0, messages.COMMAND: 0, messages.SETTINGS: 0}
+        self._kept: deque[tuple[bytes, dict[str, Any]]] = deque(maxlen=_KEPT)
+        self._settings: list[tuple[bytes, dict[str, Any]]] = []
+        self._again: deque[tuple[bytes, dict[str, Any]]] = deque()
 
     def refresh(self) -> None:
         """Learn who came and went. XPUB tells a topic's first subscriber and its last one gone."""
@@ -44,6 +51,7 @@ class Publisher:
                 continue
             if change[:1] == b"\x01":
                 self._subscriptions.add(change[1:])
+                self._tell_again(change[1:])
             else:
                 self._subscriptions.discard(change[1:])
         self.wants_state = self._wanted(messages.STATE)
@@ -84,9 +92,41 @@ class Publisher:
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
-        self._events += 1
-        message = messages.event_message(self._events, wall, t, level, kind, text)
+        seq = self._count(messages.EVENT)
+        message = messages.event_message(seq, wall, t, level, kind, text)
+        self._kept.append((messages.EVENT, message))
         self._send(messages.EVENT, message)
+
+    def command(
+        self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
+    ) -> None:
+        """Publish ``hand/command``: what came and what became of it."""
+        if self._wanted(messages.COMMAND):
+            seq = self._count(messages.COMMAND)
+            message = messages.command_message(seq, wall, t, tick, request, error)
+            self._send(messages.COMMAND, message)
+
+    def settings(self, wall: float, t: float, facts: messages.Facts) -> None:
+        """Publish ``hand/settings``, once."""
+        message = messages.settings_message(self._count(messages.SETTINGS), wall, t, facts)
+        self._settings = [(messages.SETTINGS, message)]
+        self._send(messages.SETTINGS, message)
+
+    def repeat(self) -> None:
+        """Send one of the messages that a late subscriber missed, if any waits."""
+        if self._again:
+            topic, message = self._again.popleft()
+            self._send(topic, {**message, "again": True})
+
+    def _tell_again(self, prefix: bytes) -> None:
+        # A flood of subscribers gets the one list that is being sent; it makes no second one.
+        if not self._again:
+            held = [*self._settings, *self._kept]
+            self._again.extend(each for each in held if each[0].startswith(prefix))
+
+    def _count(self, topic: bytes) -> int:
+        self._told[topic] += 1
+        return self._told[topic]
 
     def _send(self, topic: bytes, message: dict[str, Any]) -> None:
         try:

@@ -67,6 +67,12 @@ def sample(topic: bytes) -> dict[str, Any]:
             record(statistics.counts, statistics.largest, *times)
         rates = messages.Rates(500.0, 100.0, 99.5, 50.0, 25.0)
         return messages.stats_message(sample_state(), 0.002, rates, statistics, 500)
+    if topic == messages.SETTINGS:
+        facts = messages.Facts("0.1.0", '{"loop":{"rate":500.0}}', "", "{}", "{}", "{}")
+        return messages.settings_message(1, 1.7e9, 10.0, facts)
+    if topic == messages.COMMAND:
+        request = {"command": "grasp", "force": 5.0, "client": "notebook"}
+        return messages.command_message(3, 1.7e9 + 0.25, 12.5, 1234, request, "arm first")
     assert topic == messages.EVENT
     return messages.event_message(5, 1.7e9 + 0.25, 12.5, "warning", "late", "a tick came late — ß")
 

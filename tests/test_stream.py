@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import msgpack
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon.messages import SCHEMA, Parts, SensorFacts, state_message
+from daemon.messages import SCHEMA, Facts, Parts, SensorFacts, state_message
 from daemon.records import Contact, Frame, State
 from daemon.stream import Publisher
 from tests.conftest import until
@@ -188,4 +189,75 @@ def test_events_are_numbered(context: zmq.Context[Any], addresses: tuple[str, st
     assert message["seq"] == 1
     assert message["mono_ns"] == 2_500_000_000
     assert (message["level"], message["kind"]) == ("info", "mode")
+    publisher.close()
+
+
+def test_who_comes_late_is_told_settings_and_events_again(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=200)
+    publisher.settings(98.0, 0.5, Facts("0.1.0", "{}", "", "", "{}", "{}"))
+    for k in range(60):
+        publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
+    early = subscribe(context, addresses[0])
+    told: list[tuple[bytes, dict[str, Any]]] = []
+
+    def tick(socket: zmq.Socket[Any]) -> int:
+        publisher.refresh()
+        publisher.repeat()
+        while socket.poll(0):
+            told.append(receive(socket))
+        return len(told)
+
+    until(lambda: tick(early) == 51)
+    assert told[0][0] == b"hand/settings"
+    assert told[0][1]["version"] == "0.1.0"
+    assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
+    assert all(message["again"] for _, message in told)
+    assert told[-1][1]["timestamp"] == 158.0  # its own, not that of the repetition
+    told.clear()
+    publisher.event(200.0, 100.0, "info", "mode", "new")
+    until(lambda: tick(early) == 1)
+    assert not told[0][1]["again"]
+    # A second subscriber, of one topic alone, is told that topic's.
+    told.clear()
+    late = subscribe(context, addresses[0], b"hand/event")
+    until(lambda: tick(late) == 50)
+    assert {topic for topic, _ in told} == {b"hand/event"}
+    publisher.close()
+
+
+def test_a_flood_of_subscribers_makes_one_list_to_tell(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=200)
+    publisher.event(99.0, 1.0, "info", "mode", "one")
+    sockets = [subscribe(context, addresses[0], b"hand/event") for _ in range(40)]
+    sent = 0
+
+    def all_told() -> bool:
+        nonlocal sent
+        publisher.refresh()
+        sent += bool(publisher._again)
+        publisher.repeat()
+        return all(socket.poll(0) for socket in sockets)
+
+    until(all_told)
+    assert sent <= 41
+    publisher.close()
+
+
+def test_commands_are_told_to_those_who_ask(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    publisher = Publisher(context, addresses[0], queue=10)
+    publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
+    socket = subscribe(context, addresses[0], b"hand/command")
+    until(lambda: (publisher.refresh(), publisher._wanted(b"hand/command"))[1])
+    publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")
+    topic, message = receive(socket)
+    assert topic == b"hand/command"
+    assert (message["seq"], message["tick"], message["client"]) == (1, 501, "me")
+    assert (message["ok"], message["error"]) == (False, "no")
+    assert json.loads(message["request"]) == {"command": "grasp", "force": 5.0, "client": "me"}
     publisher.close()

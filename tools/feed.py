@@ -117,6 +117,7 @@ class Feed:
         self.frames: dict[str, TactileFrame] = {}
         self.events: deque[Event] = deque(maxlen=200)
         self.event_count = 0
+        self._event_seq = -math.inf
         self.skipped = 0
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
         self._bin: list[tuple[float, float]] = []
@@ -192,6 +193,10 @@ class Feed:
         )
 
     def _take_event(self, record: dict[str, Any]) -> None:
+        seq = number(record, "seq")
+        if record.get("again") is True and seq <= self._event_seq:
+            return  # told again for somebody who came later
+        self._event_seq = seq
         self.event_count += 1
         self.events.append(
             Event(

@@ -173,7 +173,8 @@ class _Recorder:
         gaps = self._gaps.get(topic)
         if gaps is None:
             gaps = self._gaps[topic] = self._new_gaps()
-        gaps.take(message)
+        if not gaps.take(message):
+            return  # told again for somebody else
         self._split_if_due()
         self._writer.add(topic, message)
         self._messages += 1

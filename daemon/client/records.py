@@ -116,6 +116,7 @@ class Event:
     """One ``hand/event``."""
 
     seq: int
+    again: bool  # told again for a late subscriber: it may have been told before
     timestamp: float  # Unix time [s]
     mono_ns: int
     level: str  # info, warning, error

@@ -40,24 +40,28 @@ def nothing_from(address: str, topic: bytes, seconds: float) -> str:
 class Gaps:
     """Counts what was lost between two messages of one topic, by ``seq`` and its step.
 
-    A ``seq`` that goes back is another daemon, or the same one started again: no loss.
+    A ``seq`` that goes back is another daemon, or the same one started again: no loss. What is told
+    ``again`` is no news where it was heard before, and a gap that it fills is none.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self._last: dict[str, int] = {}
 
-    def take(self, message: dict[str, Any]) -> None:
-        """Look at one more message; of ``seq_step`` (1 if untold) one is sent."""
+    def take(self, message: dict[str, Any]) -> bool:
+        """Look at one more message; of ``seq_step`` (1 if untold) one is sent. False: no news."""
         seq, step, source = message.get("seq"), message.get("seq_step", 1), message.get("finger")
         if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
-            return
+            return True
         key = source if isinstance(source, str) else ""
         place = seq // step
-        last = self._last.get(key, place)
-        if place > last:
+        last = self._last.get(key)
+        if message.get("again") is True and last is not None and place <= last:
+            return False
+        if last is not None and place > last:
             self.lost += place - last - 1
         self._last[key] = place
+        return True
 
 
 class Decoder:
@@ -70,7 +74,7 @@ class Decoder:
         self._told = False
 
     def take(self, frames: list[bytes]) -> Any | None:
-        """The record of one message, None when it can't be read."""
+        """The record of one message, None when it can't be read or was heard before."""
         try:
             message = msgpack.unpackb(frames[-1])
             if not isinstance(message, dict):
@@ -79,7 +83,8 @@ class Decoder:
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
             self.unreadable += 1
             return None
-        self.gaps.take(message)
+        if not self.gaps.take(message):
+            return None
         schema = message.get("schema")
         if schema != messages.SCHEMA and not self._told:
             self._told = True
