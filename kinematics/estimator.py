@@ -34,7 +34,8 @@ class ContactEstimate:
     tilts are 0 and that is valid. ``covariance`` is of (d, tilt_x, tilt_y, gain); a fixed gain has
     a zero row, and without contact all is zero. ``chi2`` is the misfit's square a cell over the
     noise's, ``explained`` the share of the frame's squared pressure that the model accounts for;
-    both are 0 where nothing was fitted, as by the moments.
+    both are 0 where nothing was fitted, as by the moments. ``misfit`` tells a contact that is
+    another than the model's.
     """
 
     contact: bool = False
@@ -51,6 +52,16 @@ class ContactEstimate:
     rejected: int = 0  # hot cells left out
     second: bool = False  # something else presses too, off the footprint
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+
+    @property
+    def misfit(self) -> bool:
+        """χ² is beyond what the noise makes once in 3.5 million frames (Wilson-Hilferty, 5 σ).
+
+        So the numbers are those of a contact that this model doesn't describe, or the noise is
+        larger than was told; the covariance is widened then, but knows no bias.
+        """
+        spread = 2.0 / (9.0 * max(self.cells - 4, 1))
+        return self.chi2 > (1.0 - spread + 5.0 * math.sqrt(spread)) ** 3
 
     @property
     def d_std(self) -> float:

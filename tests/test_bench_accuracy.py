@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from kinematics.estimator import ContactEstimate
 from tools import bench
 from tools.benchmarks import accuracy, accuracy_detection, accuracy_envelope, accuracy_trials
 from tools.benchmarks.accuracy_detection import EIGHT_BITS, SIXTEEN_BITS
@@ -144,6 +145,7 @@ def test_the_misfit_limit_is_the_chi_squared_quantile():
         for _ in range(60):
             middle = 0.5 * (low + high)
             flagged = accuracy_envelope.is_misfit(np.array([middle]), cells)[0]
+            assert flagged == ContactEstimate(chi2=middle, cells=freedom + 4).misfit
             low, high = (low, middle) if flagged else (middle, high)
         half = 0.5 * high * freedom
         term = total = math.exp(-half)

@@ -131,3 +131,26 @@ def test_the_covariance_grows_where_d_and_gain_can_hardly_be_told_apart():
             nees.append(error @ np.linalg.solve(e.covariance, error))
     assert len(nees) > 1450
     assert np.mean(nees) / 4.0 == pytest.approx(1.0, abs=0.08)
+
+
+def test_a_misfit_is_flagged_and_good_frames_are_not():
+    grid = SensorGrid(44, 44, PITCH, (3e-4, -2e-4))
+    rng = np.random.default_rng(5)
+    noise = 0.002 * E
+    x = (np.arange(44) - 21.5) * PITCH
+    # Hertz pressure of the same force over r² ≤ a d, where the linear model has 2 a d − d².
+    r2 = (x[None, :] - 3e-4) ** 2 + (x[:, None] + 2e-4) ** 2
+    hertz = np.sqrt(np.maximum(1.0 - r2 / (0.020 * 0.003), 0.0))
+    good = grid.pressure(TIP, LINEAR, 0.003)
+    hertz *= good.sum() / hertz.sum()
+    estimator = ContactEstimator(TIP, LINEAR, grid, noise)
+    for clean, expected in ((good, False), (hertz, True)):
+        for _ in range(100):
+            e = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
+            assert e.valid
+            assert e.misfit is expected
+    counts = np.clip(np.round((good + rng.normal(0.0, noise, grid.shape)) / 800.0), 0, 255)
+    assert not estimator(counts.astype(np.uint8), 800.0).misfit
+    moments = ContactEstimator(TIP, LINEAR, grid, noise, method="moments")
+    assert not moments(hertz).misfit
+    assert not estimator(np.zeros(grid.shape)).misfit

@@ -90,12 +90,13 @@ def _envelope(rows: Iterable[EnvelopeRow]) -> list[str]:
 def _bias(rows: Iterable[BiasRow]) -> list[str]:
     lines = [
         f"{'bias of d over d, %':67}{'cases':>6}{'RMS':>8}{'worst':>8}{'±':>7}{'worst (d, θ)':>14}"
-        f"{'aim':>6}{'lost':>6}"
+        f"{'aim':>6}{'lost':>6}{'misfits':>9}"
     ]
     for row in rows:
         lines.append(
             f"{row.name:67}{row.cases:6d}{row.rms:8.3f}{row.worst:8.3f}{row.deviation:7.3f}"
             f"{row.mean_worst:14.3f}{f'≤ {row.aim:g}':>6}{row.lost:6d}"
+            f"{row.misfits:9d}"
         )
         lines.append(f"    worst: {row.where}")
     return lines

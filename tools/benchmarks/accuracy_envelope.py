@@ -110,6 +110,7 @@ class BiasRow:
     where: str
     mean_worst: float  # averaged over azimuths and offsets at one (d, θ, noise)
     lost: int
+    misfits: int  # as for EnvelopeRow
     aim: float
 
     def as_dict(self) -> dict[str, Any]:
@@ -212,7 +213,7 @@ def _score(case: Case, clean: FloatArray, banks: Any) -> Score:
 
 
 def is_misfit(chi2: FloatArray, cells: FloatArray) -> NDArray[np.bool_]:
-    """χ² a degree of freedom that noise exceeds once in 3.5 million frames (Wilson-Hilferty)."""
+    """As :attr:`kinematics.estimator.ContactEstimate.misfit`, of many."""
     spread = 2.0 / (9.0 * np.maximum(cells - 4.0, 1.0))
     return np.asarray(chi2 > (1.0 - spread + 5.0 * np.sqrt(spread)) ** 3)
 
@@ -284,6 +285,7 @@ def _bias_row(name: str, scores: list[Score], effort: Effort, seed: int) -> Bias
         _where(top.case),
         100.0 * max(abs(float(np.nanmean(each))) for each in groups.values()),
         sum(s.lost for s in scores),
+        sum(s.misfits for s in scores),
         1.0,
     )
 
