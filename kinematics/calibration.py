@@ -370,7 +370,7 @@ def _rising(bands: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
             last = pooled.pop()
             pooled[-1] = [a + b for a, b in zip(pooled[-1], last, strict=True)]
     sums = np.array(pooled).reshape(-1, 3)
-    return sums[:, 1:] / sums[:, :1]
+    return np.asarray(sums[:, 1:] / sums[:, :1])
 
 
 def _stack(frames: ArrayLike, step: str) -> FloatArray:

@@ -53,6 +53,7 @@ class Rig:
         self.backend = backend
         self._stack = ExitStack()
         self._stop = threading.Event()
+        self._unplug = threading.Event()
         tactile: dict[str, object] = {
             "backend": backend,
             "rows": rows,
@@ -107,9 +108,16 @@ class Rig:
         until(holds)
         return self.newest()
 
+    def unplug(self) -> None:
+        """Take the board's port away, in the thread that serves it."""
+        self._unplug.set()
+
     def _serve(self) -> None:
         t = 0.0
         while not self._stop.is_set():
+            if self._unplug.is_set():
+                self.board.unplug()
+                return
             if select.select([self.board], [], [], 0.5 / RATE)[0]:
                 self.board.hear()
             t += 1.0 / RATE

@@ -122,6 +122,15 @@ def test_one_marker_alone_is_never_locked_on():
     assert decoder.locked
 
 
+def test_bytes_behind_a_frame_in_the_same_read_are_told():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    one = frame(bytes(CELLS))
+    decoder.feed(one * 2 + MARKER, 1.0)
+    assert decoder.feed(one[2:] + one[:5], 2.0).behind == 5
+    late = decoder.feed(one[5:] + one, 3.0)  # the second may be torn yet
+    assert late.behind == len(one)
+
+
 def test_counts_are_row_major():
     decoder = FlexiTacDecoder(ROWS, COLS)
     decoded = decoder.feed(frame(bytes(range(CELLS))) + MARKER, 0.0)

@@ -29,6 +29,13 @@ def test_a_frame_is_index_halves_and_newline():
     assert encode_glove(np.full((1, 1), 60000, np.uint16)) == bytes([11, 42, 42, 10])
 
 
+def test_bytes_behind_a_frame_in_the_same_read_are_told():
+    decoder = GloveDecoder(3, 4)
+    first, second, third = (encode_glove(counts(k), k) for k in range(3))
+    assert decoder.feed(first + second + third[:7], 1.0).behind == 7
+    assert decoder.feed(third[7:], 2.0).behind == 0
+
+
 def test_the_usual_board_has_2050_bytes_a_frame():
     assert GloveDecoder().frame_bytes == len(encode_glove(counts(1, 32, 32))) == 2050
 

@@ -49,7 +49,9 @@ def test_numbers_and_times_only_rise(rig):
     while len(seen) < 12:
         seen.append(rig.wait(lambda frame: frame is not seen[-1]))
     assert (np.diff([frame.seq for frame in seen]) > 0).all()
-    assert (np.diff([frame.t_arrival for frame in seen]) > 0).all()
+    assert (np.diff([frame.t_sample for frame in seen]) >= 0).all()
+    # Frames that were read in one go have come at the same time.
+    assert (np.diff([frame.t_arrival for frame in seen]) >= 0).all()
 
 
 def test_counts_are_told_as_plain_numbers(rig):
@@ -121,3 +123,39 @@ def test_a_board_that_falls_silent_leaves_the_last_frame(backend, tmp_path):
         rig.wait(lambda frame: rig.images.number > number + 10)
         assert rig.newest() is last
         assert last.valid
+
+
+@pytest.mark.parametrize("backend", SERIAL)
+def test_a_frozen_board_goes_on_with_numbers_and_times_and_one_image(backend, tmp_path):
+    with Rig(backend, tmp_path, fault="frozen@0.2") as rig:
+        rig.sensor.open()
+        rig.wait(lambda frame: rig.images.number > 60)
+        first = rig.newest()
+        later = rig.wait(lambda frame: frame.seq >= first.seq + 3)
+        assert later.t_sample > first.t_sample
+        assert later.valid
+        assert np.array_equal(later.data, first.data)
+
+
+# The glove-style board does so too, after 40 unanswered requests of 0.1 s each.
+@pytest.mark.parametrize("backend", ["flexitac", "cobs"])
+def test_a_board_that_changes_its_grid_ends_in_an_invalid_frame(backend, tmp_path):
+    with Rig(backend, tmp_path, fault="wrong-size@0.2") as rig:
+        rig.sensor.open()
+        last = rig.wait(lambda frame: not frame.valid)
+        assert last.data.shape == (ROWS, COLS)
+        assert str(ROWS * COLS // 4) in rig.sensor.error or "16 × 16" in rig.sensor.error
+        assert rig.sensor.latest() is last
+
+
+@pytest.mark.parametrize("backend", SERIAL)
+def test_an_unplugged_board_ends_in_an_invalid_frame_with_the_old_data(backend, tmp_path):
+    with Rig(backend, tmp_path) as rig:
+        rig.sensor.open()
+        before = rig.wait(lambda frame: frame.seq >= 3)
+        rig.unplug()
+        last = rig.wait(lambda frame: not frame.valid)
+        assert last.seq > before.seq
+        assert last.t_arrival >= before.t_arrival
+        assert rig.sensor.counters()["port_lost"] == 1
+        assert "port is gone" in rig.sensor.error

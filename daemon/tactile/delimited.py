@@ -54,6 +54,7 @@ class DelimitedDecoder:
         buffer = self._buffer
         buffer += data
         newest = None
+        behind = 0
         end = buffer.find(self._delimiter, self._scanned)
         while end >= 0:
             packet = buffer[:end]
@@ -64,6 +65,7 @@ class DelimitedDecoder:
                 self._frames += 1
                 self.frame_bytes = end + 1
                 self._skipped_at_frame = self._skipped
+                behind = len(buffer)
             else:
                 # Whatever stands before the first delimiter may be a frame's tail.
                 self._resyncs += bool(packet) and self._in_step
@@ -76,6 +78,8 @@ class DelimitedDecoder:
             self._skipped += len(buffer)
             buffer.clear()
         self._scanned = len(buffer)
+        if newest is not None:
+            newest.behind = behind
         return newest
 
     def settle(self) -> Decoded | None:

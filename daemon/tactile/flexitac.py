@@ -222,11 +222,11 @@ class FlexiTacDecoder:
         count = self.rows * self.cols
         data = np.frombuffer(self._buffer, np.uint8, count, len(MARKER)).astype(np.uint16)
         end = self._start + self.frame_bytes
-        self._t_whole = next(t for piece_end, t in self._pieces if piece_end >= end)
+        read_to, self._t_whole = next(piece for piece in self._pieces if piece[0] >= end)
         self._drop(self.frame_bytes)
         self._frames += 1
         self._skipped_at_frame = self._skipped
-        return Decoded(data.reshape(self.rows, self.cols), self._t_whole)
+        return Decoded(data.reshape(self.rows, self.cols), self._t_whole, behind=read_to - end)
 
     def _lose(self) -> None:
         self._locked = False

@@ -38,6 +38,7 @@ class Decoded:
     t: float
     steps: int = 1  # frames since the last one by the board's own number
     t_sensor: float | None = None  # the board's clock at the middle of the scan [s]
+    behind: int = 0  # bytes that came behind its last one in the same read
 
 
 class Decoder(Protocol):
@@ -101,9 +102,10 @@ class SerialReader:
     """Reads one port in a thread of its own. The whole of a backend but for its framing.
 
     Times: a frame's ``t_arrival`` is when its last byte was read. ``t_sample`` is the middle of the
-    board's scan as well as it can be known: ``t_arrival`` less the time the frame's bytes take on
-    the wire, less ``latency`` [s], from the middle of the scan to the frame's first byte. Where
-    frames carry the board's time, the least delayed of late ones stands for ``t_arrival`` in it.
+    board's scan as well as it can be known: ``t_arrival`` less the time that the frame's bytes, and
+    those behind it in the same read, take on the wire, less ``latency`` [s], from the middle of the
+    scan to the frame's first byte; never before the last frame's. Where frames carry the board's
+    time, the least delayed of late ones stands for ``t_arrival`` in it.
 
     A board that must be asked is asked with ``request`` at first, after each frame, and again when
     none came for ``patience`` [s] longer than its bytes take.
@@ -269,10 +271,12 @@ class SerialReader:
         if decoded is None:
             return
         self._seq += decoded.steps
-        whole = decoded.t
+        whole = decoded.t - decoded.behind * self._byte_time
         if decoded.t_sensor is not None:
-            whole = self._sensor_clock.arrival(decoded.t_sensor, decoded.t)
+            whole = self._sensor_clock.arrival(decoded.t_sensor, whole)
         sampled = whole - self._decoder.frame_bytes * self._byte_time - self._latency
+        if self._latest is not None:
+            sampled = max(sampled, self._latest.t_sample)
         self._latest = Frame(self._seq, sampled, decoded.t, True, decoded.data)
         self._error = ""
         self._event.set()
