@@ -1,0 +1,82 @@
+"""Two tips that were calibrated to different materials: each finger's forces are by its own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.calibration import Calibration, ModulusStep, now, save_calibration, sensor_of
+from daemon.settings import Settings
+from kinematics.held import total_tilt
+
+LEFT = 0.25e6  # Pa, a constant modulus
+STRAIN = [0.0, 0.1, 0.2, 0.4, 0.6]
+STRESS = [0.0, 14e3, 31e3, 75e3, 130e3]  # Pa, the right tip's law
+TRUE = 0.28e6  # Pa, the simulated tips'
+
+
+@pytest.fixture
+def settings(tmp_path):
+    base = Settings.model_validate(
+        {
+            "loop": {"clock": "virtual"},
+            "material": {"law": "constant", "modulus": TRUE},
+            "estimator": {"free_gain": False},
+            "simulation": {"tactile_noise": 300.0},
+            "tactile": {"noise": 300.0},
+        }
+    )
+    files = []
+    for finger, points in ((0, {}), (1, {"strain": STRAIN, "stress": STRESS})):
+        step = ModulusStep(date=now(), modulus=LEFT, offset=0.0, residual=0.0, **points)
+        sensor = sensor_of(base, finger)
+        files.append(str(tmp_path / f"{sensor.finger}.json"))
+        save_calibration(
+            tmp_path / f"{sensor.finger}.json",
+            Calibration(sensor=sensor, date=now(), modulus=step),
+        )
+    raw = base.model_dump()
+    raw["tactile"]["calibration"] = tuple(files)
+    return Settings.model_validate(raw)
+
+
+def test_each_tips_material_reaches_estimate_table_and_prediction(settings):
+    events = []
+    with Daemon(settings, wire=False, on_event=lambda *event: events.append(event)) as daemon:
+        told = [text for _, kind, text in events if kind == "calibration"]
+        assert [text.split(":")[0] for text in told] == ["left", "right"]
+        assert all(text.endswith(": modulus") for text in told)
+        left, right = daemon.models
+        assert left.material.reference_modulus == pytest.approx(LEFT)
+        assert not right.material.is_linear
+        loop = daemon.loop
+        loop.advance(0.3)
+        loop.command({"command": "arm"})
+        loop.advance(0.1)
+        loop.command({"command": "grasp", "force": 6.0})
+        for _ in range(300):
+            if loop.state.mode == "holding":
+                break
+            loop.advance(0.01)
+        assert loop.state.mode == "holding"
+        loop.advance(0.2)
+        for model, contact in zip(daemon.models, loop.state.contacts, strict=True):
+            assert contact.gain == 1.0
+            expected = model.table(contact.d, total_tilt(contact.theta, contact.tilt_y))
+            assert contact.force == pytest.approx(expected.force, rel=1e-9)
+            assert contact.energy == pytest.approx(expected.energy, rel=1e-9)
+        assert daemon.hand is not None
+        # The simulated tips stay the settings' own.
+        d, theta = daemon.hand.d, daemon.hand.theta
+        by_truth = math.pi * TRUE * d**2 / np.cos(theta)
+        assert np.abs(daemon.hand.force / by_truth - 1.0).max() < 1e-3
+
+
+def test_tips_of_one_material_share_one_table():
+    with Daemon(Settings.model_validate({"loop": {"clock": "virtual"}}), wire=False) as daemon:
+        assert daemon.models[0].table is daemon.models[1].table
+        assert daemon.hand is not None
+        assert daemon.hand.table is daemon.models[0].table
