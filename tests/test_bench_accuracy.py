@@ -12,6 +12,7 @@ from kinematics.estimator import ContactEstimate
 from tools import bench
 from tools.benchmarks import accuracy, accuracy_detection, accuracy_envelope, accuracy_trials
 from tools.benchmarks.accuracy_detection import EIGHT_BITS, SIXTEEN_BITS
+from tools.benchmarks.accuracy_flaws import FlawRow
 from tools.benchmarks.accuracy_mismatch import MismatchRow, mismatches
 from tools.benchmarks.accuracy_trials import FLOAT, Board, Place
 from tools.benchmarks.estimator_bounds import LINEAR, SIZE, TIP
@@ -33,6 +34,7 @@ SHORT = accuracy.Effort(
     samples=200,
     other_frames=20,
     other_noises=(608.0,),
+    flaw_frames=10,
 )
 
 
@@ -66,6 +68,20 @@ def test_faint_contacts_are_seen_and_others_models_show(rows):
         assert found[(name, 0.004, 0.0)].misfits == 1.0
         assert found[(name, 0.004, 0.0)].d_error < -5e-4
     assert found[("Table I's law", 0.002, 0.0)].misfits == 0.0
+
+
+def test_flaws_are_told_with_what_they_do(rows):
+    found = {(r.name, r.d, r.free): r for r in of(FlawRow, rows)}
+    for d in (0.002, 0.004):
+        clean = found[("none", d, True)]
+        assert abs(clean.d_error) < 4 * clean.told
+        assert clean.misfits == 0.0
+        # Unloading reads more pressure: a gain if that is free, else a deeper contact.
+        unloading = found[("hysteresis 10 %, unloading", d, True)]
+        assert 1.01 < unloading.gain < 1.25
+        assert found[("hysteresis 10 %, unloading", d, False)].d_error > 0.02 * d
+        # A blur widens the footprint.
+        assert found[("blur 1 mm", d, True)].d_error > 4 * clean.told
 
 
 def test_sampled_alarms_are_as_computed(rows):
@@ -171,21 +187,21 @@ def test_the_neighbours_distribution_is_that_of_the_sum(board):
     )
     # Its tail, against counts drawn as the board makes them.
     rng = np.random.default_rng(4)
-    counts = np.clip(np.floor(noise * rng.standard_normal((200_000, 24)) + 0.5), 0, 255e9)
+    counts = np.clip(np.floor(noise * rng.standard_normal((100_000, 24)) + 0.5), 0, 255e9)
     counts[counts < board.threshold] = 0
     sums = counts @ np.sort(weights)
     level = int(np.quantile(sums, 0.99))
-    assert total[level + 1 :].sum() == pytest.approx(np.mean(sums > level), rel=0.06)
+    assert total[level + 1 :].sum() == pytest.approx(np.mean(sums > level), rel=0.1)
 
 
 def test_importance_sampling_counts_each_frame_once():
     # At a low level frames often have several alarming cells, and sampling them is easy.
     frames = 20_000
     plain = accuracy_detection.sampled((2.5,), frames, 608.0)[0] / frames
-    weighed = accuracy_detection.importance(1500, 2.5)
+    weighed = accuracy_detection.importance(800, 2.5)
     expected = accuracy_detection.expected_alarms(608.0, FLOAT, 2.5)
     assert weighed < expected
-    assert plain == pytest.approx(weighed, abs=4.0 * math.sqrt(weighed / frames))
+    assert plain == pytest.approx(weighed, abs=4.0 * math.sqrt(weighed / frames) + 0.02 * weighed)
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 40])

@@ -1,8 +1,8 @@
 """How accurate the estimator is over its whole envelope: a campaign of some minutes.
 
 Errors against the Cramér-Rao bound, honesty of the covariance, dead cells, 8-bit counts, faint
-contacts, false alarms, and frames of other contact models. The parts are accuracy_*.py; here are
-their sizes and their tables.
+contacts, false alarms, frames of other contact models and of imperfect sensors. The parts are
+accuracy_*.py; here are their sizes and their tables.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from tools.benchmarks import accuracy_envelope, accuracy_trials
 from tools.benchmarks.accuracy_detection import AlarmRow, DetectionRow, detection, false_alarms
 from tools.benchmarks.accuracy_envelope import BiasRow, EnvelopeRow
+from tools.benchmarks.accuracy_flaws import FlawRow, flaws
 from tools.benchmarks.accuracy_mismatch import MismatchRow, mismatches
 from tools.benchmarks.estimator_bounds import MODULUS
 
@@ -31,6 +32,7 @@ class Effort:
     samples: int = 20_000  # of importance sampling, at each level
     other_frames: int = 500
     other_noises: tuple[float, ...] = accuracy_trials.noises()
+    flaw_frames: int = 200
 
 
 def measure(effort: Effort | None = None) -> list[Any]:
@@ -42,6 +44,7 @@ def measure(effort: Effort | None = None) -> list[Any]:
         *detection(effort.faint_around, effort.faint_frames, effort.faint_again),
         *false_alarms(effort.noise_frames, effort.samples),
         *mismatches(effort.other_frames, effort.other_noises),
+        *flaws(effort.flaw_frames),
     ]
 
 
@@ -53,6 +56,7 @@ def table(rows: list[Any]) -> str:
         _detection(_of(DetectionRow, rows)),
         _alarms(_of(AlarmRow, rows)),
         _mismatch(_of(MismatchRow, rows)),
+        _flaws(_of(FlawRow, rows)),
     ]
     return "\n\n".join("\n".join(lines) for lines in parts)
 
@@ -137,6 +141,21 @@ def _mismatch(rows: Iterable[MismatchRow]) -> list[str]:
             f"{row.name:20}{row.d * 1e3:6.1f}{math.degrees(row.theta):6.1f}"
             f"{100 * row.noise / MODULUS:9.1f}{row.d_error * 1e3:10.3f}{row.told * 1e3:8.3f}"
             f"{math.degrees(row.theta_error):9.2f}{row.chi2:10.2f}{100 * row.misfits:7.0f} %"
+            f"{100 * row.invalid:9.0f} %"
+        )
+    return lines
+
+
+def _flaws(rows: Iterable[FlawRow]) -> list[str]:
+    lines = [
+        f"{'a sensor with':28}{'d mm':>6}{'θ °':>6}{'gain':>7}{'d off mm':>10}{'±':>8}"
+        f"{'θ off °':>9}{'gain':>8}{'flagged':>9}{'not valid':>11}"
+    ]
+    for row in rows:
+        lines.append(
+            f"{row.name:28}{row.d * 1e3:6.1f}{math.degrees(row.theta):6.1f}"
+            f"{'free' if row.free else 'known':>7}{row.d_error * 1e3:10.3f}{row.told * 1e3:8.3f}"
+            f"{math.degrees(row.theta_error):9.2f}{row.gain:8.3f}{100 * row.misfits:7.0f} %"
             f"{100 * row.invalid:9.0f} %"
         )
     return lines
