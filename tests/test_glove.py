@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.simulation.encoders import encode_glove
-from daemon.tactile.glove import GloveDecoder
+from daemon.simulation.encoders import encode_glove, encoder_for
+from daemon.tactile.glove import GloveDecoder, bits_of
 from tests.conftest import until
 from tests.tactile_harness import Rig
 
@@ -27,6 +27,18 @@ def test_a_frame_is_index_halves_and_newline():
     assert decoded.t == 3.0
     assert decoded.data.tolist() == [[0, 31], [32, 1023]]
     assert encode_glove(np.full((1, 1), 60000, np.uint16)) == bytes([11, 42, 42, 10])
+
+
+@pytest.mark.parametrize("full_count", [1023, 4095])
+def test_a_board_sends_all_its_bits(full_count):
+    sent = np.array([[0, 63, 64], [1022, full_count - 1, full_count]], np.uint16)
+    data = encoder_for("glove", full_count).encode(sent, 3, 0.0)
+    decoder = GloveDecoder(2, 3, bits_of(full_count))
+    assert decoder.feed(data, 1.0).data.tolist() == sent.tolist()
+    if full_count == 4095:
+        plain = GloveDecoder(2, 3, bits_of(65535))  # as a profile that doesn't tell
+        assert plain.feed(data, 1.0) is None
+        assert "full_count = 4095" in plain.diagnosis()
 
 
 def test_bytes_behind_a_frame_in_the_same_read_are_told():

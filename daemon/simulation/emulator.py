@@ -23,7 +23,7 @@ from daemon.records import FINGERS
 from daemon.settings import Settings, TactileSettings
 from daemon.simulation.bus_faults import FaultError, ReplyFaults
 from daemon.simulation.control_port import ControlPort
-from daemon.simulation.encoders import ENCODERS
+from daemon.simulation.encoders import ENCODERS, encoder_for
 from daemon.simulation.fault_words import SERVOS, Event, Faults
 from daemon.simulation.hand import SimulatedHand
 from daemon.simulation.link_folder import FolderError, LinkFolder
@@ -154,7 +154,7 @@ class Emulator:
                 source.open()
                 board = TactileBoard(
                     source,
-                    ENCODERS[tactile.backend],
+                    encoder_for(tactile.backend, tactile.full_count),
                     tactile.rate,
                     settings.simulation.tactile_delay,
                     seed=settings.simulation.seed + finger,

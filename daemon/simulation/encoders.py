@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +32,28 @@ def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.
     return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
 
 
-def encode_glove(counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0) -> bytes:
-    """Number + 11, each count's high and low five bits + 11, newline; counts over 1023 saturate."""
-    counts = np.minimum(counts, 1023)
-    halves = np.stack([counts // 32 + 11, counts % 32 + 11], axis=-1)
+def encode_glove(
+    counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
+) -> bytes:
+    """Number + 11, each count's high and low half + 11, newline; counts beyond that saturate.
+
+    ``values`` of a half: 32 or, with a 12-bit converter, 64.
+    """
+    counts = np.minimum(counts, values * values - 1)
+    halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
     return bytes((11 + number % 244,)) + halves.astype(np.uint8).tobytes() + b"\n"
 
 
 def encode_cobs(counts: NDArray[np.uint16], number: int = 0, t: float = 0.0) -> bytes:
     """Our own framing with uint16 counts, see :mod:`daemon.tactile.cobs`."""
     return cobs.encode(counts, number, t)
+
+
+def encoder_for(backend: str, full_count: int) -> Encoder:
+    """The framing of a backend's board whose largest count is ``full_count``."""
+    if backend == "glove" and 1023 < full_count <= 4095:
+        return Encoder(partial(encode_glove, values=64), b"a")
+    return ENCODERS[backend]
 
 
 ENCODERS = {

@@ -4,6 +4,9 @@ At 1,000,000 baud. The host writes ``a``; the board answers with one frame of 2 
 bytes: index + 11, then for each cell, row-major, the high 5 bits + 11 and the low 5 bits + 11, then
 a newline (10). No byte but the last can be a newline, so the stream is found again at the next one.
 There is no checksum: a byte that turned into another one of 11 … 42 goes unseen.
+
+Boards with a 12-bit converter send the same with 6 bits in each half; ``tactile.full_count`` above
+1023, up to 4095, tells them.
 """
 
 from __future__ import annotations
@@ -19,14 +22,15 @@ from daemon.tactile.serial_reader import SerialReader
 REQUEST = b"a"
 _NEWLINE = 10
 _OFFSET = 11
-_HALF = 32  # values of each half of a count
+_BITS = 5  # of each half of a count
 _PATIENCE = 0.1  # s over a frame's time on the wire until the board is asked again
 
 
 class GloveDecoder(DelimitedDecoder):
-    """Bytes of a glove-style board in, frames of 10-bit counts out."""
+    """Bytes of a glove-style board in, frames of counts with twice ``bits`` bits out."""
 
-    def __init__(self, rows: int = 32, cols: int = 32) -> None:
+    def __init__(self, rows: int = 32, cols: int = 32, bits: int = _BITS) -> None:
+        self._values = 1 << bits  # of each half
         super().__init__(rows, cols, _NEWLINE, 2 + 2 * rows * cols)
         self._reason = ""
 
@@ -38,17 +42,22 @@ class GloveDecoder(DelimitedDecoder):
             return None
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
         # Bytes below the offset wrap round to large ones.
-        if packet[0] < _OFFSET or halves.max() >= _HALF:
-            self._reason = "a byte that stands for no half of a count"
+        if packet[0] < _OFFSET or halves.max() >= self._values:
+            self._reason = "a byte that stands for no half of a count (tactile.full_count = 4095?)"
             return None
         counts = halves[0::2].astype(np.uint16)
-        counts *= _HALF
+        counts *= self._values
         counts += halves[1::2]
         return counts.reshape(self.rows, self.cols)
 
     def reason(self) -> str:
         """As :meth:`DelimitedDecoder.reason`."""
         return self._reason
+
+
+def bits_of(full_count: int) -> int:
+    """Bits in each half of a count, by the largest count of the board."""
+    return _BITS + 1 if 1 << 2 * _BITS <= full_count < 1 << 2 * (_BITS + 1) else _BITS
 
 
 class Glove(SerialReader):
@@ -58,7 +67,7 @@ class Glove(SerialReader):
         """``finger`` 0 is the left one; it chooses the port."""
 
         def make_decoder() -> GloveDecoder:
-            return GloveDecoder(settings.rows, settings.cols)
+            return GloveDecoder(settings.rows, settings.cols, bits_of(settings.full_count))
 
         super().__init__(
             settings.port[finger],
