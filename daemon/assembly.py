@@ -74,9 +74,9 @@ class Daemon:
         self.hand = self._make_hand(cache, on_event)
         self.servos = make_servos(settings, self.clock, self.hand)
         perceptions = self._make_perceptions()
-        prediction = None
+        self.prediction: Prediction | None = None
         if perceptions and self.servos is not None:
-            prediction = Prediction(settings, self.tables)
+            self.prediction = Prediction(settings, self.tables)
         warm_up(settings, self.tables, perceptions)
         if self.servos is not None:
             self._connect(self.servos)
@@ -84,7 +84,14 @@ class Daemon:
             self._closers.append(perception.sensor.close)
             perception.sensor.open()
         self.loop = Loop(
-            settings, self.clock, self.servos, perceptions, prediction, publisher, server, on_event
+            settings,
+            self.clock,
+            self.servos,
+            perceptions,
+            self.prediction,
+            publisher,
+            server,
+            on_event,
         )
         if publisher is not None:
             publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))

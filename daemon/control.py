@@ -27,6 +27,7 @@ _SETTLED_FORCE = 0.03  # share of the force target
 _SETTLED_ANGLE = 0.5 * math.pi / 180.0
 _SETTLED_FOR = 0.2  # s
 _TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
+_RAISED = 1.02  # of the force asked for: told as raised
 _LOST_AFTER = 0.1  # s without contact in a grip
 
 
@@ -51,6 +52,8 @@ class Control:
         self._pose = ObjectPose()
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
         self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
+        self._next_angle: float | None = None  # rad to turn to once the grip holds
+        self._raised = False  # the grip is firmer than was asked for
         self._touching = [False, False]
         self._gripping = False
         self._rest_current = settings.safety.current_move  # A, with which the joints hold a goal
@@ -61,8 +64,8 @@ class Control:
 
     def command(self, command: Command) -> dict[str, Any]:
         """Carry out a command that `modes.parse` let through. Raises Refused with the reason."""
-        getattr(self, f"_{command.name}")(command.numbers)
-        return {"mode": self.mode.value}
+        told = getattr(self, f"_{command.name}")(command.numbers)
+        return {"mode": self.mode.value} | (told or {})
 
     def fail(self, reason: str, name: str) -> None:
         """Latch a fault: torque off until ``clear``. ``name`` is its row of `daemon.limits`."""
@@ -125,15 +128,23 @@ class Control:
         if self._gripping:
             self._grip.retarget(force)
         else:
-            self._hold_here()
-            self._touching = [False, False]
+            if self.mode is not Mode.GRASPING:
+                self._hold_here()
+                self._touching = [False, False]
             self._force = force
         self._enter(Mode.GRASPING)
 
-    def _rotate(self, numbers: dict[str, float]) -> None:
+    def _rotate(self, numbers: dict[str, float]) -> dict[str, Any] | None:
         if len(self._fingers) < 2 or not self._settings.scene.object_model:
             raise Refused("rotate: needs both fingers and the object model in the scene")
         angle = numbers["angle"]
+        if self.mode is Mode.GRASPING:
+            self._next_angle = angle
+            return {"queued": "rotate", "until": Mode.HOLDING.value}
+        self._turn_to(angle)
+        return None
+
+    def _turn_to(self, angle: float) -> None:
         if not self._pose.valid:
             raise Refused("rotate: the object's angle is not known")
         low, high = self._turns()
@@ -185,6 +196,10 @@ class Control:
         if mode is not self.mode:
             self.events.append(("info", "mode", f"{self.mode.value} → {mode.value}"))
         self.mode = mode
+        if self._next_angle is not None and mode not in (Mode.GRASPING, Mode.HOLDING):
+            self._next_angle = None
+            text = f"rotate: dropped, since the grasp ended in {mode.value}"
+            self.events.append(("warning", "rotate", text))
         self._rest_current = self._settings.safety.current_move
         self._waiting = self._lost = 0.0
         if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
@@ -276,6 +291,9 @@ class Control:
     def _hold(self, dt: float, goal: Goal) -> None:
         contacts = self._touched
         grip = self._grip
+        grip.holding = self.mode is Mode.HOLDING
+        if self._loses(dt, contacts, goal):
+            return
         if self._by_position:
             goal.q[:] = grip.angles(self._contacts, self._pose, self._held)
             goal.current[0] = goal.current[1] = self._settings.safety.current_max
@@ -286,30 +304,50 @@ class Control:
                 goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
                 goal.current[index] = abs(current)
         self._watch_slip()
-        self._watch_contact(dt, contacts, max(goal.current[index] for index in self._fingers))
         self._watch_settling(dt, contacts)
 
-    def _watch_contact(self, dt: float, contacts: list[Contact], current: float) -> None:
+    def _loses(self, dt: float, contacts: list[Contact], goal: Goal) -> bool:
+        """Without a contact the joints hold where they are; when it stays away the grip ends."""
         lost = False
         for contact in contacts:
             lost = lost or not contact.contact
-        self._lost = self._lost + dt if lost else 0.0
+        if not lost:
+            self._lost = 0.0
+            return False
+        if self._lost == 0.0:
+            self._hold_here()
+            # A board that went blind must not make the joints press harder than they did.
+            pressed = max(goal.current[index] for index in self._fingers)
+            self._rest_current = min(pressed, self._settings.safety.current_move)
+        for index in self._fingers:
+            goal.q[index] = self._ways[index].value
+            goal.current[index] = self._rest_current
+        self._lost += dt
         if self._lost > _LOST_AFTER:
             self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
-            self._hold_here()
+            rest = self._rest_current
             self._enter(Mode.ARMED)
-            # A board that went blind must not make the joints press harder than they did.
-            self._rest_current = min(current, self._rest_current)
+            self._rest_current = rest
+        return True
 
     def _watch_slip(self) -> None:
-        """Turning shears the tips, however firm the grip: it ends where they would slip."""
+        """Tell when the grip is raised by itself. Turning ends where the tips would slip."""
         law = self._settings.control
         most = law.tip_friction * (1.0 - law.slip_margin)
         grip = self._grip
-        if self.mode is Mode.ROTATING and self._held.shear > most and grip.turning_away:
+        if grip.slip.turned:
+            self.events.append(("warning", "slip", "the object turns in the grip"))
+        asked, given = grip.force_target, grip.force.target
+        if given > _RAISED * asked and not self._raised:
+            self._raised = True
+            text = f"grip raised above {asked:.1f} N: each tip may bear {grip.slip.load:.1f} N"
+            self.events.append(("warning", "slip", f"{text} along its face"))
+        elif given <= asked:
+            self._raised = False
+        if self.mode is Mode.ROTATING and self._held.shear * grip.turning_on > most:
             text = f"turning ended at {math.degrees(self._pose.angle):.1f}°: the tips would slip"
             self.events.append(("warning", "slip", text))
-            grip.steer(self._pose.angle, grip.angle.value)
+            grip.steer(self._pose.angle, self._pose.angle)
 
     def _watch_settling(self, dt: float, contacts: list[Contact]) -> None:
         if self.mode not in (Mode.GRASPING, Mode.ROTATING):
@@ -324,4 +362,16 @@ class Control:
         if self._waiting > _SETTLED_FOR:
             if self._pose.valid and not self._grip.steering:
                 self._grip.steer(self._pose.angle, self._pose.angle)
+            self._grip.slip.begin(self._held)
             self._enter(Mode.HOLDING)
+            self._turn_next()
+
+    def _turn_next(self) -> None:
+        """Carry out a turn that waited for the grip."""
+        angle, self._next_angle = self._next_angle, None
+        if angle is None:
+            return
+        try:
+            self._turn_to(angle)
+        except Refused as reason:
+            self.events.append(("warning", "rotate", str(reason)))

@@ -24,8 +24,12 @@ from daemon.prediction import Held
 from daemon.records import Contact, ObjectPose, Reading
 from daemon.reference import Reference
 from daemon.settings import Settings
+from daemon.slip import SlipWatch
 
 _INTEGRAL_SHARE = 0.3  # the integral's bound, as a share of the force wanted
+_SHARE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
+_SHARE_ANGLE = 3e-3  # rad that the object may turn by that
+_QUIET = 2.0  # standard deviations of the angle that the joints at rest don't follow
 _STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
 
 
@@ -44,6 +48,10 @@ class Grip:
         self.force = Reference(self._dt, law.smooth_time)
         self.angle = Reference(self._dt, law.smooth_time)
         self.steering = False
+        self.holding = False  # nothing but loads moves the joints
+        self.slip = SlipWatch(settings)
+        self._shift = 0.0  # of the offset, to share the force out between the tips [rad]
+        self._closing_friction = 0.0  # share of the joints' friction that is given for closing
         self._force_rate = 0.0  # N/s
         self.force_target = 0.0  # N that was asked for
         self._integral = 0.0  # N
@@ -57,23 +65,29 @@ class Grip:
         return self.angle.target
 
     @property
-    def turning_away(self) -> bool:
-        """The object is being turned away from upright."""
-        return self.angle.speed * self.angle.value > 0.0
+    def turning_on(self) -> float:
+        """The angle at which turning could stop, over the present one; 0 while it goes upright."""
+        angle, speed = self.angle.value, self.angle.speed
+        if speed * angle <= 0.0:
+            return 0.0
+        return 1.0 + min(speed * self._law.smooth_time / angle, 1.0)
 
     def start(self, held: Held, felt: float, force: float) -> None:
         """Take over from the approach with ``felt`` N on the tips."""
+        self.slip.forget()
         self.force.reset(felt)
         self._integral = 0.0
         self._offset = 0.5 * (held.q[0] - held.q[1])
         self._closed = 0.5 * (held.q[0] + held.q[1])
         self.steering = False
+        self._shift = 0.0
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
         """Go to another grip force [N]."""
         self.force_target = self.force.target = force
-        self._force_rate = max(abs(force - self.force.value), 0.1 * force) / self._law.force_time
+        least = max(0.1 * force, 0.5 * self._law.grip_raise_max)
+        self._force_rate = max(abs(force - self.force.value), least) / self._law.force_time
 
     def steer(self, present: float, angle: float) -> None:
         """Turn the object from its ``present`` angle to ``angle`` [rad], and keep it there."""
@@ -87,12 +101,14 @@ class Grip:
     ) -> list[float]:
         """Joint torques [N·m], positive closing; pairs, of which the fingers' places are filled."""
         torques = self._torques
-        wanted = self._wanted(held)
+        wanted = self._wanted(contacts, held)
         push = wanted + self._correction(wanted, contacts)
         if len(self._fingers) == 1:
             return self._press(push, reading, held)
         lean = self._steer(pose, held) if self.steering else 0.0
+        self._share_out(held)
         close = self._closing(lean, held)
+        self._closing_friction = min(max(close / self._law.friction_speed, -1.0), 1.0)
         dq1, dq2 = reading.dq
         arm = 0.5 * (held.arm[0] + held.arm[1])
         stiffness = _mean_stiffness(held)
@@ -111,7 +127,7 @@ class Grip:
         What it can't do is why the other laws exist: its finest step is one count of the joints.
         """
         law = self._law
-        wanted = self._wanted(held)
+        wanted = self._wanted(contacts, held)
         error = wanted - 0.5 * (contacts[0].force + contacts[1].force)
         arm = 0.5 * (held.arm[0] + held.arm[1])
         lean = self._steer(pose, held) if self.steering else 0.0
@@ -119,17 +135,12 @@ class Grip:
         self._closed += (self._closing(lean, held) + way) * self._dt
         return [self._closed + self._offset, self._closed - self._offset]
 
-    def _wanted(self, held: Held) -> float:
-        """The force [N] at this tick: the target, raised where the tips would be near to slipping.
-
-        Of the shear force one part grows with the grip, the rolling's; the load is borne by both.
-        """
-        law = self._law
-        if law.object_load > 0.0:
-            spare = law.tip_friction * (1.0 - law.slip_margin) - held.shear
-            most = self.force_target + law.grip_raise_max
-            needed = 0.5 * law.object_load / spare if spare > 0.0 else most
-            self.force.target = min(max(self.force_target, needed), most)
+    def _wanted(self, contacts: list[Contact], held: Held) -> float:
+        """The force [N] at this tick: the target, raised where the tips would be near slipping."""
+        if len(self._fingers) == 2:
+            self.force.target = self.slip.step(
+                held, contacts, self.force_target, self.holding, self._closing_friction
+            )
         return self.force.step(self._force_rate)
 
     def _closing(self, lean: float, held: Held) -> float:
@@ -174,10 +185,26 @@ class Grip:
         if pose.valid:
             error = angle - pose.angle
             if self.angle.arrived:
-                error = _beyond(error, held.angle_std)
+                error = _beyond(error, _QUIET * held.angle_std)
             self._offset += 2.0 * math.pi * law.rotate_bandwidth * error / turn * self._dt
         self._offset += lean * self._dt
         return lean
+
+    def _share_out(self, held: Held) -> None:
+        """Take out what the object's rubbing on the table has put between the tips.
+
+        The force law holds their mean; friction may keep the object where one tip is pressed more.
+        Both fingers then shift sideways by a little, less than the object's angle is held to.
+        """
+        if not self.force.arrived or (self.steering and not self.angle.arrived):
+            return
+        arm = 0.5 * (held.arm[0] + held.arm[1])
+        off = 0.5 * (held.normal[0] - held.normal[1]) / (_mean_stiffness(held) * arm)
+        most = _SHARE_ANGLE / max(held.turn[0] + held.turn[1], 0.1)
+        shift = self._shift - 2.0 * math.pi * _SHARE_BANDWIDTH * off * self._dt
+        shift = min(max(shift, -most), most)
+        self._offset += shift - self._shift
+        self._shift = shift
 
     def _damping(self, stiffness: float) -> float:
         """N·m·s/rad that damp the joint's inertia on ``stiffness`` [N·m/rad]."""

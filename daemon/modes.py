@@ -40,7 +40,7 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
         frozenset({Mode.ARMED, Mode.MOVING, Mode.GRASPING}) | _GRIPPED,
         {"force": False},
     ),
-    "rotate": (_GRIPPED, {"angle": True}),
+    "rotate": (_GRIPPED | {Mode.GRASPING}, {"angle": True}),  # waits for the grip to hold
     "release": (_ON, {}),
     "set": (_ON, {"compliance": True}),
     "stop": (_ANY, {}),

@@ -22,6 +22,7 @@ from daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
 from daemon.settings import Settings
 from kinematics.held import held_motion, holding_levers, total_tilt
 from kinematics.kernels import kernel
+from kinematics.shear import load_by_torques
 from kinematics.table import ContactTable, lookup
 
 FloatArray = NDArray[np.float64]
@@ -43,11 +44,14 @@ _SINCE = 19  # their lengths since the last frame's instant
 _GAIN, _TILT, _LIVE = 22, 24, 26
 _UNSEEN = 28  # motion of the joints since the last frame that the velocity can't show [rad]
 _SLOW = 30  # half a count of velocity [rad/s]
-_MEMORY = 31
+_RAW = 31  # 1: frames as they are, carried on by nothing
+_STRAY = 32  # sum of what frames have corrected of φ [rad]
+_TORQUE = 33  # of the joints [N·m]
+_MEMORY = 35
 
 # Columns of the history, and of what a tick gives out.
 _H_T, _H_WAY, _H_Q, _H_SIZE = 0, 1, 4, 6
-_OUT = 27
+_OUT = 31
 
 
 @kernel
@@ -96,7 +100,7 @@ def _advance(
     seen1 = _credited(m, 0, way1, dq1 * dt, dt)
     seen2 = _credited(m, 1, way2, dq2 * dt, dt)
     both = m[_LIVE] > 0.0 and m[_LIVE + 1] > 0.0
-    if both or m[_ALONE] > 0.0:
+    if (both or m[_ALONE] > 0.0) and m[_RAW] == 0.0:
         arm1, arm2, turn1, turn2, slide, _, _ = held_motion(
             m[_Q], m[_Q + 1], m[_D], m[_D + 1], m[_ANGLE], m[_B], m[_L], m[_E], m[_A]
         )
@@ -153,9 +157,9 @@ def _weigh(m: FloatArray, which: int, moved: float, found: float, variance: floa
     miss = found - (m[place] - moved)
     if miss * miss > _OUTLIER * (own + variance):
         own = miss * miss
-    weight = own / (own + variance)
+    weight = own / (own + variance) if m[_RAW] == 0.0 else 1.0
     m[place] += weight * miss
-    m[_VAR + which] = (1.0 - weight) * own
+    m[_VAR + which] = weight * variance
     m[_SINCE + which] = abs(moved)
     return weight
 
@@ -195,7 +199,9 @@ def _correct(
         # The errors of d and gain in a frame make up for each other: both get the same weight.
         weight = _weigh(m, finger, moved, d, d_variance)
         m[_GAIN + finger] += weight * (gain - m[_GAIN + finger])
+        before = m[_ANGLE]
         _weigh(m, 2, turned, angle, theta_variance + _STEP_VARIANCE * step * step)
+        m[_STRAY] += m[_ANGLE] - before
     m[_TILT + finger] = tilt
 
 
@@ -235,12 +241,28 @@ def _tell(m: FloatArray, table1: FloatArray, table2: FloatArray, out: FloatArray
     out[19] = motion[2]
     out[20] = motion[3]
     out[21] = motion[4]
-    lever1, lever2, shear = holding_levers(table1, table2, m[_D], m[_D + 1], theta1, theta2, motion)
+    d1 = m[_D]
+    d2 = m[_D + 1]
+    lever1, lever2, shear, normal1, normal2 = holding_levers(
+        table1, table2, d1, d2, theta1, theta2, motion
+    )
+    gain1 = m[_GAIN]
+    gain2 = m[_GAIN + 1]
     out[22] = lever1
     out[23] = lever2
-    out[24] = shear
+    out[24] = 2.0 * abs(shear) / (normal1 + normal2) if normal1 + normal2 > 0.0 else 0.0
     out[25] = m[_Q]
     out[26] = m[_Q + 1]
+    out[27] = gain1 * normal1
+    out[28] = gain2 * normal2
+    if gain1 > 0.0 and gain2 > 0.0:
+        torque1 = m[_TORQUE] / gain1
+        torque2 = m[_TORQUE + 1] / gain2
+        load, lever = load_by_torques(
+            table1, table2, d1, d2, theta1, theta2, motion, shear, torque1, torque2
+        )
+        out[29] = 0.5 * (gain1 + gain2) * load
+        out[30] = lever
 
 
 def _pair() -> list[float]:
@@ -258,6 +280,10 @@ class Held:
     lever: list[float] = field(default_factory=_pair)  # torque over force by the energy [m]
     stiffness: list[float] = field(default_factory=_pair)  # ∂F/∂d [N/m]
     shear: float = 0.0  # shear over normal force, by the balance of the object without a load
+    normal: list[float] = field(default_factory=_pair)  # normal forces [N]
+    load: float = 0.0  # what each tip bears along its face, by the joints' torques [N]
+    load_lever: float = 0.0  # and the lever of that load about the pivots [m]
+    stray: float = 0.0  # turning of the object that no joint explains, summed up [rad]
     angle_std: float = 0.0  # of the object's angle [rad]
 
 
@@ -278,6 +304,7 @@ class Prediction:
             2.0 * math.pi / (COUNTS_PER_TURN * settings.servos.gear_ratio),
             float(len(settings.scene.fingers) == 1),
         )
+        self._torque_constant = settings.control.torque_constant
         self._m[_SLOW] = 0.5 * VELOCITY_UNIT / settings.servos.gear_ratio
         self._m[_T] = -math.inf
         self._history = np.full((round(_HISTORY * settings.loop.rate) + 2, _H_SIZE), -math.inf)
@@ -285,9 +312,15 @@ class Prediction:
         self._live = [False, False]
         self.held = Held()
 
+    def switch_off(self) -> None:
+        """Pass frames on as they are, late and rare: to show what prediction is worth."""
+        self._m[_RAW] = 1.0
+
     def advance(self, reading: Reading) -> None:
         """Carry the estimates on to the instant of a good reading."""
-        q, dq = reading.q, reading.dq
+        q, dq, current = reading.q, reading.dq, reading.current
+        self._m[_TORQUE] = self._torque_constant * current[0]
+        self._m[_TORQUE + 1] = self._torque_constant * current[1]
         _advance(self._m, self._history, reading.t, q[0], q[1], dq[0], dq[1])
 
     def correct(self, finger: int, frame: Contact, contact: Contact) -> None:
@@ -344,6 +377,10 @@ class Prediction:
         held.q = out[25:27]
         held.stiffness = [out[4], out[11]]
         held.shear = out[24]
+        held.normal = out[27:29]
+        held.load = out[29]
+        held.load_lever = out[30]
+        held.stray = float(self._m[_STRAY])
         held.angle_std = angle_std
 
 

@@ -197,12 +197,12 @@ class Control(Section):
     contact_force: Positive = 0.5  # N at which a finger counts as touching
     force_default: Positive = 5.0  # N, grasp without force=
     law: Literal["energy", "two_phase", "position"] = "energy"  # "position" is for comparison
-    force_time: Seconds = 0.2  # s in which the force goes from what is felt to what is wanted
+    force_time: Seconds = 0.1  # s in which the force goes from what is felt to what is wanted
     smooth_time: Seconds = 0.1  # s over which references are averaged: bounds their jerk
     force_gain: NonNegative = 1.0  # N a N of force error
     force_bandwidth: NonNegative = 1.0  # Hz of the force integral
-    rotate_speed: Positive = 0.65  # rad/s of the object's angle
-    rotate_bandwidth: NonNegative = 1.5  # Hz of the angle integral
+    rotate_speed: Positive = 1.3  # rad/s of the object's angle
+    rotate_bandwidth: NonNegative = 4.0  # Hz of the angle integral
     joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
     joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
     damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness

@@ -91,8 +91,8 @@ def holding_levers(
     theta1: float,
     theta2: float,
     motion: tuple[float, float, float, float, float, float, float],
-) -> tuple[float, float, float]:
-    """(τ1/F, τ2/F, |T|/N): what holds the object in balance, by the energy of both tips' tables.
+) -> tuple[float, float, float, float, float]:
+    """(τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
 
     The torques are the energy's gradient along the rolling increments, ``motion`` as
     :func:`held_motion` gives it,
@@ -101,24 +101,31 @@ def holding_levers(
 
     and the object's balance gives one shear force for both tips: T W = N (s1 − s2) + ∂U1/∂θ1 +
     ∂U2/∂θ2. F is the mean of both tips' forces, so that the levers τ/F [m] don't depend on a
-    modulus that both tips share. ``data1`` and ``data2`` are the tables' data. All zero without two
+    modulus that both tips share; N is that of the normal forces N1 and N2 [N], which differ where
+    the object rubs on something. ``data1`` and ``data2`` are the tables' data. All zero without two
     contacts.
     """
     if not (d1 > 0.0 and d2 > 0.0):
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, width, apart = motion
     contact1 = lookup(data1, d1, theta1)
     contact2 = lookup(data2, d2, theta2)
-    tangential = normal = turning1 = turning2 = 0.0
+    tangential = normal = normal1 = normal2 = turning1 = turning2 = 0.0
+    tangent1 = math.tan(theta1)
+    tangent2 = math.tan(theta2)
     for _ in range(_SHEAR_STEPS):
         by_d1, turning1 = sheared_gradient(contact1, d1, theta1, tangential)
         by_d2, turning2 = sheared_gradient(contact2, d2, theta2, tangential)
-        normal = 0.5 * (by_d1 + by_d2 - tangential * (math.tan(theta1) + math.tan(theta2)))
+        normal1 = by_d1 - tangential * tangent1
+        normal2 = by_d2 - tangential * tangent2
+        normal = 0.5 * (normal1 + normal2)
         tangential = (normal * apart + turning1 + turning2) / width
     force = 0.5 * (contact1[0] + contact2[0])
     moment = tangential * width
     return (
         (normal * arm1 + turning1 + moment * turn1) / force,
         (normal * arm2 - turning2 - moment * turn2) / force,
-        abs(tangential) / normal,
+        tangential,
+        normal1,
+        normal2,
     )

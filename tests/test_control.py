@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "tactile": {"rate": 25.0},
     "simulation": {"tactile_delay": 0.040},
 }
+SLOW: dict[str, dict[str, Any]] = {key: PAPER[key] for key in ("tactile", "simulation")}
 ANGLE = math.radians(10.0)
 
 
@@ -63,18 +65,28 @@ def test_grasps_and_turns_with_mass_and_modulus_30_percent_off(
         seen = grasped(hand)
         mean = seen.force.mean(axis=1)
         assert seen.force.max() < 11.0
-        assert seen.settled(np.abs(mean - 10.0) > 0.2) < 0.6
+        assert seen.settled(np.abs(mean - 10.0) > 0.2) < 0.4
         assert mean[-250:].mean() == pytest.approx(10.0, rel=0.01)
-        assert settled(hand, ANGLE) < 1.0
-        assert settled(hand, -ANGLE) < 1.5
+        assert settled(hand, ANGLE) < 0.6
+        assert settled(hand, -ANGLE) < 0.8
 
 
-def test_frames_at_100_hz_settle_in_half_the_time_that_25_hz_may_take() -> None:
+def test_frames_at_100_hz_settle_in_half_the_time_of_25_hz_without_prediction() -> None:
+    with watched(SLOW) as hand:
+        hand.prediction.switch_off()
+        plain = grasped(hand)
+        assert plain.force.max() > 11.0, "without prediction these gains overshoot at 25 Hz"
+    # Gains with which it doesn't, much.
+    control = {"force_time": 0.2, "force_gain": 0.3, "force_bandwidth": 0.5}
+    with watched(SLOW | {"control": control}) as hand:
+        hand.prediction.switch_off()
+        seen = grasped(hand)
+        without = seen.settled(np.abs(seen.force.mean(axis=1) - 10.0) > 0.2)
     with watched({}) as hand:
         seen = grasped(hand)
-        assert seen.settled(np.abs(seen.force.mean(axis=1) - 10.0) > 0.2) < 0.5
-        assert settled(hand, ANGLE) < 0.75
-        assert settled(hand, -ANGLE) < 0.75
+        assert seen.settled(np.abs(seen.force.mean(axis=1) - 10.0) > 0.2) < 0.5 * without
+        assert settled(hand, ANGLE) < 0.4
+        assert settled(hand, -ANGLE) < 0.6
 
 
 def test_position_control_alone_misses_what_the_laws_reach() -> None:
@@ -84,9 +96,12 @@ def test_position_control_alone_misses_what_the_laws_reach() -> None:
         assert abs(seen.force[-200:].mean() / 10.0 - 1.0) > 0.1
 
 
-def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip() -> None:
+@pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
+def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(
+    sections: dict[str, dict[str, Any]],
+) -> None:
     rng = np.random.default_rng(3)
-    with watched(PAPER) as hand:
+    with watched(sections) as hand:
         grasped(hand)
         start = hand.plant.object_pose.copy()
         for _ in range(20):
@@ -102,22 +117,103 @@ def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip() -> None:
         assert math.hypot(moved[0], moved[1]) < 3e-4
 
 
-def test_an_object_that_is_taken_away_ends_the_grip() -> None:
-    with daemon({}) as built:
+@pytest.mark.parametrize("last", ["grasp", "rotate", "hold"])
+@pytest.mark.parametrize("law", ["energy", "position"])
+def test_an_object_that_is_taken_away_ends_the_grip(law: str, last: str) -> None:
+    with daemon({"control": {"law": law}}) as built:
         loop, events = built.loop, []
         loop._on_event = lambda *event: events.append(event)
         loop.advance(0.3)
         loop.command({"command": "arm"})
         loop.command({"command": "grasp", "force": 6.0})
-        loop.advance(1.5)
-        assert loop.state.mode == "holding"
+        while loop.state.contacts[0].force < 3.0:
+            loop.advance(0.01)
+        if last != "grasp":
+            loop.advance(2.5)
+            assert loop.state.mode == "holding"
+        if last == "rotate":
+            loop.command({"command": "rotate", "angle": 0.15})
+            loop.advance(0.1)
         assert built.hand is not None
         built.hand.object_pose[:] = 0.0, 0.5, 0.0
         built.hand.refresh()
-        loop.advance(0.5)
+        loop.advance(0.7)
         assert (loop.state.mode, loop.state.fault) == ("armed", "")
         assert any(kind == "lost" for _, kind, _ in events)
         assert max(abs(dq) for dq in loop.state.reading.dq) < 0.1
+
+
+def test_a_turn_asked_for_while_grasping_waits_for_the_grip() -> None:
+    with daemon({}) as built:
+        loop = built.loop
+        loop.advance(0.3)
+        loop.command({"command": "arm"})
+        loop.command({"command": "grasp", "force": 8.0})
+        reply = loop.command({"command": "rotate", "angle": ANGLE})
+        assert reply == {"mode": "grasping", "queued": "rotate", "until": "holding"}
+        loop.advance(2.5)
+        assert loop.state.mode == "holding"
+        assert loop.state.object.angle == pytest.approx(ANGLE, abs=math.radians(0.3))
+
+
+@pytest.mark.parametrize(
+    ("angle", "then", "text"),
+    [
+        (ANGLE, "release", "rotate: dropped, since the grasp ended in releasing"),
+        (1.2, "", "rotate: angle: found 1.2 rad, expected"),
+    ],
+)
+def test_a_turn_that_can_not_come_is_told(angle: float, then: str, text: str) -> None:
+    with daemon({}) as built:
+        loop, events = built.loop, []
+        loop._on_event = lambda *event: events.append(event)
+        loop.advance(0.3)
+        loop.command({"command": "arm"})
+        loop.command({"command": "grasp", "force": 8.0})
+        loop.command({"command": "rotate", "angle": angle})
+        if then:
+            loop.command({"command": then})
+        loop.advance(2.0)
+        assert next(said for _, kind, said in events if kind == "rotate").startswith(text)
+        assert loop.state.mode == ("armed" if then else "holding")
+
+
+def test_any_commands_streamed_right_after_arm_are_safe() -> None:
+    rng = np.random.default_rng(17)
+    with daemon({}) as built:
+        loop, dt = built.loop, built.loop.period
+        loop.advance(0.3)
+        loop.command({"command": "arm"})
+        modes = set()
+        forces = []
+        for _ in range(4000):
+            command: dict[str, Any] = [
+                {
+                    "command": "move",
+                    "left": rng.uniform(-0.4, 0.3),
+                    "right": rng.uniform(-0.4, 0.3),
+                },
+                {"command": "grasp", "force": rng.uniform(2.0, 15.0)},
+                {"command": "rotate", "angle": rng.uniform(-0.2, 0.2)},
+                {"command": "release"},
+            ][rng.choice(4, p=[0.005, 0.0015, 0.993, 0.0005])]
+            with contextlib.suppress(Refused):
+                loop.command(command)
+            loop.advance(dt)
+            assert loop.state.fault == ""
+            modes.add(loop.state.mode)
+            assert built.hand is not None
+            forces.append(built.hand.force.max())
+        assert {"grasping", "rotating", "releasing"} <= modes
+        assert 5.0 < max(forces) < 16.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_tip_by_itself_keeps_a_light_grip(seed: int) -> None:
+    off = (0.7, 1.3)
+    with watched(PAPER, seed=seed, object_mass=0.1 * off[seed % 2]) as hand:
+        seen = grasped(hand, force=5.0, seconds=3.5)
+        assert np.abs(seen.force[500:] / 5.0 - 1.0).max() < 0.02
 
 
 def test_targets_streamed_right_after_arm_move_the_hand_smoothly() -> None:

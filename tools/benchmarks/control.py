@@ -192,6 +192,21 @@ def _speed() -> Row:
     return row("the plant alone, times real time (200 are asked for)", "", samples)
 
 
+def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> float:
+    """Push the object along its faces from ``start`` to ``force`` [N], ``rate`` [N/s].
+
+    Positive is away from the palm; the push stays. Returns the largest share of friction used.
+    """
+    dt, used = 0.02, 0.0
+    count = max(round(abs(force - start) / (rate * dt)), 1)
+    for k in range(1, count + 1):
+        now = start + (force - start) * k / count
+        angle = float(hand.plant.object_pose[2])
+        hand.plant.push(-now * math.sin(angle), now * math.cos(angle))
+        used = max(used, float(hand.watch(dt).slip.max()))
+    return used
+
+
 @dataclass(frozen=True)
 class Seen:
     """The truth, tick by tick."""
@@ -218,7 +233,9 @@ class Watched:
         settings = Settings.model_validate(sections | {"loop": {"clock": "virtual"}})
         self._daemon = Daemon(settings, wire=False)
         assert self._daemon.hand is not None
+        assert self._daemon.prediction is not None
         self.plant = self._daemon.hand
+        self.prediction = self._daemon.prediction
         self._friction = settings.simulation.tip_friction
 
     def __enter__(self) -> Watched:

@@ -1,0 +1,92 @@
+"""The load on a held object along its faces, from the joints' torques and the tips' pressure.
+
+A pressure grid feels no shear. The joints do: what the normal forces and the tips' turning moments
+don't explain of their torques is shear, times its lever about the pivot. Pure kernels on the
+coordinates and signs of :mod:`kinematics.held`; the joints are at rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from kinematics.held import sheared_gradient
+from kinematics.kernels import kernel
+from kinematics.table import lookup
+
+_STEPS = 4  # of Newton's method; the equation is a parabola, all but a line
+_LEAST_SLOPE = 0.2  # of what it is where no tip is tilted
+
+
+@kernel
+def _unexplained(
+    data: NDArray[float64],
+    d: float,
+    theta: float,
+    side: float,
+    shear: float,
+    torque: float,
+    arm: float,
+    lever: float,
+) -> tuple[float, float]:
+    """side (τ − N arm) − ∂U/∂θ − T lever of one tip [N·m], and how fast it falls with T [m]."""
+    contact = lookup(data, d, theta)
+    force, _, force_d, force_theta, _, _, _ = contact
+    by_d, by_theta = sheared_gradient(contact, d, theta, shear)
+    sine = math.sin(theta)
+    cosine = math.cos(theta)
+    tangent = sine / cosine
+    bend = 0.5 * (shear / force - sine) / cosine
+    bend_t = 0.5 / (force * cosine)
+    stretch_t = d * bend_t * (sine + 2.0 * cosine * bend)
+    normal_t = force_d * stretch_t - 2.0 * force * cosine * bend * bend_t - tangent
+    theta_t = force_theta * stretch_t + force * d * bend_t * (cosine - 2.0 * sine * bend)
+    left = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * lever
+    return left, side * arm * normal_t + theta_t + lever
+
+
+@kernel
+def load_by_torques(
+    data1: NDArray[float64],
+    data2: NDArray[float64],
+    d1: float,
+    d2: float,
+    theta1: float,
+    theta2: float,
+    motion: tuple[float, float, float, float, float, float, float],
+    rolled: float,
+    torque1: float,
+    torque2: float,
+) -> tuple[float, float]:
+    """(L, lever): the share L [N] that each tip bears of a load 2 L along the object's t.
+
+    Solves for L, in the least squares of both joints' torques, that
+
+        τ1 = N1 arm1 + ∂U1/∂θ1 + T1 W turn1      T1 = T + L
+        τ2 = N2 arm2 − ∂U2/∂θ2 − T2 W turn2      T2 = T − L
+
+    with T = ``rolled`` [N], the shear that rolling and the turning moments cause without a load
+    (:func:`kinematics.held.holding_levers`), and N and ∂U/∂θ as the shears bend them. ``motion`` is
+    what :func:`kinematics.held.held_motion` gives. An error of both torques by e makes one of
+    e/lever in L [m]. Zeros without two contacts.
+    """
+    if not (d1 > 0.0 and d2 > 0.0):
+        return 0.0, 0.0
+    arm1, arm2, turn1, turn2, _, width, _ = motion
+    lever1 = width * turn1
+    lever2 = width * turn2
+    least = _LEAST_SLOPE * (lever1 * lever1 + lever2 * lever2)
+    if least <= 0.0:
+        return 0.0, 0.0
+    # A tip can't bear more shear than it is pressed with.
+    most = 0.5 * (lookup(data1, d1, theta1)[0] + lookup(data2, d2, theta2)[0])
+    load = slope = 0.0
+    for _ in range(_STEPS):
+        left1, slope1 = _unexplained(data1, d1, theta1, 1.0, rolled + load, torque1, arm1, lever1)
+        left2, slope2 = _unexplained(data2, d2, theta2, -1.0, rolled - load, torque2, arm2, lever2)
+        over = lever1 * left1 - lever2 * left2
+        slope = max(lever1 * slope1 + lever2 * slope2, least)
+        load = min(max(load + over / slope, -most), most)
+    return load, slope / max(abs(lever1) + abs(lever2), 1e-3 * width)
