@@ -70,6 +70,7 @@ class Daemon:
     def _assemble(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
+        self.publisher = publisher
         self.models = make_models(settings, cache, on_event)
         self.hand = self._make_hand(cache, on_event)
         self.servos = make_servos(settings, self.clock, self.hand)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from daemon.messages import Parts, Rates
 from daemon.perception import FingerPerception
-from daemon.records import State
+from daemon.records import Frame, State
 from daemon.schedule import Schedule
 from daemon.settings import Settings
 from daemon.statistics import Statistics
@@ -55,12 +55,17 @@ class Broadcast:
         if schedule.look.due(seq):
             publisher.refresh()
         publisher.repeat()
-        if publisher.wants_state and schedule.state.due(seq):
-            self._states += 1
-            publisher.state(state, self._scene, schedule.state.every)
         if publisher.wants_tactile:
             for perception in self._perceptions:
                 self._frame(state, perception)
+        if publisher.wants_input:  # behind the frames, which it refers to
+            frames: list[Frame | None] = [None, None]
+            for perception in self._perceptions:
+                frames[perception.finger] = perception.frame
+            publisher.input(state, (frames[0], frames[1]))
+        if publisher.wants_state and schedule.state.due(seq):
+            self._states += 1
+            publisher.state(state, self._scene, schedule.state.every)
         if schedule.stats.due(seq):
             rates = self._rates(state)
             if publisher.wants_stats:

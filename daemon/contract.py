@@ -108,6 +108,37 @@ _TOLD = (
     Field("mono_ns", "int", "ns", "the daemon's monotonic clock"),
 )
 
+_TAKEN = (
+    Field("q", "float", "rad", "joint angle"),
+    Field("dq", "float", "rad/s", "joint velocity"),
+    Field("current", "float", "A", "motor current"),
+    Field("hardware", "int", "", "the servo's hardware error bits, 0 if not known"),
+    Field("temperature", "float", "°C", "of the servo, 0 while not known"),
+    Field("voltage", "float", "V", "of its supply, 0 while not known"),
+    Field("frame_seq", "int", "", "newest tactile frame, 0 before the first"),
+    Field("frame_t", "float", "s", "when it was scanned, by the daemon's clock"),
+    Field("frame_arrival", "float", "s", "when it was complete here"),
+    Field("frame_valid", "bool", "", "false: the board is gone"),
+)
+
+_INPUT = (
+    *_ALL,
+    Field("mono_ns", "int", "ns", "the daemon's monotonic clock at the tick"),
+    Field("t", "float", "s", "the same, with all its digits"),
+    Field("late_in_row", "int", "", "overruns in a row, up to this tick"),
+    Field("reading.seq", "int", "", "readings of the servos"),
+    Field("reading.t", "float", "s", "when the last good one was taken; no number before it"),
+    Field("reading.valid", "bool", "", "this tick's is good"),
+    Field("reading.alert", "int", "", "bit i: servo of finger i reports a hardware error"),
+    Field("reading.error", "str", "", "what the bus failed with, or empty"),
+    *(
+        part._replace(name=f"{finger}.{part.name}", meaning=f"{finger} finger: {part.meaning}")
+        for finger in FINGERS
+        for part in _TAKEN
+    ),
+    Field("write_error", "str", "", "what the bus failed with when written to, or empty"),
+)
+
 _SETTINGS = (
     *_TOLD,
     Field("version", "str", "", "of softfinger"),
@@ -179,6 +210,7 @@ TOPICS: dict[bytes, tuple[Field, ...]] = {
     messages.STATS: _STATS,
     messages.SETTINGS: _SETTINGS,
     messages.COMMAND: _COMMAND,
+    messages.INPUT: _INPUT,
 }
 
 _SUMMARY = {
@@ -187,6 +219,7 @@ _SUMMARY = {
     messages.EVENT: "What happened: modes, faults, warnings; the last 50 again for whoever comes.",
     messages.STATS: "Once a second, how the loop keeps its time.",
     messages.SETTINGS: "Once, and again for whoever subscribes later: what this hand is.",
+    messages.INPUT: "All that a tick took in, every tick: what `replay --recompute` starts from.",
     messages.COMMAND: "Each command that was answered, by whomever; `status` is left out.",
 }
 

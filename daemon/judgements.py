@@ -44,7 +44,6 @@ class View:
         self.frames = frames  # what each finger's newest frame alone says
         self.sensors = sensors
         self.frame_period = 1.0 / settings.tactile.rate
-        self.overruns_in_row = 0
         self.no_number = False  # the last goal was none
         self.grip_width = math.nan  # of the object when it was gripped [m]
         self.seen: list[Frame | None] = [None, None]
@@ -330,8 +329,8 @@ def saturated(view: View, state: State, share: float) -> str:
     return ""
 
 
-def overrunning(view: View, _: State, __: float) -> str:
-    late = view.overruns_in_row
+def overrunning(view: View, state: State, _: float) -> str:
+    late = state.timing.late_in_row
     return f"loop: {late} overruns in a row" if late >= view.limits.overruns_fault else ""
 
 

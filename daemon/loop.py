@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from daemon.broadcast import Broadcast
 from daemon.clock import Clock
-from daemon.commands import CommandServer, Refused
+from daemon.commands import Handler, Refused
 from daemon.control import Control
 from daemon.modes import Command, Lease, Mode, parse
 from daemon.perception import FingerPerception
@@ -33,6 +33,16 @@ _DEAF = 0.1  # s in which what waited meanwhile has come through the socket's ow
 _LATE = 0.05  # s after its deadline from which a late tick is told
 
 
+class Commands(Protocol):
+    """Where commands come from: `daemon.commands.CommandServer`, or a recording."""
+
+    def serve(self, handler: Handler) -> bool:
+        """Carry out through ``handler`` what is due at this tick; False when nothing was."""
+
+    def drain(self, handler: Handler) -> None:
+        """Answer all that has waited since before the first tick."""
+
+
 class Loop:
     """Runs the pipeline on a clock. All of it happens in the thread that calls `run`."""
 
@@ -44,7 +54,7 @@ class Loop:
         perceptions: list[FingerPerception],
         prediction: Prediction | None,
         publisher: Publisher | None,
-        server: CommandServer | None,
+        server: Commands | None,
         on_event: EventSink | None = None,
     ) -> None:
         self.state = State()
@@ -131,10 +141,10 @@ class Loop:
             deadline += self.period
             if done > deadline:
                 timing.overruns += 1
-                self._safety.overruns_in_row += 1
+                timing.late_in_row += 1
                 deadline = done
             else:
-                self._safety.overruns_in_row = 0
+                timing.late_in_row = 0
         clock.sleep_until(deadline)
 
     def _refuse_old(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -174,13 +184,15 @@ class Loop:
         return done
 
     def _read(self) -> None:
-        reading = self.state.reading
+        state, reading = self.state, self.state.reading
         if self.servos is None:
             return
+        state.read_error = state.write_error = ""
         try:
             self.servos.read(reading)
         except ServoError as error:
             reading.valid = False
+            state.read_error = str(error)
             self._fail(str(error))
         if reading.valid and self._prediction is not None:
             self._prediction.advance(reading)
@@ -252,6 +264,7 @@ class Loop:
             try:
                 self._safety.write(servos, state)
             except ServoError as error:
+                state.write_error = str(error)
                 self._fail(str(error))
                 self._torque_off(servos)
 
@@ -260,6 +273,7 @@ class Loop:
         try:
             servos.set_torque(True)
         except ServoError as error:
+            self.state.write_error = str(error)
             self._fail(str(error))
             self._torque_off(servos)
 
@@ -272,6 +286,7 @@ class Loop:
         try:
             servos.set_torque(False)
         except ServoError as error:
+            state.write_error = str(error)
             if self._next_try < 0.0:
                 self.emit("error", "servos", f"torque could not be turned off: {error}")
             self._next_try = state.t + _RETRY

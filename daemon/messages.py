@@ -15,7 +15,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.records import FINGERS, Contact, Frame, State
+from daemon.records import FINGERS, Contact, Frame, Reading, State
 from daemon.settings import Settings
 
 if TYPE_CHECKING:  # it brings compiled kernels, which clients have no use for
@@ -28,6 +28,7 @@ EVENT = b"hand/event"
 STATS = b"hand/stats"
 SETTINGS = b"hand/settings"
 COMMAND = b"hand/command"
+INPUT = b"hand/input"
 
 pack = msgpack.Packer(use_bin_type=True).pack
 
@@ -154,6 +155,45 @@ def _finger(
         "contact": contact.contact,
         "frame_seq": contact.seq,
         "frame_age_s": state.t - contact.t if contact.seq else 0.0,
+    }
+
+
+def input_message(state: State, frames: tuple[Frame | None, Frame | None]) -> dict[str, Any]:
+    """The ``hand/input`` map: all that the tick took in from outside, numbers as they were."""
+    reading = state.reading
+    left, right = (_taken(reading, finger, frame) for finger, frame in enumerate(frames))
+    return {
+        "schema": SCHEMA,
+        "seq": state.seq,
+        "timestamp": state.wall,
+        "mono_ns": int(state.t * 1e9),
+        "t": state.t,
+        "late_in_row": state.timing.late_in_row,
+        "reading": {
+            "seq": reading.seq,
+            "t": reading.t,
+            "valid": reading.valid,
+            "alert": reading.alert,
+            "error": state.read_error,
+        },
+        "left": left,
+        "right": right,
+        "write_error": state.write_error,
+    }
+
+
+def _taken(reading: Reading, finger: int, frame: Frame | None) -> dict[str, Any]:
+    return {
+        "q": reading.q[finger],
+        "dq": reading.dq[finger],
+        "current": reading.current[finger],
+        "hardware": reading.hardware[finger],
+        "temperature": reading.temperature[finger],
+        "voltage": reading.voltage[finger],
+        "frame_seq": 0 if frame is None else frame.seq,
+        "frame_t": 0.0 if frame is None else frame.t_sample,
+        "frame_arrival": 0.0 if frame is None else frame.t_arrival,
+        "frame_valid": False if frame is None else frame.valid,
     }
 
 

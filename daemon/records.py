@@ -96,6 +96,7 @@ class Timing:
     compute_s: float = 0.0  # work of the last tick
     wake_late_s: float = 0.0  # this tick's start after its deadline
     overruns: int = 0  # ticks whose work outlasted the period
+    late_in_row: int = 0  # the last of them, without one in time between
 
 
 def _contacts() -> list[Contact]:
@@ -113,6 +114,8 @@ class State:
     fault: str = ""
     fault_name: str = ""  # the row of `daemon.limits` it stands in
     torque: bool = False
+    read_error: str = ""  # what the servos' bus failed with at this tick, reading and writing
+    write_error: str = ""
     reading: Reading = field(default_factory=Reading)
     contacts: list[Contact] = field(default_factory=_contacts)
     object: ObjectPose = field(default_factory=ObjectPose)

@@ -119,15 +119,6 @@ class Safety:
         self._sent_current = [0.0, 0.0]
         self._sent_seq = -2
 
-    @property
-    def overruns_in_row(self) -> int:
-        """Late ticks in a row, as the loop counts them."""
-        return self._view.overruns_in_row
-
-    @overruns_in_row.setter
-    def overruns_in_row(self, count: int) -> None:
-        self._view.overruns_in_row = count
-
     # Judging
 
     def judge(self, state: State) -> Finding | None:
@@ -198,8 +189,8 @@ class Safety:
                         and contact.inside
                     ):
                         return False
-        view = self._view
-        return view.overruns_in_row < self._limits.overruns_fault and not view.no_number
+        late = state.timing.late_in_row
+        return late < self._limits.overruns_fault and not self._view.no_number
 
     def cause(self, state: State, gripping: bool = False) -> str:
         """The first fault that stands in this state, or an empty text: what refuses a command.

@@ -166,9 +166,9 @@ class Stream(Section):
 
     address: str = "tcp://127.0.0.1:9872"
     state_rate: Rate = 100.0
-    tactile_rate: Rate = 25.0
+    tactile_rate: Rate = 100.0
     tactile_unit: Literal["count", "Pa"] = "count"  # raw, or what the estimator makes of it
-    queue: Annotated[int, Field(ge=1, le=100_000)] = 200  # messages kept for a slow subscriber
+    queue: Annotated[int, Field(ge=1, le=100_000)] = 2000  # messages kept for a slow subscriber
 
 
 class CommandSettings(Section):

@@ -35,6 +35,7 @@ class Publisher:
         self.wants_state = False
         self.wants_tactile = False
         self.wants_stats = False
+        self.wants_input = False
         self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
         self._told = {messages.EVENT: 0, messages.COMMAND: 0, messages.SETTINGS: 0}
         self._kept: deque[tuple[bytes, dict[str, Any]]] = deque(maxlen=_KEPT)
@@ -57,6 +58,7 @@ class Publisher:
         self.wants_state = self._wanted(messages.STATE)
         self.wants_tactile = self._wanted(messages.TACTILE)
         self.wants_stats = self._wanted(messages.STATS)
+        self.wants_input = self._wanted(messages.INPUT)
 
     def _wanted(self, topic: bytes) -> bool:
         return any(topic.startswith(prefix) for prefix in self._subscriptions)
@@ -64,6 +66,10 @@ class Publisher:
     def state(self, state: State, scene: messages.Parts, step: int = 1) -> None:
         """Publish ``hand/state``, every ``step`` ticks."""
         self._send(messages.STATE, messages.state_message(state, scene, step))
+
+    def input(self, state: State, frames: tuple[Frame | None, Frame | None]) -> None:
+        """Publish ``hand/input``, every tick."""
+        self._send(messages.INPUT, messages.input_message(state, frames))
 
     def tactile(
         self,

@@ -67,6 +67,10 @@ def sample(topic: bytes) -> dict[str, Any]:
             record(statistics.counts, statistics.largest, *times)
         rates = messages.Rates(500.0, 100.0, 99.5, 50.0, 25.0)
         return messages.stats_message(sample_state(), 0.002, rates, statistics, 500)
+    if topic == messages.INPUT:
+        counts = np.zeros((4, 5), np.uint16)
+        frame = Frame(seq=77, t_sample=12.48, t_arrival=12.49, valid=True, data=counts)
+        return messages.input_message(sample_state(), (frame, None))
     if topic == messages.SETTINGS:
         facts = messages.Facts("0.1.0", '{"loop":{"rate":500.0}}', "", "{}", "{}", "{}")
         return messages.settings_message(1, 1.7e9, 10.0, facts)

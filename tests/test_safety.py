@@ -330,9 +330,9 @@ def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
 
 
 def test_overruns_in_a_row_are_a_cause() -> None:
-    judge = safety()
-    judge.overruns_in_row = SETTINGS.safety.overruns_fault
-    assert judged(judge, sound()) == ("loop.overruns", "loop: 100 overruns in a row")
+    judge, state = safety(), sound()
+    state.timing.late_in_row = SETTINGS.safety.overruns_fault
+    assert judged(judge, state) == ("loop.overruns", "loop: 100 overruns in a row")
 
 
 def frames_of(*thetas: float) -> list[Contact]:
@@ -497,7 +497,7 @@ def test_the_quick_look_never_passes_over_what_a_row_finds(
         limit = math.asin(depth) if 0.0 <= depth <= 1.0 else 1.0
         each.theta = share[11 + i] * limit
         each.t_sound = 5.0 - share[13 + i] * limits.frame_age_fault / SETTINGS.tactile.rate
-    judge.overruns_in_row = 100 if share[15] > 1.2 else 0
+    state.timing.late_in_row = 100 if share[15] > 1.2 else 0
     if judge._quiet(state):
         for watch in judge._each_tick:
             assert watch.check(judge._view, state, watch.row.share) == "", watch.row.name

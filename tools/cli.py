@@ -18,6 +18,7 @@ SUBCOMMANDS = {
     "send": "send one command to the running daemon",
     "monitor": "live terminal page of the running daemon",
     "record": "record the running daemon's stream into an MCAP file",
+    "replay": "publish a recording again, or compare it with what today's code makes of it",
     "doctor": "check ports, servos, boards and this machine, and tell what mends them",
     "scan": "find the servos on a port, at any rate",
     "calibrate": "calibrate the pressure sensor under a tip, step by step",

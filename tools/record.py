@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import select
 import signal
 import sys
 import time
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-wait", action="store_true", help="end with an error when nothing comes within 2 s"
     )
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # a pipe of the daemon's
     parser.add_argument(
         "--recover", action="store_true", help="close a FILE that was cut short, and record nothing"
     )
@@ -121,6 +123,8 @@ class _Recorder:
                         failure = f"nothing from {arguments.address} within {_WAIT:g} s"
                         break
                     self._tell_waiting()
+                if arguments.lifeline is not None and _hung_up(arguments.lifeline):
+                    break
                 if arguments.duration is not None and now - began >= arguments.duration:
                     break
                 if now - shown >= _SHOW:
@@ -233,6 +237,11 @@ class _Recorder:
         if failure:
             print(f"record: {failure}", file=sys.stderr)
         return 1 if failure else 0
+
+
+def _hung_up(lifeline: int) -> bool:
+    """The other end of the pipe is closed: the daemon that started this is gone."""
+    return bool(select.select([lifeline], [], [], 0.0)[0])
 
 
 class _Ending:

@@ -14,6 +14,7 @@ from typing import Any
 from daemon.settings import Settings, SettingsError
 from tools.arguments import add_profile, profile, seconds
 from tools.event_log import EventLog
+from tools.recorder_beside import NoRecorder
 
 _STARTED = time.monotonic()
 
@@ -24,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--monitor", action="store_true", help="show the live page here; q ends both"
+    )
+    parser.add_argument(
+        "--record",
+        type=Path,
+        metavar="FILE.mcap",
+        help="record everything from the first tick on (extra 'record')",
     )
 
 
@@ -75,9 +82,19 @@ def _serve(
             loop.emit(*event)
         loop.emit("info", "schedule", str(Schedule(settings)))
         log.line("info", "start", _ready(settings, daemon))
+        recording: Any = nullcontext()
+        if arguments.record is not None:
+            try:
+                recording = _record(arguments.record, settings, daemon)
+            except NoRecorder as error:
+                log.plain(f"softfinger: {error}")
+                return 1
         log.quiet = arguments.monitor  # from here on the page owns the terminal
         with _page(settings, loop) if arguments.monitor else nullcontext():
             loop.run(arguments.duration)
+    if arguments.record is not None:
+        for line in recording.close().splitlines():
+            log.plain(line)
     _tell_times(daemon.loop, log)
     state = daemon.loop.state
     if state.fault:
@@ -94,6 +111,17 @@ def _tell_times(loop: Any, log: EventLog) -> None:
     log.plain(f"{statistics.ticks} ticks, {loop.state.timing.overruns} overruns")
     for line in statistics.table():
         log.plain(line)
+
+
+def _record(path: Path, settings: Settings, daemon: Any) -> Any:
+    """A recorder that has subscribed to everything. Raises NoRecorder."""
+    from tools.recorder_beside import RecorderBeside
+
+    def subscribed() -> bool:
+        daemon.publisher.refresh()
+        return bool(daemon.publisher.wants_input)
+
+    return RecorderBeside(path, settings.stream.address, subscribed)
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:

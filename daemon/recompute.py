@@ -1,0 +1,200 @@
+"""The loop run again on what it took in: recorded readings, frames and commands, tick by tick.
+
+Servos, sensors, clock and commands here say what the recording says; estimator, tables, prediction,
+control and limits are today's. Whoever gives it all inputs from the first tick on, with the same
+code and settings, gets the same states to the last bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from daemon.commands import Refused
+from daemon.loop import Loop
+from daemon.model import make_models
+from daemon.perception import FingerPerception
+from daemon.prediction import Prediction
+from daemon.records import FINGERS, Frame, Goal, Reading, State
+from daemon.servos.base import ServoError
+from daemon.settings import Settings, TactileSettings, Task
+
+
+class Recomputation:
+    """A loop that is fed. ``calibrations`` are the recorded ones as JSON, empty where none was."""
+
+    def __init__(
+        self, settings: Settings, calibrations: Sequence[str], cache: Path | None = None
+    ) -> None:
+        """Raises SettingsError or TactileError when settings and calibrations don't fit."""
+        with tempfile.TemporaryDirectory() as folder:
+            settings = _without_world(settings, calibrations, Path(folder))
+            models = make_models(settings, cache)
+        self._clock = _Clock()
+        self._commands = _Commands()
+        self._servos = _Servos() if settings.servos.backend != "none" else None
+        self._sensors: dict[int, _Sensor] = {}
+        perceptions = []
+        if settings.tactile.backend != "none":
+            for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+                sensor = self._sensors[finger] = _Sensor()
+                perceptions.append(FingerPerception(sensor, models[finger], settings))
+        prediction = None
+        if perceptions and self._servos is not None:
+            prediction = Prediction(settings, (models[0].table, models[1].table))
+        self._loop = Loop(
+            settings,
+            self._clock,
+            self._servos,
+            perceptions,
+            prediction,
+            None,
+            self._commands,
+        )
+
+    @property
+    def fingers(self) -> tuple[int, ...]:
+        """The fingers whose frames are wanted."""
+        return tuple(self._sensors)
+
+    def tick(
+        self,
+        taken: Mapping[str, Any],
+        frames: Mapping[int, Frame],
+        commands: Sequence[dict[str, Any]],
+    ) -> State:
+        """The state after one tick: its ``hand/input``, new frames by finger, its commands.
+
+        The state is the loop's own, and changes with the next call.
+        """
+        loop = self._loop
+        self._clock.t, self._clock.unix = taken["t"], taken["timestamp"]
+        for finger, frame in frames.items():
+            self._sensors[finger].frame = frame
+        if self._servos is not None:
+            self._servos.taken = taken
+        self._commands.waiting = list(commands)
+        loop.state.seq = taken["seq"] - 1
+        loop.state.timing.late_in_row = taken["late_in_row"]
+        loop.tick(taken["t"])
+        return loop.state
+
+
+def _without_world(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
+    """Settings without a task, whose commands are recorded, and with calibrations from files."""
+    files = ["", ""]
+    for finger, text in enumerate(calibrations):
+        if text:
+            path = folder / f"{FINGERS[finger]}.json"
+            path.write_text(text, encoding="utf-8")
+            files[finger] = str(path)
+    tactile: TactileSettings = settings.tactile.model_copy(
+        update={"calibration": (files[0], files[1])}
+    )
+    return settings.model_copy(update={"tactile": tactile, "task": Task()})
+
+
+class _Clock:
+    """The recorded time."""
+
+    def __init__(self) -> None:
+        self.t = 0.0
+        self.unix = 0.0
+
+    def now(self) -> float:
+        return self.t
+
+    def wall(self) -> float:
+        return self.unix
+
+    def sleep_until(self, t: float) -> None:
+        self.t = t
+
+
+class _Servos:
+    """The recorded readings; what is written goes nowhere, and fails where it failed."""
+
+    def __init__(self) -> None:
+        self.taken: Mapping[str, Any] = {}
+
+    def connect(self) -> None:
+        pass
+
+    def read(self, reading: Reading) -> None:
+        taken = self.taken
+        said = taken["reading"]
+        reading.seq = said["seq"]
+        reading.t = said["t"] if said["t"] is not None else -math.inf
+        reading.valid = said["valid"]
+        reading.alert = said["alert"]
+        for finger, name in enumerate(FINGERS):
+            part = taken[name]
+            reading.q[finger] = part["q"]
+            reading.dq[finger] = part["dq"]
+            reading.current[finger] = part["current"]
+            reading.hardware[finger] = part["hardware"]
+            reading.temperature[finger] = part["temperature"]
+            reading.voltage[finger] = part["voltage"]
+        if said["error"]:
+            raise ServoError(said["error"])
+
+    def set_torque(self, on: bool) -> None:
+        self._fail_as_recorded()
+
+    def write(self, goal: Goal) -> None:
+        self._fail_as_recorded()
+
+    def _fail_as_recorded(self) -> None:
+        if self.taken["write_error"]:
+            raise ServoError(self.taken["write_error"])
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+@dataclasses.dataclass(slots=True)
+class _Sensor:
+    """The newest recorded frame."""
+
+    frame: Frame | None = None
+
+    def open(self) -> None:
+        pass
+
+    def latest(self) -> Frame | None:
+        return self.frame
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+class _Commands:
+    """The commands of a tick, in the place of the command server."""
+
+    def __init__(self) -> None:
+        self.waiting: list[dict[str, Any]] = []
+
+    def serve(self, handler: Any) -> bool:
+        for request in self.waiting:
+            try:
+                handler(request)
+            except Refused:
+                pass  # it was carried out when it was recorded: the states will differ and be told
+        self.waiting = []
+        return True
+
+    def drain(self, handler: Any) -> None:
+        pass
+
+    def close(self) -> None:
+        pass

@@ -1,0 +1,42 @@
+"""A progress bar on the terminal, and nothing where there is none."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+
+_STEP = 0.1  # s between two pictures
+_WIDTH = 40
+
+
+class Progress:
+    """``with Progress("analyse", total) as progress: progress(done)``; written to stderr."""
+
+    def __init__(self, what: str, total: int) -> None:
+        self._what = what
+        self._total = max(total, 1)
+        self._shown = -1.0
+        self._on = sys.stderr.isatty()
+
+    def __call__(self, done: int) -> None:
+        """So much of the total is behind."""
+        if not self._on or time.monotonic() - self._shown < _STEP:
+            return
+        self._shown = time.monotonic()
+        share = min(done / self._total, 1.0)
+        full = round(share * _WIDTH)
+        bar = "█" * full + "·" * (_WIDTH - full)
+        print(f"\r{self._what} {bar} {share:4.0%}", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._on:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,74 @@
+"""The recorder beside a daemon: ``softfinger run --record FILE`` starts it as a child process.
+
+Holds that child's life only. It is subscribed before the first tick, so that nothing is missed, and
+is told to end when the daemon has said its last word; should the daemon die, it ends as well.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+_PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
+_LOOK = 0.01  # s
+
+
+class NoRecorder(Exception):
+    """The recorder did not come up. The message says what it said."""
+
+
+class RecorderBeside:
+    """A recording of all that ``address`` publishes, from before the first message on."""
+
+    def __init__(self, path: Path, address: str, subscribed: Callable[[], bool]) -> None:
+        """``subscribed`` tells whether somebody takes everything. Raises NoRecorder."""
+        reads, self._lifeline = os.pipe()  # its end is the end of this process
+        # -P: a folder named tools where the daemon was started is not ours.
+        words = [sys.executable, "-P", "-m", "tools.cli", "record", str(path)]
+        words += ["--address", address, "--lifeline", str(reads)]
+        # A session of its own: Ctrl-C is the daemon's, whose last messages are to be recorded, too.
+        self._process = subprocess.Popen(
+            words,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            pass_fds=(reads,),
+            start_new_session=True,
+        )
+        os.close(reads)
+        deadline = time.monotonic() + _PATIENCE
+        while not subscribed():
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self._process.kill()
+                said = " ".join(part.strip() for part in self._process.communicate())
+                raise NoRecorder(said.strip() or "the recorder did not come up")
+            time.sleep(_LOOK)
+
+    def close(self) -> str:
+        """Have the file closed; what the recorder says of it."""
+        self._process.send_signal(signal.SIGTERM)
+        os.close(self._lifeline)
+        try:
+            out, error = self._process.communicate(timeout=_PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            out, error = self._process.communicate()
+        return (out + error).strip()
+
+    def __enter__(self) -> RecorderBeside:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._process.poll() is None:
+            self.close()

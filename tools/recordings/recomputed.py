@@ -1,0 +1,193 @@
+"""A recording's inputs through today's code, and what differs from what was recorded then."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from daemon import messages
+from daemon.recompute import Recomputation
+from daemon.records import FINGERS, Frame
+from daemon.settings import Settings
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+
+# What depends on the machine and the moment, and not on what the loop took in.
+_MOMENT = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "seq_step"})
+
+
+@dataclass(slots=True)
+class Difference:
+    """How one field of ``hand/state`` differs: how often, where first, where worst."""
+
+    count: int = 0
+    first_tick: int = 0
+    recorded: Any = None  # at the first
+    recomputed: Any = None
+    worst: float = 0.0  # largest difference of numbers
+    worst_tick: int = 0
+
+
+@dataclass(slots=True)
+class Comparison:
+    """What became of a recording: ticks run, states compared, fields that differ."""
+
+    ticks: int = 0
+    states: int = 0
+    fields: int = 0
+    from_start: bool = False  # the first tick was recorded: nothing was remembered from before
+    missing_ticks: int = 0
+    missing_frames: int = 0
+    differences: dict[str, Difference] = field(default_factory=dict)
+
+
+def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
+    """Settings and calibrations (JSON) that the recording holds. Raises RecordingError."""
+    message = next((each for _, each in recording.messages([messages.SETTINGS])), None)
+    if message is None:
+        raise RecordingError(f"{recording.path}: no hand/settings in it")
+    try:
+        settings = Settings.model_validate_json(message["settings"], strict=False)
+    except ValueError as error:
+        raise RecordingError(
+            f"{recording.path}: its settings are not of this version: {error}"
+        ) from None
+    return settings, [message["calibration_left"], message["calibration_right"]]
+
+
+def recompute(
+    recording: Recording,
+    settings: Settings | None = None,
+    cache: Path | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Comparison:
+    """Run the recorded inputs through the loop and compare state for state.
+
+    ``settings`` stand for the recorded ones where they are given. Raises RecordingError when the
+    recording lacks what is needed.
+    """
+    own, calibrations = recorded_settings(recording)
+    if not recording.count(messages.INPUT):
+        raise RecordingError(f"{recording.path}: no hand/input in it; `record` takes it along")
+    used = settings or own
+    machine = Recomputation(used, calibrations, cache)
+    scene = messages.Parts.of(used)
+    result = Comparison()
+    newest = [0, 0]
+    last = 0
+    for tick, frames, commands, state in _ticks(recording, progress, machine.fingers):
+        if result.ticks == 0:
+            result.from_start = tick["seq"] == 1
+        else:
+            result.missing_ticks += tick["seq"] - last - 1
+        last = tick["seq"]
+        taken: dict[int, Frame] = {}
+        for finger in machine.fingers:
+            part = tick[FINGERS[finger]]
+            if part["frame_seq"] == newest[finger]:
+                continue
+            newest[finger] = part["frame_seq"]
+            counts = frames.get((finger, part["frame_seq"]))
+            if counts is None:
+                result.missing_frames += 1
+                continue
+            taken[finger] = Frame(
+                part["frame_seq"],
+                part["frame_t"],
+                part["frame_arrival"],
+                part["frame_valid"],
+                counts,
+            )
+        now = machine.tick(tick, taken, commands)
+        result.ticks += 1
+        if state is not None:
+            step = state.get("seq_step", 1)
+            # Through the packer, as the recorded one went: the same types and roundings.
+            again = msgpack.unpackb(messages.pack(messages.state_message(now, scene, step)))
+            _compare(result, state, again)
+    return result
+
+
+def _ticks(
+    recording: Recording, progress: Callable[[int], None] | None, fingers: tuple[int, ...]
+) -> Iterator[
+    tuple[
+        dict[str, Any],
+        dict[tuple[int, int], Any],
+        list[dict[str, Any]],
+        dict[str, Any] | None,
+    ]
+]:
+    """Each tick's input, the frames at hand, its commands and its state if one was recorded.
+
+    A tick's frames and commands come before its input, its state behind it.
+    """
+    wanted = (messages.INPUT, messages.TACTILE, messages.COMMAND, messages.STATE)
+    frames: dict[tuple[int, int], Any] = {}
+    commands: dict[int, list[dict[str, Any]]] = {}
+    waiting: dict[str, Any] | None = None
+    for topic, message in recording.messages(wanted, progress=progress):
+        if topic == messages.TACTILE:
+            if message.get("unit") != "count":
+                raise RecordingError(
+                    f"{recording.path}: frames in {message.get('unit')!r}, expected counts: "
+                    'record with stream.tactile_unit = "count"'
+                )
+            if message.get("seq_step") != 1:
+                raise RecordingError(
+                    f"{recording.path}: one of {message.get('seq_step')} frames was published, "
+                    "all are needed: record with stream.tactile_rate at the sensors' own"
+                )
+            finger = FINGERS.index(message["finger"])
+            counts = np.frombuffer(message["data"], "<u2").reshape(message["rows"], message["cols"])
+            frames[finger, message["seq"]] = counts
+            frames.pop((finger, message["seq"] - 2), None)
+        elif topic == messages.COMMAND:
+            if message["ok"]:
+                commands.setdefault(message["tick"], []).append(json.loads(message["request"]))
+        elif topic == messages.INPUT:
+            if waiting is not None:
+                yield waiting, frames, commands.pop(waiting["seq"], []), None
+            waiting = message
+        elif waiting is not None and message["seq"] == waiting["seq"]:
+            yield waiting, frames, commands.pop(waiting["seq"], []), message
+            waiting = None
+    if waiting is not None:
+        yield waiting, frames, commands.pop(waiting["seq"], []), None
+
+
+def _compare(result: Comparison, recorded: dict[str, Any], recomputed: dict[str, Any]) -> None:
+    result.states += 1
+    fields = 0
+    for name, before, after in _pairs(recorded, recomputed):
+        fields += 1
+        if before == after or (before != before and after != after):
+            continue
+        seen = result.differences.get(name)
+        tick = recorded["seq"]
+        if seen is None:
+            seen = result.differences[name] = Difference(0, tick, before, after)
+        seen.count += 1
+        if isinstance(before, float) and isinstance(after, float):
+            size = abs(after - before)
+            if not size <= seen.worst:
+                seen.worst, seen.worst_tick = (math.inf if math.isnan(size) else size), tick
+    result.fields = max(result.fields, fields)
+
+
+def _pairs(
+    recorded: dict[str, Any], recomputed: dict[str, Any], outer: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    for key, before in recorded.items():
+        after = recomputed.get(key)
+        if isinstance(before, dict) and isinstance(after, dict):
+            yield from _pairs(before, after, f"{outer}{key}.")
+        elif outer or key not in _MOMENT:
+            yield f"{outer}{key}", before, after

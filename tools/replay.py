@@ -1,0 +1,155 @@
+"""``softfinger replay FILE.mcap``: a recording on the wire again, or through today's code."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from daemon.settings import SettingsError, Stream
+from tools.arguments import moment, seconds
+from tools.recordings.errors import RecordingError
+
+_EPILOG = """\
+Without --recompute the messages go out on the stream's socket as they were, at their own pace or
+--speed times that; the monitor, a recorder or a program of your own can't tell it from a daemon.
+
+--recompute runs readings, frames and commands through today's estimator, tables, control and
+limits, and compares every state with the recorded one. Record it from the first tick on, with
+`run --record`, and the same code and settings give the same states to the last bit.
+Exit status: 0 the same, 1 can't be read, 3 states differ."""
+
+_READERS = 10.0  # s that subscribers are waited for
+_DIFFERENT = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``replay``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("file", type=Path, metavar="FILE.mcap")
+    parser.add_argument("--address", default=Stream().address, help="where to publish")
+    parser.add_argument(
+        "--speed", type=seconds, default=1.0, metavar="X", help="times as fast (default 1)"
+    )
+    parser.add_argument("--from", type=moment, default=0.0, metavar="S", dest="start")
+    parser.add_argument("--to", type=seconds, metavar="S", dest="end")
+    parser.add_argument(
+        "--no-wait", action="store_true", help="begin at once, and not with the first subscriber"
+    )
+    parser.add_argument("--recompute", action="store_true", help="compare instead of publishing")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="with --recompute: these settings instead"
+    )
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT", help="with --recompute: write the comparison, too"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Publish, or recompute; 1 with one line when the recording is no good."""
+    from tools.recordings.reader import Recording
+
+    try:
+        recording = Recording(arguments.file)
+        if recording.truncated:
+            print(f"replay: {arguments.file} is cut short: {recording.damage}", file=sys.stderr)
+        return (
+            _recompute(arguments, recording)
+            if arguments.recompute
+            else _publish(arguments, recording)
+        )
+    except (RecordingError, SettingsError) as error:
+        print(f"replay: {error}", file=sys.stderr)
+        return 1
+
+
+def _publish(arguments: argparse.Namespace, recording: Any) -> int:
+    import zmq
+
+    from daemon.messages import pack
+    from daemon.sockets import AddressError, Bound
+
+    context: zmq.Context[Any] = zmq.Context()
+    ended = False
+
+    def end(*_: object) -> None:
+        nonlocal ended
+        ended = True
+
+    old = {each: signal.signal(each, end) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        bound = Bound(context, zmq.XPUB, arguments.address, "--address", 10_000, 1024)
+    except AddressError as error:
+        raise RecordingError(str(error)) from None
+    try:
+        waited = time.monotonic() + (0.0 if arguments.no_wait else _READERS)
+        while not ended and time.monotonic() < waited and not bound.socket.poll(100):
+            pass
+        sent = 0
+        began = first = None
+        end_at = float("inf") if arguments.end is None else arguments.end
+        for topic, message in recording.messages(start=arguments.start, end=end_at):
+            stamp = message.get("timestamp", 0.0)
+            if began is None or first is None:
+                began, first = time.monotonic(), stamp
+            due = began + (stamp - first) / arguments.speed
+            while not ended and (left := due - time.monotonic()) > 0.0:
+                time.sleep(min(left, 0.1))
+            if ended:
+                break
+            bound.socket.send_multipart([topic, pack(message)])
+            sent += 1
+        print(f"{sent} of {recording.total} messages published")
+    finally:
+        bound.close()
+        context.term()
+        for number, handler in old.items():
+            signal.signal(number, handler)
+    return 0
+
+
+def _recompute(arguments: argparse.Namespace, recording: Any) -> int:
+    from daemon.profiles import load
+    from tools.progress import Progress
+    from tools.recordings.recomputed import recompute
+    from tools.run import cache_folder
+
+    settings = None if arguments.config is None else load(arguments.config)
+    with Progress("recompute", recording.size) as progress:
+        result = recompute(recording, settings, cache_folder(), progress)
+    print(
+        f"{arguments.file}: {result.ticks} ticks, {result.states} states of {result.fields} fields "
+        "compared"
+    )
+    if not result.from_start:
+        print(
+            "the recording begins after the first tick: what was remembered from before it is not "
+            "there, so that the first states may differ"
+        )
+    for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
+        if count:
+            print(f"{count} {what} are missing in the recording")
+    if arguments.json is not None:
+        _write(arguments.json, result)
+    if not result.differences:
+        print("identical to the last bit")
+        return 0
+    print(f"{'field':24} {'differ':>8} {'first tick':>10}  recorded → recomputed; worst")
+    for name, each in result.differences.items():
+        line = f"{name:24} {each.count:8} {each.first_tick:10}  {each.recorded} → {each.recomputed}"
+        print(line + (f"; {each.worst:.3g} at tick {each.worst_tick}" if each.worst else ""))
+    return _DIFFERENT
+
+
+def _write(path: Path, result: Any) -> None:
+    import json
+    from dataclasses import asdict
+
+    try:
+        path.write_text(json.dumps(asdict(result), indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
