@@ -18,14 +18,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from daemon.settings import Finite, Positive, Settings
 from daemon.tactile.base import TactileError
-from kinematics.calibration import to_pressure
 from kinematics.material import Material
+from kinematics.readings import look_up_pressure, to_pressure
 
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
+_TABLE_STEPS = 8192  # of a curve's table: 64 KB
 
 
 class CalibrationFileError(TactileError):
@@ -67,7 +68,7 @@ class EquilibrateStep(_Part):
 
 
 class CurveStep(_Part):
-    """(exponent, c_1, c_2, c_3) as for kinematics.calibration.to_pressure; relative residual."""
+    """(exponent, c_1, c_2, c_3) as for kinematics.readings.to_pressure; relative residual."""
 
     date: str
     kind: Literal["power", "cubic"]
@@ -220,13 +221,26 @@ class Converter:
         self._curve = np.array(curve.coefficients if curve else (1.0, pascal_per_count, 0.0, 0.0))
         self._out = np.zeros(shape)
         self._full = sensor.full_count
+        self._table, self._per_step = self._tabulated(float(self._gain.max()) * sensor.full_count)
         self.live: NDArray[np.bool_] = self._gain > 0.0
         self(np.zeros(shape, np.uint16))  # compiled here, not in the loop
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
         """Pressure [Pa] of counts [rows, cols]; the array is valid until the next call."""
-        to_pressure(counts, self.zero, self._gain, self._curve, self._out)
+        if self._table is None:
+            to_pressure(counts, self.zero, self._gain, self._curve, self._out)
+        else:
+            look_up_pressure(counts, self.zero, self._gain, self._table, self._per_step, self._out)
         return self._out
+
+    def _tabulated(self, largest: float) -> tuple[FloatArray | None, float]:
+        """A power's table up to x = ``largest`` and its steps a count; None for a polynomial."""
+        exponent, factor = float(self._curve[0]), float(self._curve[1])
+        if exponent == 1.0:
+            return None, 1.0
+        step = max(self._full / _TABLE_STEPS, 1.0)
+        x = step * np.arange(int(largest / step) + 2)
+        return np.asarray(factor * x**exponent, np.float64), 1.0 / step
 
     def readings(self, counts: FloatArray) -> FloatArray:
         """x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""

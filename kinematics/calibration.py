@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinematics.contact import Fingertip
 from kinematics.estimator import ContactEstimator
-from kinematics.kernels import kernel
 from kinematics.material import Material
 from kinematics.pressure import SensorGrid
 
@@ -34,28 +33,6 @@ _LEAST_TILT = math.radians(3.0)  # below it a tilt tells no direction
 
 class CalibrationError(ValueError):
     """The data don't determine what is asked for. The message says what is missing or wrong."""
-
-
-@kernel
-def to_pressure(
-    counts: NDArray[np.uint16],
-    zero: FloatArray,
-    gain: FloatArray,
-    curve: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Counts → Pa, all [rows, cols]: x = max(counts − zero, 0)·gain, then the curve of x.
-
-    ``curve`` is (exponent b, c_1, c_2, c_3): p = c_1 x^b for b ≠ 1, else c_1 x + c_2 x² + c_3 x³.
-    """
-    exponent, c1, c2, c3 = curve[0], curve[1], curve[2], curve[3]
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            x = max(float(counts[i, j]) - zero[i, j], 0.0) * gain[i, j]
-            if exponent == 1.0:
-                out[i, j] = x * (c1 + x * (c2 + x * c3))
-            else:
-                out[i, j] = c1 * x**exponent if x > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -121,7 +98,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 @dataclass(frozen=True)
 class Curve:
-    """``coefficients`` (exponent, c_1, c_2, c_3) as for :func:`to_pressure`.
+    """``coefficients`` (exponent, c_1, c_2, c_3) as for `kinematics.readings.to_pressure`.
 
     ``errors`` [n]: relative error of each known force; ``residual`` their rms.
     """

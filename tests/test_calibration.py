@@ -16,11 +16,11 @@ from kinematics.calibration import (
     fit_law,
     fit_modulus,
     tare,
-    to_pressure,
 )
 from kinematics.contact import Fingertip
 from kinematics.material import Material
 from kinematics.pressure import SensorGrid
+from kinematics.readings import look_up_pressure, to_pressure
 
 TIP = Fingertip(0.020)
 E = 0.304e6
@@ -98,6 +98,22 @@ def test_to_pressure_equals_its_plain_twin():
         b, c1, c2, c3 = curve
         plain = c1 * x + c2 * x**2 + c3 * x**3 if b == 1 else c1 * x**b
         np.testing.assert_allclose(out, plain, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("exponent", "step"), [(0.7, 1.0), (1.4, 1.0), (1.4, 8.0)])
+def test_pressure_from_a_table_is_within_its_bound(exponent, step):
+    counts = RNG.integers(0, 4000, (16, 17)).astype(np.uint16)
+    zero, gain = RNG.uniform(0, 900, (16, 17)), RNG.uniform(0, 2, (16, 17))
+    exact, found = np.empty((16, 17)), np.empty((16, 17))
+    to_pressure(counts, zero, gain, np.array([exponent, 3.0, 0.0, 0.0]), exact)
+    table = 3.0 * (step * np.arange(8002 / step)) ** exponent
+    look_up_pressure(counts, zero, gain, table, 1.0 / step, found)
+    x = np.maximum(counts - zero, 0.0) * gain
+    far = x > step  # in the first step the bound is none
+    bound = abs(exponent * (exponent - 1.0)) / 8.0 * (step / (x[far] - step)) ** 2
+    assert (np.abs(found[far] / exact[far] - 1.0) <= bound + 1e-12).all()
+    assert (found[~far] <= table[1]).all()
+    assert (found[x == 0.0] == 0.0).all()
 
 
 @pytest.mark.parametrize("rotation", [0.0, 0.3, -2.0])
