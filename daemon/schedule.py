@@ -56,9 +56,11 @@ class Schedule:
         if self._frames:
             parts[0] += f", tactile frames as they come ({self._frames:g} Hz)"
             rate = self._frames / self.tactile_every
-            parts.append(f"every {self.tactile_every} frames hand/tactile ({rate:.4g} Hz)")
+            frames = "frame" if self.tactile_every == 1 else f"{self.tactile_every} frames"
+            parts.append(f"every {frames} hand/tactile ({rate:.4g} Hz)")
         parts += [
-            f"every {turn.every} {turn.what} ({self.rate / turn.every:.4g} Hz)"
+            f"every {f'{turn.every} ticks' if turn.every > 1 else 'tick'} {turn.what} "
+            f"({self.rate / turn.every:.4g} Hz)"
             for turn in self.turns()
         ]
         return "; ".join(parts)

@@ -25,21 +25,25 @@ class Listener:
     wants_state = wants_tactile = wants_stats = True
 
     def __init__(self) -> None:
-        self.ticks: dict[str, list[int]] = {"look": [], "state": [], "tactile": [], "stats": []}
+        self.ticks: dict[str, list[int]] = {"look": [], "state": [], "stats": []}
+        self.frames: tuple[list[int], list[int]] = ([], [])  # of each finger, by number
         self.rates: list[Rates] = []
         self.seq = 0
 
     def refresh(self) -> None:
         self.ticks["look"].append(self.seq)
 
-    def state(self, state: State, _: Any) -> None:
+    def __getattr__(self, name: str) -> Any:
+        """No other topic is wanted, and nothing else is done."""
+        return False if name.startswith("wants_") else lambda *_: None
+
+    def state(self, state: State, *_: Any) -> None:
         self.ticks["state"].append(state.seq)
 
-    def tactile(self, *_: Any) -> None:
-        if self.seq not in self.ticks["tactile"][-1:]:  # both fingers' come on the same tick
-            self.ticks["tactile"].append(self.seq)
+    def tactile(self, frame: Any, _data: Any, finger: int, *_: Any) -> None:
+        self.frames[finger].append(frame.seq)
 
-    def stats(self, state: State, _period: float, rates: Rates, _: Statistics) -> None:
+    def stats(self, state: State, _period: float, rates: Rates, *_: Any) -> None:
         self.ticks["stats"].append(state.seq)
         self.rates.append(rates)
 
@@ -62,24 +66,27 @@ def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
     return listener, daemon
 
 
-def test_each_topic_goes_out_on_exactly_every_nth_tick_and_seldom_on_the_same() -> None:
-    listener, _ = listened(4.0)
+def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame() -> None:
+    listener, _ = listened(4.0, stream={"tactile_rate": 25.0})
     ticks = listener.ticks
     assert ticks["state"] == list(range(5, 2001, 5))
-    assert ticks["tactile"] == list(range(1, 2001, 20))
     assert ticks["look"] == list(range(2, 2001, 25))
     assert ticks["stats"] == [3, 503, 1003, 1503]
-    assert not set(ticks["state"]) & (set(ticks["tactile"]) | set(ticks["stats"]))
+    assert not set(ticks["state"]) & set(ticks["stats"])
+    for frames in listener.frames:  # 100 Hz, of which 25 are published: one of each four
+        assert [seq // 4 for seq in frames] == list(range(len(frames)))
+        assert len(frames) == pytest.approx(100, abs=1)
 
 
 def test_rates_are_what_really_happened_in_the_last_second() -> None:
-    listener, _ = listened(4.0, tactile={"rate": 80.0}, stream={"state_rate": 50.0})
+    stream = {"state_rate": 50.0, "tactile_rate": 20.0}
+    listener, _ = listened(4.0, tactile={"rate": 80.0}, stream=stream)
     rates = listener.rates[-1]
     assert rates.tick == pytest.approx(500.0, abs=0.5)
     assert rates.left == pytest.approx(80.0, abs=1.01)
     assert rates.right == pytest.approx(80.0, abs=1.01)
     assert rates.state == pytest.approx(50.0, abs=0.1)
-    assert rates.tactile == pytest.approx(50.0, abs=0.1)  # 25 of each finger
+    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # 20 of each finger
 
 
 @pytest.mark.parametrize(
@@ -89,20 +96,23 @@ def test_rates_are_what_really_happened_in_the_last_second() -> None:
 def test_the_schedule_takes_the_nearest_whole_number_of_ticks(
     rate: float, wanted: float, every: int
 ) -> None:
-    settings = Settings.model_validate(
-        {"loop": {"rate": rate}, "stream": {"state_rate": wanted, "tactile_rate": wanted}}
-    )
+    settings = Settings.model_validate({"loop": {"rate": rate}, "stream": {"state_rate": wanted}})
     schedule = Schedule(settings)
-    assert schedule.state.every == schedule.tactile.every == every
-    due = [seq for seq in range(1, 10 * every + 1) if schedule.tactile.due(seq)]
-    assert len(due) == 10
+    assert schedule.state.every == every
+    due = [seq for seq in range(1, 10 * every + 1) if schedule.state.due(seq)]
+    assert due == list(range(every, 10 * every + 1, every))
     assert f"hand/state ({rate / every:.4g} Hz)" in str(schedule)
 
 
 def test_the_schedule_tells_every_rate() -> None:
-    told = str(Schedule(Settings()))
-    for words in ("every tick (500 Hz)", "frames as they come (100 Hz)", "every 5 hand/state",
-                  "every 20 hand/tactile (25 Hz)", "every 500 hand/stats (1 Hz)"):  # fmt: skip
+    told = str(Schedule(Settings.model_validate({"stream": {"tactile_rate": 25.0}})))
+    for words in (
+        "every tick (500 Hz)",
+        "frames as they come (100 Hz)",
+        "every 5 ticks hand/state (100 Hz)",
+        "every 4 frames hand/tactile (25 Hz)",
+        "every 500 ticks hand/stats (1 Hz)",
+    ):
         assert words in told
     blind = str(Schedule(Settings.model_validate({"tactile": {"backend": "none"}})))
     assert "frames" not in blind
@@ -120,7 +130,7 @@ def test_the_statistics_message_has_every_field_as_documented(
     statistics = Statistics()
     record(statistics.counts, statistics.largest, 1e-6, 2e-5, 1e-5, 2e-6)
     rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
-    publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics)
+    publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
     assert socket.poll(5000)
     topic, payload = socket.recv_multipart()
     assert topic == b"hand/stats"
@@ -130,6 +140,7 @@ def test_the_statistics_message_has_every_field_as_documented(
         "seq": 503,
         "timestamp": 9.0,
         "mono_ns": 1_500_000_000,
+        "seq_step": 500,
         "ticks": 1,
         "overruns": 0,
         "period_s": 0.002,
@@ -141,7 +152,7 @@ def test_the_statistics_message_has_every_field_as_documented(
 
 
 def test_statistics_that_are_zero_are_still_floats() -> None:
-    message = stats_message(State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), Statistics())
+    message = stats_message(State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), Statistics(), 1)
     for name in ("wake", "compute", "bus", "publish"):
         assert [type(message[name][key]) for key in ("p50", "p99", "p999", "max")] == [float] * 4
     assert all(isinstance(rate, float) for rate in message["rates"].values())
