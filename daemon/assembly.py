@@ -18,6 +18,8 @@ import zmq
 
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
+from daemon.doorkeeper import Doorkeeper
+from daemon.keys import load_server
 from daemon.loop import EventSink, Loop
 from daemon.messages import Facts
 from daemon.model import (
@@ -34,6 +36,7 @@ from daemon.records import FINGERS, Contact, ObjectPose, Reading
 from daemon.servos import make_servos
 from daemon.servos.base import Servos
 from daemon.settings import Settings
+from daemon.sockets import Guard
 from daemon.stream import Publisher
 from daemon.tactile import make_sensor
 from kinematics.table import ContactTable
@@ -45,8 +48,8 @@ if TYPE_CHECKING:
 class Daemon:
     """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
-    Raises SettingsError, AddressError, ServoError or TactileError when it can't be made ready;
-    whatever was opened until then is closed again.
+    Raises SettingsError, AddressError, KeyFileError, ServoError or TactileError when it can't be
+    made ready; whatever was opened until then is closed again.
     """
 
     def __init__(
@@ -101,9 +104,16 @@ class Daemon:
         context: zmq.Context[Any] = zmq.Context()
         self._closers.append(context.term)
         stream, commands = self.settings.stream, self.settings.commands
-        publisher = Publisher(context, stream.address, stream.queue)
+        access = self.settings.access
+        keys = load_server(Path(access.keys)) if access.keys else None
+        if keys is not None:
+            self._closers.append(Doorkeeper(context, keys.clients).close)
+        guard = Guard(int(access.ipc_mode, 8), keys)
+        publisher = Publisher(context, stream.address, stream.queue, guard)
         self._closers.append(publisher.close)
-        server = CommandServer(context, commands.address, commands.max_bytes)
+        server = CommandServer(
+            context, commands.address, commands.max_bytes, commands.per_second, guard
+        )
         self._closers.append(server.close)
         return publisher, server
 

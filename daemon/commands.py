@@ -2,23 +2,31 @@
 
 The server lives in the loop's own thread: it is asked once a tick, costs one system-free look when
 nobody speaks, and needs no lock. A plain REQ socket is enough for a client.
+
+One command is carried out a tick. What has come beside it is looked through as far as a tick
+allows: a ``stop`` goes first whoever else speaks, and a client that sends more than it may a second
+is refused, so that a flood costs the tick a bounded time and no one else's command its turn.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import msgpack
 import zmq
 
+from daemon.keys import ClientKeys
 from daemon.messages import pack
-from daemon.sockets import Bound
+from daemon.sockets import OWNER_ONLY, Bound, Guard
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
-# One command a tick keeps a flood from stretching the tick; more wait in their senders' queues.
-_QUEUE = 64
+_QUEUE = 64  # commands that wait, of one client in its socket and of all of them here
+_LOOK = 8  # messages that are taken in at a tick
+_CLIENTS = 256  # whose pace is remembered
+_STOP = b"stop"
 
 
 class Refused(Exception):
@@ -26,34 +34,81 @@ class Refused(Exception):
 
 
 class CommandServer:
-    """Answers at most one command a tick. Anything malformed gets a refusal, never an exception."""
+    """Answers commands, at most one a tick. Anything malformed is refused, never an exception."""
 
-    def __init__(self, context: zmq.Context[Any], address: str, max_bytes: int) -> None:
-        self._bound = Bound(context, zmq.ROUTER, address, "commands.address", _QUEUE, 4 * max_bytes)
+    def __init__(
+        self,
+        context: zmq.Context[Any],
+        address: str,
+        max_bytes: int,
+        per_second: float = 1e9,
+        guard: Guard = OWNER_ONLY,
+    ) -> None:
+        """``per_second`` bounds each client's commands; one second's worth may come at once."""
+        self._bound = Bound(
+            context, zmq.ROUTER, address, "commands.address", _QUEUE, 4 * max_bytes, guard
+        )
         self._socket = self._bound.socket
         self._max_bytes = max_bytes
+        self._per_second = per_second
+        self._paces: dict[bytes, tuple[float, float]] = {}  # of a client: may send, at time
+        self._waiting: deque[tuple[list[bytes], bytes]] = deque()
+        self.refused_by_pace = 0
 
-    def serve(self, handler: Handler) -> bool:
-        """Answer one waiting command through ``handler``; False when nobody waits."""
-        if not self._bound.readable():
+    def serve(self, handler: Handler, now: float = 0.0) -> bool:
+        """Answer one waiting command through ``handler``; False when nobody waits.
+
+        ``now`` [s] is what the clients' pace is measured by.
+        """
+        for _ in range(_LOOK):
+            if not self._bound.readable():
+                break
+            self._take_in(self._socket.recv_multipart(zmq.NOBLOCK), handler, now)
+        if not self._waiting:
             return False
-        frames = self._socket.recv_multipart(zmq.NOBLOCK)
+        envelope, payload = self._waiting.popleft()
+        self._send(envelope, self._answer(payload, handler))
+        return True
+
+    def _take_in(self, frames: list[bytes], handler: Handler, now: float) -> None:
         # A REQ socket sends [identity, empty, payload]. Without the empty frame, as from a DEALER,
         # the reply goes back in the same form.
         envelope, payload = frames[:-1], frames[-1]
-        if len(envelope) > 2:
-            return True  # not the form of any client; an answer would only send its frames back
-        reply = self._answer(payload, handler)
+        if not 0 < len(envelope) <= 2:
+            return  # not the form of any client; an answer would only send its frames back
+        if _is_stop(payload, self._max_bytes):
+            self._send(envelope, self._answer(payload, handler))
+        elif not self._in_pace(envelope[0], now):
+            self.refused_by_pace += 1
+            self._refuse(envelope, f"too many commands: at most {self._per_second:g} a second")
+        elif len(self._waiting) >= _QUEUE:
+            self.refused_by_pace += 1
+            self._refuse(envelope, "too many commands wait already")
+        else:
+            self._waiting.append((envelope, payload))
+
+    def _in_pace(self, client: bytes, now: float) -> bool:
+        most = self._per_second
+        left, then = self._paces.get(client, (most, now))
+        left = min(left + (now - then) * most, most)
+        if client not in self._paces and len(self._paces) >= _CLIENTS:
+            self._paces.clear()
+        self._paces[client] = (max(left - 1.0, 0.0), now)
+        return left >= 1.0
+
+    def _refuse(self, envelope: list[bytes], error: str) -> None:
+        self._send(envelope, {"ok": False, "error": error})
+
+    def _send(self, envelope: list[bytes], reply: dict[str, Any]) -> None:
         try:
             self._socket.send_multipart([*envelope, pack(reply)], zmq.NOBLOCK)
         except zmq.ZMQError:
             pass  # the client has gone
-        return True
 
-    def drain(self, handler: Handler) -> None:
+    def drain(self, handler: Handler, now: float = 0.0) -> None:
         """Answer all that wait, up to the queue's length."""
         for _ in range(_QUEUE):
-            if not self.serve(handler):
+            if not self.serve(handler, now):
                 return
 
     def _answer(self, payload: bytes, handler: Handler) -> dict[str, Any]:
@@ -67,6 +122,15 @@ class CommandServer:
     def close(self) -> None:
         """Close the socket."""
         self._bound.close()
+
+
+def _is_stop(payload: bytes, max_bytes: int) -> bool:
+    if _STOP not in payload or len(payload) > max_bytes:
+        return False
+    try:
+        return bool(decode(payload)["command"] == "stop")
+    except Refused:
+        return False
 
 
 def decode(payload: bytes) -> dict[str, Any]:
@@ -88,12 +152,16 @@ class NoAnswer(Exception):
     """The daemon did not answer in time."""
 
 
-def send(address: str, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
+def send(
+    address: str, request: dict[str, Any], timeout: float = 2.0, keys: ClientKeys | None = None
+) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s."""
     context: zmq.Context[Any] = zmq.Context()
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
     try:
+        if keys is not None:
+            keys.guard(socket)
         try:
             socket.connect(address)
         except zmq.ZMQError as error:

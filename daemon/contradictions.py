@@ -17,6 +17,7 @@ from daemon.settings import FINGER_NAMES, Settings
 _SIMULATED = ("simulated", "replay", "none")
 _LONGEST = 60  # characters of a value that are shown
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
+_ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
 
 def contradictions(settings: Settings, directory: Path | None, wrong: set[str]) -> list[str]:
@@ -174,14 +175,19 @@ def _forces(settings: Settings) -> Iterator[str]:
 
 def _addresses(settings: Settings) -> Iterator[str]:
     stream, commands = settings.stream.address, settings.commands.address
+    here = _TCP if not settings.access.keys else _ANY_TCP
     for key, address in (("stream.address", stream), ("commands.address", commands)):
-        tcp = _TCP.fullmatch(address)
+        tcp = here.fullmatch(address)
         path = address.removeprefix("ipc://")
         local = path != address and path.isprintable() and path[:1] not in ("", "@", "*")
         if not local and not (tcp and 0 < int(tcp[2]) < 65536):
+            if here is _TCP and _ANY_TCP.fullmatch(address):
+                hint = "; other addresses need access.keys, which `softfinger keys` makes"
+            else:
+                hint = ""
             yield (
                 f"{key}: found {shown(address)}, expected tcp://127.0.0.1:PORT with a port of "
-                "1 to 65535, or ipc://PATH"
+                f"1 to 65535, or ipc://PATH{hint}"
             )
     if stream == commands:
         yield f"commands.address: found {shown(commands)}, expected another than stream.address"
@@ -211,5 +217,5 @@ _QUESTIONS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], .
     (("servos", "tactile", "loop"), _clock),
     (("safety",), _limits),
     (("control", "safety", "task"), _forces),
-    (("stream", "commands"), _addresses),
+    (("stream", "commands", "access"), _addresses),
 )

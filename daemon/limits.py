@@ -106,6 +106,8 @@ ROWS: tuple[Row, ...] = (
         ("safety.residual_torque",), by.hand_torque, _T, lasts=0.3),
     Row("grip.slip", "shear against friction less a margin", "warn",
         ("control.tip_friction", "control.slip_margin"), by.slip, _T, lasts=0.1),
+    Row("commands.pace", "a client's commands a second, stop not counted", "limit",
+        ("commands.per_second",)),
     Row("loop.overruns", "late ticks in a row", "fault", ("safety.overruns_fault",), by.overrunning,
         "", True),
 )  # fmt: skip

@@ -104,7 +104,7 @@ class Loop:
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         if self._server is not None:
-            self._server.drain(self._refuse_old)
+            self._server.drain(self._refuse_old, self.state.t)
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -216,8 +216,10 @@ class Loop:
             self._stopping = False
             self._by_person({"command": "stop"})
         if self._server is not None:
-            old = state.t < self._deaf_until
-            self._server.serve(self._refuse_old if old else self._by_person)
+            if state.t < self._deaf_until:
+                self._server.drain(self._refuse_old, state.t)
+            else:
+                self._server.serve(self._by_person, state.t)
         if self._task is not None:
             self._follow(self._task)
         state.mode = control.mode
@@ -378,6 +380,9 @@ class Loop:
         counters = {} if self.servos is None else {"servos": self.servos.counters()}
         for perception in self.perceptions:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
+        limited = dict(self._safety.limited)
+        if self._server is not None and self._server.refused_by_pace:
+            limited["commands.pace"] = self._server.refused_by_pace
         return {
             "fault": state.fault,
             "fault_name": state.fault_name,
@@ -385,7 +390,7 @@ class Loop:
             "seq": state.seq,
             "overruns": state.timing.overruns,
             "counters": counters,
-            "limited": dict(self._safety.limited),
+            "limited": limited,
         }
 
     def _by_person(self, request: dict[str, Any]) -> dict[str, Any]:

@@ -5,16 +5,30 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import zmq
+
+from daemon.keys import ServerKeys
 
 _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)  # plain numbers: enum flags cost a microsecond
 
 
 class AddressError(Exception):
     """A socket can't be bound: the address is in use or can't be had."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guard:
+    """Who may connect: rights of an ipc address's file, and keys where there are some."""
+
+    ipc_mode: int = 0o600
+    keys: ServerKeys | None = None
+
+
+OWNER_ONLY = Guard()
 
 
 class Bound:
@@ -31,6 +45,7 @@ class Bound:
         key: str,
         queue: int,
         max_bytes: int,
+        guard: Guard = OWNER_ONLY,
     ) -> None:
         self._lock = -1
         self._file = ""
@@ -44,8 +59,14 @@ class Bound:
         self.socket.setsockopt(zmq.MAXMSGSIZE, max_bytes)
         self.socket.setsockopt(zmq.SNDHWM, queue)
         self.socket.setsockopt(zmq.RCVHWM, queue)
+        if guard.keys is not None:
+            guard.keys.guard(self.socket)
+        # The file comes into being with its rights, so that nobody slips in before.
+        before = os.umask(0o777 & ~guard.ipc_mode) if self._file else -1
         try:
             self.socket.bind(address)
+            if self._file:
+                Path(self._file).chmod(guard.ipc_mode)
         except zmq.ZMQError as error:
             self.close()
             if error.errno == zmq.EADDRINUSE:
@@ -53,6 +74,12 @@ class Bound:
                     f"{key}: {address} is in use; is another softfinger running?"
                 ) from None
             raise AddressError(f"{key}: can't bind {address}: {error}") from None
+        except OSError as error:
+            self.close()
+            raise AddressError(f"{key}: {address}: {error.strerror}") from None
+        finally:
+            if before >= 0:
+                os.umask(before)
 
     def readable(self) -> bool:
         """A message waits. About a microsecond; no system call unless something happened."""

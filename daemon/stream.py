@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from daemon import messages
 from daemon.records import Frame, State
-from daemon.sockets import Bound
+from daemon.sockets import OWNER_ONLY, Bound, Guard
 from daemon.statistics import Statistics
 
 _CHANGES = 16  # subscriptions taken in at a time; more wait for the next look
@@ -28,8 +28,10 @@ _LONGEST_TOPIC = 64  # bytes; whoever subscribes to more gets nothing
 class Publisher:
     """Publishes state, tactile frames and events. One thread, the loop's, may call it."""
 
-    def __init__(self, context: zmq.Context[Any], address: str, queue: int) -> None:
-        self._bound = Bound(context, zmq.XPUB, address, "stream.address", queue, 1024)
+    def __init__(
+        self, context: zmq.Context[Any], address: str, queue: int, guard: Guard = OWNER_ONLY
+    ) -> None:
+        self._bound = Bound(context, zmq.XPUB, address, "stream.address", queue, 1024, guard)
         self._socket = self._bound.socket
         self._subscriptions: set[bytes] = set()
         self.wants_state = False

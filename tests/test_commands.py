@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import stat
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -13,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.commands import CommandServer, NoAnswer, Refused, decode, send
-from daemon.sockets import AddressError
+from daemon.sockets import AddressError, Guard
+from daemon.stream import Publisher
 from tests.conftest import until
 
 
@@ -136,4 +139,123 @@ def test_a_second_server_on_the_same_address_is_told(
     with pytest.raises(AddressError, match="is another softfinger running"):
         CommandServer(context, address, 200)
     first.close()
-    CommandServer(context, address, 200).close()
+
+    def free() -> bool:  # libzmq gives a port back in a thread of its own
+        try:
+            CommandServer(context, address, 200).close()
+        except AddressError:
+            return False
+        return True
+
+    until(free)
+
+
+class Flood:
+    """Clients that send without waiting for answers; nothing serves yet."""
+
+    def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
+        self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]
+        for socket in self.sockets:
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.connect(address)
+            for _ in range(each):
+                socket.send(msgpack.packb({"command": "move"}))
+
+    def replies(self) -> list[dict[str, Any]]:
+        found = []
+        for socket in self.sockets:
+            while socket.poll(20):
+                found.append(msgpack.unpackb(socket.recv()))
+        return found
+
+
+def arrived(server: CommandServer) -> bool:
+    return server._bound.readable()
+
+
+def test_a_stop_goes_before_all_that_waits(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    server = CommandServer(context, addresses[1], max_bytes=200, per_second=1000.0)
+    flood = Flood(context, addresses[1], clients=4, each=40)
+    until(lambda: arrived(server))
+    order: list[str] = []
+
+    def note(request: dict[str, Any]) -> dict[str, Any]:
+        order.append(request["command"])
+        return {}
+
+    server.serve(note, 0.0)  # the flood is being worked on
+    stopper = context.socket(zmq.DEALER)
+    stopper.setsockopt(zmq.LINGER, 0)
+    stopper.connect(addresses[1])
+    stopper.send_multipart([b"", msgpack.packb({"command": "stop"})])
+    ticks = 0
+
+    def stopped() -> bool:
+        nonlocal ticks
+        ticks += 1
+        server.serve(note, 0.002 * ticks)
+        return bool(stopper.poll(1))
+
+    until(stopped)
+    assert "stop" in order
+    assert order.index("stop") < 160, "not behind all of the flood"
+    assert len(server._waiting) > 0, "others wait still"
+    del flood
+    server.close()
+
+
+def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    server = CommandServer(context, addresses[1], max_bytes=200, per_second=20.0)
+    flood = Flood(context, addresses[1], clients=1, each=60)
+    quiet = Flood(context, addresses[1], clients=1, each=3)
+    replies: list[dict[str, Any]] = []
+    kind: list[dict[str, Any]] = []
+
+    def all_answered() -> bool:
+        while server.serve(echo, 1.0):
+            pass
+        replies.extend(flood.replies())
+        kind.extend(quiet.replies())
+        return len(replies) == 60 and len(kind) == 3
+
+    until(all_answered)
+    assert sum(reply["ok"] for reply in replies) == 20
+    assert {reply.get("error") for reply in replies if not reply["ok"]} == {
+        "too many commands: at most 20 a second"
+    }
+    assert all(reply["ok"] for reply in kind)
+    assert server.refused_by_pace == 40
+    # A second later it may send again.
+    flood.sockets[0].send(msgpack.packb({"command": "move"}))
+    until(lambda: server.serve(echo, 2.0))
+    assert flood.replies() == [{"ok": True, "heard": "move"}]
+    server.close()
+
+
+def test_what_many_clients_are_remembered_by_is_bounded(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    server = CommandServer(context, addresses[1], max_bytes=200, per_second=2.0)
+    for client in range(5000):
+        assert server._in_pace(str(client).encode(), 0.0)
+    assert len(server._paces) <= 256
+    server.close()
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o660])
+def test_an_ipc_file_has_the_rights_that_were_set(
+    context: zmq.Context[Any], tmp_path_factory: pytest.TempPathFactory, mode: int
+) -> None:
+    folder = tmp_path_factory.mktemp("s")
+    server = CommandServer(context, f"ipc://{folder}/c", 200, guard=Guard(mode))
+    stream = Publisher(context, f"ipc://{folder}/s", 10, Guard(mode))
+    for name in ("c", "s"):
+        assert stat.S_IMODE(Path(f"{folder}/{name}").stat().st_mode) == mode
+    assert stat.S_IMODE(Path(f"{folder}/c.lock").stat().st_mode) == 0o600
+    server.close()
+    stream.close()
+    assert list(folder.iterdir()) == []

@@ -167,6 +167,8 @@ def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
         ('[stream]\naddress = "tcp://127.0.0.1:99999"', "stream.address: found"),
         ('[stream]\naddress = "tcp://*:9872"', "stream.address: found"),
         ('[stream]\naddress = "inproc://x"', "stream.address: found"),
+        ('[commands]\naddress = "tcp://10.0.0.2:9873"', "commands.address: found"),
+        ('access.ipc_mode = "0777"', "access.ipc_mode: found"),
         ('[commands]\naddress = "ipc://"', "commands.address: found"),
         ('[commands]\naddress = "ipc://a\\u0000b"', 'commands.address: found "ipc://a?b"'),
         ('[commands]\naddress = "tcp://127.0.0.1:9872"', "commands.address: found"),
@@ -220,3 +222,16 @@ def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> Non
 def test_a_change_that_names_no_key_is_told(change: str) -> None:
     with pytest.raises(SettingsError, match=r"^--set: found .* expected section\.key=value"):
         load(changes=[change])
+
+
+def test_addresses_off_this_machine_need_keys(tmp_path: Path) -> None:
+    path = tmp_path / "far.toml"
+    path.write_text('commands.address = "tcp://10.0.0.2:9873"\n', encoding="utf-8")
+    with pytest.raises(SettingsError, match=r"need access\.keys"):
+        load(path)
+    for address in ("tcp://10.0.0.2:9873", "tcp://*:9873", "tcp://hand.lan:9873", "tcp://[::]:9"):
+        path.write_text(
+            f'commands.address = "{address}"\naccess.keys = "/etc/softfinger/keys"\n',
+            encoding="utf-8",
+        )
+        assert load(path).commands.address == address

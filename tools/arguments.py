@@ -35,6 +35,13 @@ def profile(arguments: argparse.Namespace) -> Settings:
     return load(arguments.config, arguments.dir, arguments.set)
 
 
+def add_keys(parser: argparse.ArgumentParser) -> None:
+    """``--keys``, for a subcommand that speaks with a daemon that may want them."""
+    parser.add_argument(
+        "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
+    )
+
+
 def seconds(text: str) -> float:
     """A time above 0 s. Raises ArgumentTypeError with what was found."""
     try:

@@ -69,6 +69,7 @@ class Beside:
 def start_beside(
     state_address: str,
     command_address: str,
+    keys: str = "",
     duration: float | None = None,
     on_end: Callable[[], None] | None = None,
 ) -> Beside:
@@ -77,16 +78,21 @@ def start_beside(
     The child holds one end of a pipe whose other end is ours alone: when this process ends, in
     whatever way, the child reads the pipe's end and gives the terminal back. ``on_end`` is called
     once, from a signal handler in the main thread, when the monitor has ended: with
-    ``on_end=loop.end`` the person's q ends the daemon, and the loop need not look.
+    ``on_end=loop.end`` the person's q ends the daemon, and the loop need not look. ``keys`` is the
+    folder with the client's keys, if the daemon wants some.
     """
     attributes: list[Any] | None = None
-    terminal = sys.stdout.fileno()
-    with contextlib.suppress(termios.error):
+    terminal = -1
+    # A standard output that was closed, or is no file, is no terminal either.
+    with contextlib.suppress(termios.error, AttributeError, OSError, ValueError):
+        terminal = sys.stdout.fileno()
         attributes = termios.tcgetattr(terminal)
     reads, writes = os.pipe()
     # -P: a folder named tools where the daemon was started is not ours.
     command = [sys.executable, "-P", "-m", "tools.monitor", "--state", state_address]
     command += ["--commands", command_address, "--lifeline", str(reads)]
+    if keys:
+        command += ["--keys", keys]
     if duration is not None:
         command += ["--duration", str(duration)]
     try:

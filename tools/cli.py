@@ -22,13 +22,23 @@ SUBCOMMANDS = {
     "doctor": "check ports, servos, boards and this machine, and tell what mends them",
     "scan": "find the servos on a port, at any rate",
     "calibrate": "calibrate the pressure sensor under a tip, step by step",
+    "limits": "every limit of the hand: what is judged, what follows, which setting",
+    "keys": "make the keys that addresses off this machine need",
     "figures": "the paper's figures from this model, as CSV and PNG",
     "bench": "measure run time, beside what a user would otherwise pick",
 }
 
 
+def _open_standard_streams() -> None:
+    """Stand-ins for standard streams that were closed, so that no other file takes their place."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``softfinger``; returns the exit status."""
+    _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
         prog="softfinger",
@@ -41,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, text in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(name, help=text, description=text)
         if name == called:
-            module = importlib.import_module(f"tools.{name}")
+            module = importlib.import_module(f"tools.{name.replace('-', '_')}")
             module.add_arguments(subparser)
     arguments = parser.parse_args(words)
     assert module is not None  # argparse has refused everything else

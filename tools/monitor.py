@@ -20,6 +20,8 @@ from typing import Any
 
 import zmq
 
+from daemon.keys import KeyFileError, load_client
+from tools.arguments import add_keys
 from tools.feed import FINGERS, Commander, Feed, Subscriber, field, number, text
 from tools.monitor_page import Page
 from tools.terminal import Keys, Terminal, TerminalGone
@@ -41,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
     parser.add_argument("--commands", metavar="ADDRESS", help="where commands are taken")
+    add_keys(parser)
     parser.add_argument(
         "--no-wait", action="store_true", help="end when no daemon is running, or when it ends"
     )
@@ -62,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     context: zmq.Context[Any] = zmq.Context(io_threads=1)
     feed = Feed()
     try:
+        if args.keys is not None:
+            load_client(args.keys).guard(context)
         subscriber = Subscriber(context, state, feed)
         commander = Commander(context, commands)
         try:
@@ -75,6 +80,9 @@ def run(args: argparse.Namespace) -> int:
             subscriber.close()
     except zmq.ZMQError as error:
         print(f"softfinger monitor: {state}, {commands}: {error}", file=sys.stderr)
+        return 1
+    except KeyFileError as error:
+        print(f"softfinger monitor: {error}", file=sys.stderr)
         return 1
     finally:
         context.destroy(linger=0)

@@ -127,7 +127,12 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
     from tools.beside import start_beside
 
-    return start_beside(settings.stream.address, settings.commands.address, on_end=loop.end)
+    return start_beside(
+        settings.stream.address,
+        settings.commands.address,
+        keys=settings.access.keys,
+        on_end=loop.end,
+    )
 
 
 def _scene(settings: Settings) -> str:

@@ -9,8 +9,9 @@ import sys
 from typing import Any
 
 from daemon.commands import NoAnswer, send
+from daemon.keys import KeyFileError, load_client
 from daemon.settings import CommandSettings
-from tools.arguments import seconds
+from tools.arguments import add_keys, seconds
 
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
@@ -26,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("command", metavar="COMMAND")
     parser.add_argument("values", metavar="key=value", nargs="*")
     parser.add_argument("--address", default=CommandSettings().address, help="command socket")
+    add_keys(parser)
     parser.add_argument("--client", default="", help="name that owns the commander's lease")
     parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S")
 
@@ -43,8 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
             return 2
         request[key] = value
     try:
-        reply = send(arguments.address, request, arguments.timeout)
-    except NoAnswer as error:
+        keys = load_client(arguments.keys) if arguments.keys else None
+        reply = send(arguments.address, request, arguments.timeout, keys)
+    except (NoAnswer, KeyFileError) as error:
         print(f"send: {error}", file=sys.stderr)
         return 2
     print(json.dumps(reply, ensure_ascii=False))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -17,6 +18,7 @@ from daemon.client.hand import COMMANDS, STREAM, accepted
 from daemon.client.records import Event, HandState, TactileFrame
 from daemon.client.wire import Decoder, nothing_from, prepare
 from daemon.commands import NoAnswer
+from daemon.keys import load_client
 
 
 class AsyncHand:
@@ -29,12 +31,15 @@ class AsyncHand:
         *,
         client: str = "",
         timeout: float = 2.0,
+        keys: Path | None = None,
     ) -> None:
         self.stream_address = stream
         self.command_address = commands
         self.client = client
         self.timeout = timeout
         self._context = zmq.asyncio.Context()
+        if keys is not None:
+            load_client(keys).guard(self._context)
 
     async def __aenter__(self) -> AsyncHand:
         return self

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
@@ -15,6 +16,7 @@ from daemon.client.errors import HandFault, NoStream, NotInTime
 from daemon.client.records import Event, HandState, TactileFrame
 from daemon.client.wire import Decoder, nothing_from, prepare
 from daemon.commands import Refused, send
+from daemon.keys import load_client
 from daemon.settings import CommandSettings, Stream
 
 _Record = TypeVar("_Record")
@@ -86,7 +88,8 @@ class Hand:
     """A hand by its two addresses. Not for use from several threads at once; make one in each.
 
     ``client`` is the name that owns the commander's lease (`daemon.modes.Lease`); ``timeout`` [s]
-    is how long a reply, or a first state, is waited for.
+    is how long a reply, or a first state, is waited for. ``keys`` is the folder of this client's
+    keys, where the daemon wants some; `daemon.keys.KeyFileError` when they can't be read.
     """
 
     def __init__(
@@ -96,12 +99,16 @@ class Hand:
         *,
         client: str = "",
         timeout: float = 2.0,
+        keys: Path | None = None,
     ) -> None:
         self.stream_address = stream
         self.command_address = commands
         self.client = client
         self.timeout = timeout
+        self._keys = None if keys is None else load_client(keys)
         self._context: zmq.Context[Any] = zmq.Context()
+        if self._keys is not None:
+            self._keys.guard(self._context)
         self._states: Subscription[HandState] | None = None
 
     def __enter__(self) -> Hand:
@@ -188,7 +195,7 @@ class Hand:
         request: dict[str, Any] = {"command": name, **numbers}
         if self.client:
             request["client"] = self.client
-        return accepted(send(self.command_address, request, self.timeout))
+        return accepted(send(self.command_address, request, self.timeout, self._keys))
 
     def arm(self) -> None:
         """Torque on; the joints hold where they are."""

@@ -1,0 +1,193 @@
+"""Keys of the daemon's sockets and of those who may use them: files, and what they do to a socket.
+
+CurveZMQ: each side has a key pair; a client knows the server's public key, and the server the
+public keys of its clients. Whoever has no key among them gets nothing. A folder of `make_keys`:
+
+``server/server.key_secret``
+    the daemon's own pair
+``server/clients/NAME.key``
+    whom it lets in; a file taken away is a client shut out at the next start
+``NAME/server.key``, ``NAME/client.key_secret``
+    what that client needs: the folder to bring to its machine. ``local`` is this machine's.
+
+The files are ZeroMQ certificates, which other ZeroMQ programs can read, too.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zmq
+import zmq.utils.z85
+
+LOCAL = "local"  # the client that every folder of keys has
+DOMAIN = b"softfinger"
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_KEY = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"]*)"\s*$', re.MULTILINE)
+_LENGTH = 40  # characters of a key in Z85
+_LARGEST = 65_536  # bytes of a key file
+
+
+class KeyFileError(ValueError):
+    """Keys can't be made or read. The message says which file, and what mends it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServerKeys:
+    """The daemon's pair and its clients' public keys, in Z85."""
+
+    public: bytes
+    secret: bytes
+    clients: dict[bytes, str]  # public key → name
+
+    def guard(self, socket: zmq.Socket[Any]) -> None:
+        """Before bind: only clients whom a `Doorkeeper` of these keys lets in."""
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
+        socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
+        # Without a doorkeeper nobody is let in, rather than everybody.
+        socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, 2000)
+
+
+@dataclass(frozen=True, slots=True)
+class ClientKeys:
+    """A client's pair and the server's public key, in Z85."""
+
+    server: bytes
+    public: bytes
+    secret: bytes
+
+    def guard(self, socket: zmq.Socket[Any] | zmq.Context[Any]) -> None:
+        """Speak with this server alone, by this name: a socket before connect, or all to come."""
+        socket.setsockopt(zmq.CURVE_SERVERKEY, self.server)
+        socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
+
+
+def check_curve() -> None:
+    """Raises KeyFileError when this machine's libzmq can't do it."""
+    if not zmq.has("curve"):
+        raise KeyFileError(
+            f"libzmq {zmq.zmq_version()} of this Python was built without CURVE: install a pyzmq "
+            "that has it (its published wheels do), or keep to addresses on this machine"
+        )
+
+
+def make_keys(folder: Path, names: list[str]) -> list[Path]:
+    """Make the server's pair, unless it is there, and a pair for each client; the new folders.
+
+    Raises KeyFileError before anything is written when a client is there already.
+    """
+    check_curve()
+    server = folder / "server"
+    new = not (server / "server.key_secret").exists()
+    wanted = [LOCAL, *names] if new else names
+    for name in wanted:
+        if not _NAME.fullmatch(name) or name == "server":
+            raise KeyFileError(
+                f"{name!r} is no name of a client: letters, digits, dots, dashes, at most 64"
+            )
+        there = [server / "clients" / f"{name}.key", folder / name]
+        if any(path.exists() for path in there) or wanted.count(name) > 1:
+            raise KeyFileError(f"{folder}: client {name} is there already; take another name")
+    if not wanted:
+        raise KeyFileError(f"{folder}: the server's keys are there already; name clients to add")
+    try:
+        return _write_keys(folder, server, wanted, new)
+    except OSError as error:
+        raise KeyFileError(f"{error.filename or folder}: {error.strerror}") from None
+
+
+def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list[Path]:
+    for path in (folder, server, server / "clients"):
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if new:
+        public, secret = zmq.curve_keypair()
+        _write(server / "server.key_secret", public, secret)
+    else:
+        public, _ = _pair(server / "server.key_secret")
+    made = [server] if new else []
+    for name in names:
+        client = folder / name
+        client.mkdir(mode=0o700)
+        own_public, own_secret = zmq.curve_keypair()
+        _write(client / "server.key", public)
+        _write(client / "client.key_secret", own_public, own_secret)
+        # Last, so that nobody is let in whose own keys could not be written.
+        _write(server / "clients" / f"{name}.key", own_public)
+        made.append(client)
+    return made
+
+
+def _write(path: Path, public: bytes, secret: bytes = b"") -> None:
+    lines = ["metadata", "curve", f'    public-key = "{public.decode()}"']
+    if secret:
+        lines.append(f'    secret-key = "{secret.decode()}"')
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write("\n".join(lines) + "\n")
+
+
+def load_server(folder: Path) -> ServerKeys:
+    """The daemon's keys, from the folder of `make_keys` or its ``server``. Raises KeyFileError."""
+    check_curve()
+    place = folder if (folder / "server.key_secret").exists() else folder / "server"
+    public, secret = _pair(place / "server.key_secret")
+    clients = {}
+    for path in sorted((place / "clients").glob("*.key")):
+        clients[_keys(path)["public"]] = path.stem
+    if not clients:
+        raise KeyFileError(f"{place / 'clients'}: no client's key; `softfinger keys` makes them")
+    return ServerKeys(public, secret, clients)
+
+
+def load_client(folder: Path) -> ClientKeys:
+    """A client's keys, from its own folder or the one of `make_keys`. Raises KeyFileError."""
+    check_curve()
+    place = folder if (folder / "client.key_secret").exists() else folder / LOCAL
+    public, secret = _pair(place / "client.key_secret")
+    return ClientKeys(_keys(place / "server.key")["public"], public, secret)
+
+
+def _pair(path: Path) -> tuple[bytes, bytes]:
+    found = _keys(path)
+    if "secret" not in found:
+        raise KeyFileError(f"{path}: holds no secret key")
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")
+    return found["public"], found["secret"]
+
+
+def _keys(path: Path) -> dict[str, bytes]:
+    try:
+        with path.open(encoding="ascii") as file:
+            text = file.read(_LARGEST)
+    except OSError as error:
+        raise KeyFileError(
+            f"{path}: can't be read: {error.strerror}; `softfinger keys` makes such files"
+        ) from None
+    except UnicodeDecodeError:
+        raise KeyFileError(f"{path}: no key file") from None
+    found = {name: value.encode() for name, value in _KEY.findall(text)}
+    if "public" not in found or not all(_sound(key) for key in found.values()):
+        raise KeyFileError(f"{path}: no key file")
+    return found
+
+
+def _sound(key: bytes) -> bool:
+    if len(key) != _LENGTH:
+        return False
+    try:
+        zmq.utils.z85.decode(key)
+    except (KeyError, ValueError, OverflowError, zmq.ZMQError):
+        return False
+    return True

@@ -1,0 +1,36 @@
+"""``softfinger keys FOLDER [CLIENT …]``: keys for sockets that other machines may reach."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from daemon.keys import KeyFileError, make_keys
+
+_EPILOG = """\
+The first call makes the daemon's keys and those of the client `local`, for the tools on the
+daemon's own machine; each CLIENT is one more. Set access.keys in the profile to FOLDER, bring
+FOLDER/CLIENT to that client's machine, and give it to the tools with --keys. Nothing is ever
+overwritten; a client is shut out by removing FOLDER/server/clients/CLIENT.key and restarting.
+Exit status: 0 made, 1 refused."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``keys``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("clients", nargs="*", metavar="CLIENT")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make keys; 0, or 1 with the reason."""
+    try:
+        made = make_keys(arguments.folder, arguments.clients)
+    except KeyFileError as error:
+        print(f"keys: {error}", file=sys.stderr)
+        return 1
+    for folder in made:
+        print(folder)
+    return 0

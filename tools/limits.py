@@ -1,0 +1,47 @@
+"""``softfinger limits``: the table of all limits, with the numbers of a profile."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from daemon.settings import Settings, SettingsError
+from tools.arguments import add_profile, profile
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``limits``."""
+    add_profile(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table; 2 for wrong settings."""
+    try:
+        settings = profile(arguments)
+    except SettingsError as error:
+        print(error, file=sys.stderr)
+        return 2
+    from daemon.limits import ROWS
+
+    lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in ROWS]
+    widths = [max(len(line[column]) for line in lines) for column in range(3)]
+    for line in lines:
+        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]
+        print("  ".join([*cells, line[3]]).rstrip())
+    return 0
+
+
+def _values(settings: Settings, keys: tuple[str, ...]) -> str:
+    return ", ".join(f"{key} = {_shown(_value(settings, key))}" for key in keys)
+
+
+def _value(settings: Settings, key: str) -> Any:
+    section, _, name = key.partition(".")
+    return getattr(getattr(settings, section), name)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_shown(each) for each in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
