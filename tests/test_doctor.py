@@ -23,7 +23,7 @@ from daemon.checkup.result import Result
 from daemon.commands import CommandServer
 from daemon.profiles import load
 from daemon.servos import registers as reg
-from daemon.servos.mend import scan
+from daemon.servos.scanning import scan
 from daemon.settings import Settings
 from daemon.simulation.emulator import Emulator
 from tools import doctor
@@ -138,7 +138,10 @@ def test_servos_at_another_rate_are_found(emulated, capsys):
     status, lines = hand.doctor(capsys)
     assert status == 1
     assert "note   found: ID 1 at 1000000 baud: XM430-W350, firmware 48" in lines
-    assert "       → set servos.baud = 1000000" in lines
+    assert (
+        "       → softfinger doctor --fix makes it servo 1 (left): 1000000 → 2000000 baud; "
+        "or set servos.baud = 1000000"
+    ) in lines
     path = str(hand.folder / "servos")
     arguments = ["scan", path, "--baud", "2000000", "--baud", "1000000", "--wait", "0.1"]
     assert main(arguments) == 0

@@ -6,17 +6,20 @@ import os
 import struct
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import dynamixel_sdk as sdk
 import numpy as np
 import pytest
+import serial
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from daemon.clock import RealClock
 from daemon.records import Goal, Reading
+from daemon.servos import port as port_module
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
 from daemon.servos.checks import check_latency
@@ -220,6 +223,38 @@ def test_latency_timer_of_an_adapter() -> None:
     assert check_latency("/dev/ttyUSB0", 0.016, 0.004).errors
     assert check_latency("/dev/ttyUSB0", 0.002, 0.004).notices
     assert check_latency("/dev/ttyUSB0", 0.001, 0.004) == check_latency("x", 0.0, 0.004)
+
+
+def test_an_adapters_latency_timer_is_asked_to_be_low(
+    bus: RunningBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = Path(os.path.realpath(bus.path)).name
+    (tmp_path / name / "device").mkdir(parents=True)
+    place = tmp_path / name / "device" / "latency_timer"
+    place.write_text("16\n")
+    monkeypatch.setattr(port_module, "_SYSFS", tmp_path)
+    # The mode is not there, as on this pseudo-terminal: it is told, and what mends it.
+    text = refusal(bus, reply_timeout=0.004)
+    assert "the adapter's latency timer is 16 ms" in text
+    assert "`softfinger doctor --fix` sets it to 1 ms" in text
+    # The mode is there: a driver then sets the timer to 1 ms by itself.
+    asked = []
+
+    def low(_: serial.Serial, on: bool) -> None:
+        asked.append(on)
+        place.write_text("1\n")
+
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", low)
+    backend = connected(bus)
+    assert asked == [True]
+    assert not [notice for notice in backend.notices if "latency" in notice]
+    backend.close()
+    place.write_text("nonsense")
+    port = SerialPort(bus.path, 2_000_000, PATIENCE, low_latency=False)
+    port.openPort()
+    assert port.latency_timer() == 0.0
+    assert asked == [True]
+    port.closePort()
 
 
 # --- reading and writing -----------------------------------------------------------------------

@@ -11,9 +11,11 @@ import pytest
 from daemon.clock import RealClock
 from daemon.servos import mend as mending
 from daemon.servos import registers as reg
+from daemon.servos import scanning
 from daemon.servos.base import ServoError
 from daemon.servos.dynamixel import DynamixelServos
-from daemon.servos.mend import FoundServo, mend, scan
+from daemon.servos.mend import mend
+from daemon.servos.scanning import FoundServo, scan
 from daemon.settings import Settings
 from daemon.simulation.free_joints import FreeJoints
 from daemon.simulation.servo_bus import ServoBus
@@ -39,7 +41,9 @@ def running() -> Iterator[Callable[..., RunningBus]]:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """The bus shares this process's interpreter lock."""
-    monkeypatch.setattr(mending, "_PING_TIMEOUT", 0.1)
+    for module in (mending, scanning):
+        monkeypatch.setattr(module, "PING_TIMEOUT", 0.1)
+    monkeypatch.setattr(mending, "_SEARCH", 0.1)
 
 
 def profile(bus: RunningBus, **servos: Any) -> Settings:
@@ -93,7 +97,7 @@ def test_what_can_not_be_mended_is_told_with_what_was(running: Callable[..., Run
     with pytest.raises(ServoError) as caught:
         mend(profile(bus))
     assert str(caught.value).splitlines() == [
-        "servo 2 (right): no answer at 2000000 baud",
+        "servo 2 (right): no answer at any rate: check its power and cable",
         "(done: servo 1 (left): operating mode 3 → 5)",
         "(done: servo 1 (left): return delay 250 → 0)",
     ]

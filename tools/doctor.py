@@ -25,9 +25,12 @@ _PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board
 _EPILOG = """\
 exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
 can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
-servos get their operating mode, return delay and status return level and are rebooted after a
-hardware error (the hand lets go meanwhile), and kernels are compiled. Nothing is ever stiffened or
-moved."""
+servos get their ID and rate where there is no doubt which one is meant, their operating mode,
+return delay and status return level, and are rebooted after a hardware error (the hand lets go
+meanwhile), and kernels are compiled. Nothing is ever stiffened or moved.
+
+factory-new servos all have ID 1, at 57600 baud: connect one alone, then doctor --fix; then the next
+one beside it, and doctor --fix again."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

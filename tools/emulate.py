@@ -30,9 +30,9 @@ softfinger emulate --dir DIR --send "drop=0.01 left:frozen@2" tells a running on
 what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
 begins the record anew, --send "report forget" does both without a gap:
   t, monotonic     the hand's time now [s], and time.monotonic() then
-  servos           by ID:
-    torque, mode, q, hardware_error, watchdog (time armed for [s], 0 when it is not, null after it
-                   stopped the motor), stopped_by_watchdog: the state now
+  servos           left first, of each:
+    id, torque, mode, q, hardware_error, watchdog (time armed for [s], 0 when it is not, null after
+                   it stopped the motor), stopped_by_watchdog: the state now
     goal_q, goal_current
                    least and greatest goal that came [rad, A; positive closes], refused ones too;
                    null when none came
@@ -59,7 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_settings(parser)
     parser.add_argument("--model", metavar="NAME", help="the servos' model")
-    parser.add_argument("--ids", type=_ids, metavar="L,R", help="the servos' IDs, left first")
+    parser.add_argument(
+        "--ids",
+        type=_ids,
+        metavar="L,R",
+        help="the servos' IDs, left first; 1,1 lets both answer at once, as factory-new ones do",
+    )
     parser.add_argument(
         "--baud",
         type=int,
@@ -78,7 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--factory",
         action="store_true",
-        help="servos as they leave the factory: position mode, 500 µs return delay",
+        help="servos as they leave the factory: position mode, 500 µs return delay; in all with "
+        "--baud 57600 --ids 1,1",
     )
     parser.add_argument(
         "--send",
@@ -107,8 +113,8 @@ def _ids(text: str) -> tuple[int, ...]:
         ids = tuple(int(part) for part in text.split(","))
     except ValueError:
         ids = ()
-    if len(ids) != 2 or ids[0] == ids[1]:
-        raise argparse.ArgumentTypeError(f"expected two different IDs such as 1,2, found {text}")
+    if len(ids) != 2 or not all(0 <= each <= 252 for each in ids):
+        raise argparse.ArgumentTypeError(f"expected two IDs of 0 to 252 such as 1,2, found {text}")
     return ids
 
 
@@ -143,6 +149,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals)
             baud=arguments.baud,
             latency=arguments.latency,
             prepared=not arguments.factory,
+            ids=arguments.ids,
             faults=arguments.fault,
             table_cache=cache_folder(),
             undisturbed=signals.held,
@@ -225,16 +232,12 @@ def _send(folder: Path, words: str) -> int:
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     settings = profile(arguments)
-    changes = {}
-    if arguments.model is not None:
-        changes["model"] = arguments.model
-    if arguments.ids is not None:
-        changes["ids"] = arguments.ids
-    if not changes:
+    if arguments.model is None:
         return settings
     try:
-        servos = ServoSettings.model_validate({**settings.servos.model_dump(), **changes})
+        servos = ServoSettings.model_validate(
+            {**settings.servos.model_dump(), "model": arguments.model}
+        )
     except ValidationError as error:
-        first = error.errors()[0]
-        raise SettingsError(f"--ids, --model: {first['msg']}") from None
+        raise SettingsError(f"--model: {error.errors()[0]['msg']}") from None
     return settings.model_copy(update={"servos": servos})

@@ -7,8 +7,8 @@ import sys
 
 from daemon.checkup.ports import serial_ports
 from daemon.servos.base import ServoError
-from daemon.servos.mend import FoundServo, scan
 from daemon.servos.registers import BAUD_RATES
+from daemon.servos.scanning import ALONE, FoundServo, search
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,15 +42,17 @@ def run(arguments: argparse.Namespace) -> int:
     count = 0
     for path in paths:
         try:
-            found = scan(path, arguments.baud or BAUD_RATES, arguments.wait)
+            found = search(path, arguments.baud or BAUD_RATES, arguments.wait)
         except ServoError as error:
             print(f"scan: {error}", file=sys.stderr)
             continue
-        for servo in found:
+        for servo in found.servos:
             print(_line(path, servo), flush=True)
-        if not found:
+        for garbled in found.garbled:
+            print(f"{path}: {garbled}\n  → {ALONE}", flush=True)
+        if not found.servos and not found.garbled:
             print(f"{path}: no servo answers at any of these rates", flush=True)
-        count += len(found)
+        count += len(found.servos)
     return 0 if count else 1
 
 

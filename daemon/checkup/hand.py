@@ -10,12 +10,13 @@ from daemon.records import FINGERS
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
 from daemon.servos.checks import check_angle
-from daemon.servos.examine import Examined, examine
+from daemon.servos.examine import Examined, examine, servo_name
+from daemon.servos.identity import plan
 from daemon.servos.line import ServoLine
-from daemon.servos.mend import FoundServo, scan
 from daemon.servos.models import ServoModel, by_name
 from daemon.servos.packets import PacketHandler
 from daemon.servos.port import SerialPort
+from daemon.servos.scanning import ALONE, FoundServo, search
 from daemon.servos.units import JointScale
 from daemon.settings import Settings
 from daemon.tactile import make_sensor
@@ -48,7 +49,7 @@ def check_servos(
             port.closePort()
         results = [line for each in found for line in _judge(each, settings, model)]
         if not all(each.answers for each in found):
-            results += _search(settings, wait)
+            results += _search(settings, model, wait)
     except ServoError as error:
         return [Result("FAIL", "servos", str(error))]
     return results
@@ -96,14 +97,11 @@ def _result(status: Status, name: str, text: str) -> Result:
     return Result(status, name, what, mend.replace("`", ""))
 
 
-def _search(settings: Settings, wait: float) -> list[Result]:
-    """What answers on the port at any rate that the model has, told once for each servo."""
+def _search(settings: Settings, model: ServoModel, wait: float) -> list[Result]:
+    """What answers on the port at any rate that the model has, and what is to be done about it."""
     servos = settings.servos
-    found: dict[int, FoundServo] = {}
-    for servo in scan(servos.port, by_name(servos.model).baud_rates, wait):
-        if servo.id not in found or servo.baud == servos.baud:
-            found[servo.id] = servo
-    if not found:
+    found = search(servos.port, model.baud_rates, wait, {1, *servos.ids})
+    if not found.servos and not found.garbled:
         return [
             Result(
                 "FAIL",
@@ -112,17 +110,22 @@ def _search(settings: Settings, wait: float) -> list[Result]:
                 "check the bus's power and cable",
             )
         ]
-    wanted = [servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
-    lines = []
-    for servo in found.values():
-        if servo.baud == servos.baud and servo.id in wanted:
-            continue
-        what = f"ID {servo.id} at {servo.baud} baud: {servo.model}, firmware {servo.firmware}"
-        mend = (
-            f"set servos.baud = {servo.baud}" if servo.id in wanted else "set servos.ids as it is"
-        )
-        lines.append(Result("note", "found", what, mend))
+    what = plan(found, settings, model, model.baud_rates)
+    lines = [Result("FAIL", "servos", str(each), ALONE) for each in found.garbled]
+    for change in what.changes:
+        same = change.servo.id == change.id
+        other = f"servos.baud = {change.servo.baud}" if same else "servos.ids as it is"
+        name = servo_name(change.id, change.finger)
+        fix = f"softfinger doctor --fix makes it {name}: {change}; or set {other}"
+        lines.append(Result("note", "found", _told(change.servo), fix))
+    for each in what.strangers:
+        mend = ALONE if what.missing and each.number == model.number else ""
+        lines.append(Result("note", "found", _told(each), mend))
     return lines or [Result("note", "found", "no other servo answers at any rate")]
+
+
+def _told(servo: FoundServo) -> str:
+    return f"ID {servo.id} at {servo.baud} baud: {servo.model}, firmware {servo.firmware}"
 
 
 def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Result:

@@ -62,7 +62,8 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
         table = line.read(servo_id, 0, CHECKED)
         if table is None:
             why = (
-                f"{title}: answers a ping but no read (status return level 0, or a bad line): "
+                f"{title}: answers a ping but no read (status return level 0, two servos with "
+                f"this ID, or a bad line): "
                 f"{MEND}"
             )
             found.append(Examined(finger, servo_id, True, b"", Findings(errors=(why,))))

@@ -54,6 +54,17 @@ class ServoLine:
                 return None if error & 0x7F else bytes(data)
         return None
 
+    def tell(self, address: int, values: Mapping[int, bytes]) -> None:
+        """Write each servo's bytes, unanswered and unverified: for registers that change who it is.
+
+        All have the same length.
+        """
+        length = len(next(iter(values.values())))
+        group = GroupSyncWrite(self.port, self.handler, address, length)
+        for servo_id, data in values.items():
+            group.addParam(servo_id, data)
+        group.txPacket()
+
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
         """Write each servo's bytes and read them back; the IDs where that did not succeed.
 
@@ -62,10 +73,7 @@ class ServoLine:
         waiting = dict(values)
         for _ in range(TRIES):
             length = len(next(iter(waiting.values())))
-            group = GroupSyncWrite(self.port, self.handler, address, length)
-            for servo_id, data in waiting.items():
-                group.addParam(servo_id, data)
-            group.txPacket()
+            self.tell(address, waiting)
             for servo_id, data in list(waiting.items()):
                 if self.read(servo_id, address, length) == data:
                     del waiting[servo_id]

@@ -1,80 +1,37 @@
-"""Find servos on a port, and set up those of the settings as the backend needs them.
+"""Set the servos of the settings up as the backend needs them: ID, rate, mode, return delay.
 
 The one place that writes a servo's EEPROM, and only when it is asked to (`softfinger doctor
---fix`); the hand lets go meanwhile.
+--fix`); the hand lets go meanwhile. IDs and rates are written where there is no doubt which servo
+is meant (:mod:`daemon.servos.identity`).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
 
 from daemon.records import FINGERS
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
 from daemon.servos.checks import RETURN_DELAY_MAX
+from daemon.servos.examine import servo_name
+from daemon.servos.identity import Change, Plan, plan
 from daemon.servos.line import ServoLine
-from daemon.servos.models import by_name, by_number
+from daemon.servos.models import ServoModel, by_name
 from daemon.servos.modes import mode_number
 from daemon.servos.packets import PacketHandler
 from daemon.servos.port import SerialPort
+from daemon.servos.scanning import ALONE, PING_TIMEOUT, Found, search, talks_garbled
 from daemon.settings import Settings
 
 _REBOOT_LIMIT = 2.0  # s that a servo may take to answer again
-_PING_TIMEOUT = 0.02  # s, for factory-new servos with their return delay, behind slow adapters
-
-
-@dataclass(frozen=True, slots=True)
-class FoundServo:
-    """A servo that answered a scan."""
-
-    id: int
-    baud: int
-    number: int
-    firmware: int
-
-    @property
-    def model(self) -> str:
-        """The model's name, or its number where the table lacks it."""
-        known = by_number(self.number)
-        return known.name if known else f"model number {self.number}"
-
-
-def scan(path: str, bauds: Iterable[int] = reg.BAUD_RATES, wait: float = 0.8) -> list[FoundServo]:
-    """Every servo on the port, at each of the rates; ``wait`` s for each rate.
-
-    Rates that the adapter has not are passed over.
-
-    Raises:
-        ServoError: the port can't be opened at any of them.
-    """
-    found: list[FoundServo] = []
-    handler = PacketHandler()
-    opened, refusal = False, None
-    for baud in bauds:
-        port = SerialPort(path, baud, _PING_TIMEOUT)
-        try:
-            port.openPort()
-        except ServoError as error:
-            refusal = refusal or error
-            continue
-        opened = True
-        try:
-            for servo_id, (number, firmware) in ServoLine(port, handler).ping_all(wait).items():
-                found.append(FoundServo(servo_id, baud, number, firmware))
-        finally:
-            port.closePort()
-    if refusal is not None and not opened:
-        raise refusal
-    return found
+_WRITTEN = 0.05  # s in which a packet has left an adapter and is in a servo's EEPROM
+_SEARCH = 0.8  # s that each rate is listened to
 
 
 def mend(settings: Settings) -> list[str]:
-    """Set each servo of the scene up: mode, no return delay, status return level 2, no errors.
+    """Set each servo of the scene up: ID, rate, mode, no return delay, reads answered, no errors.
 
-    Returns one line for each thing that was done; none when all was well already. IDs and rates
-    are left alone.
+    Returns one line for each thing that was done; none when all was well already.
 
     Raises:
         ServoError: the port can't be opened, or a servo that is missing, of another model, or
@@ -85,20 +42,25 @@ def mend(settings: Settings) -> list[str]:
         model = by_name(servos.model)
     except KeyError as error:
         raise ServoError(f"servos.model: {error.args[0]}") from None
-    port = SerialPort(servos.port, servos.baud, _PING_TIMEOUT)
-    port.openPort()
     done: list[str] = []
     problems: list[str] = []
+    if not _all_at_home(settings):
+        _settle_identities(settings, model, done, problems)
+    port = SerialPort(servos.port, servos.baud, PING_TIMEOUT)
+    port.openPort()
     try:
         line = ServoLine(port, PacketHandler())
         for name in settings.scene.fingers:
             servo_id = servos.ids[FINGERS.index(name)]
-            title = f"servo {servo_id} ({name})"
+            title = servo_name(servo_id, FINGERS.index(name))
             number = line.ping(servo_id)
             if number is None:
-                problems.append(f"{title}: no answer at {port.baudrate} baud")
+                if not any(text.startswith(title) for text in problems):
+                    problems.append(f"{title}: no answer at {port.baudrate} baud")
             elif number != model.number:
                 problems.append(f"{title}: is not an {model.name}: set servos.model")
+            elif talks_garbled(line, servo_id):
+                problems.append(f"{title}: its replies come damaged: {ALONE}")
             else:
                 mode = mode_number(servos)
                 wanted = mode if mode in model.modes else None
@@ -108,6 +70,87 @@ def mend(settings: Settings) -> list[str]:
     if problems:
         raise ServoError("\n".join(problems + [f"(done: {text})" for text in done]))
     return done
+
+
+def _all_at_home(settings: Settings) -> bool:
+    """Whether every servo of the scene answers under its ID at the settings' rate."""
+    servos = settings.servos
+    port = SerialPort(servos.port, servos.baud, PING_TIMEOUT)
+    port.openPort()
+    try:
+        line = ServoLine(port, PacketHandler())
+        ids = [servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
+        return all(line.ping(servo_id) is not None for servo_id in ids)
+    finally:
+        port.closePort()
+
+
+# --- ID and rate ---------------------------------------------------------------------------------
+
+
+def _settle_identities(
+    settings: Settings, model: ServoModel, done: list[str], problems: list[str]
+) -> None:
+    servos = settings.servos
+    found = search(servos.port, model.baud_rates, _SEARCH, {1, *servos.ids})
+    what = plan(found, settings, model, model.baud_rates)
+    for change in what.changes:
+        title = servo_name(change.id, change.finger)
+        problem = _identify(servos.port, change, model, title, done)
+        if problem:
+            problems.append(f"{title}: {problem}")
+        else:
+            done.append(f"{title}: {change}")
+    problems += why_missing(settings, found, what)
+
+
+def why_missing(settings: Settings, found: Found, what: Plan) -> list[str]:
+    """What keeps servos that are still missing from being known, one line each."""
+    lines = [f"{each}: {ALONE}" for each in found.garbled]
+    if lines or not what.missing:
+        return lines
+    names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
+    fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
+    if not fit:
+        return [f"{name}: no answer at any rate: check its power and cable" for name in names]
+    return [f"{name}: which one is it of {fit}? {ALONE}" for name in names]
+
+
+def _identify(path: str, change: Change, model: ServoModel, title: str, done: list[str]) -> str:
+    """Give a servo its ID and rate; what stands against it, empty when it was done."""
+    if change.baud not in model.baud_rates:
+        return f"an {model.name} has no {change.baud} baud: set servos.baud"
+    old, new = change.servo.id, change.id
+    port = SerialPort(path, change.servo.baud, PING_TIMEOUT)
+    port.openPort()
+    try:
+        line = ServoLine(port, PacketHandler())
+        if line.store(reg.STATUS_RETURN_LEVEL, {old: b"\x02"}):
+            return "answers a ping but no read"
+        if new != old and line.ping(new) is not None:
+            return f"ID {new} at {port.baudrate} baud is taken by another servo"
+        torque = line.read(old, reg.TORQUE_ENABLE, 1)
+        if torque != b"\x00":
+            if line.store(reg.TORQUE_ENABLE, {old: b"\x00"}):
+                return "torque could not be switched off"
+            done.append(f"{title}: torque off, since EEPROM is locked while it is on")
+        if new != old:
+            line.tell(reg.ID, {old: bytes((new,))})
+            if line.ping(new) != model.number:
+                return f"ID {old} could not be set to {new}"
+        if change.baud != port.baudrate:
+            index = model.baud_rates.index(change.baud)
+            line.tell(reg.BAUD_RATE, {new: bytes((index,))})
+            time.sleep(_WRITTEN)
+            port.setBaudRate(change.baud)
+            if line.ping(new) != model.number:
+                return f"no answer after its rate was set to {change.baud} baud"
+    finally:
+        port.closePort()
+    return ""
+
+
+# --- all else ------------------------------------------------------------------------------------
 
 
 def _mend_one(

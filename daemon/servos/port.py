@@ -23,6 +23,7 @@ from daemon.servos.base import ServoError
 
 _BITS_PER_BYTE = 10
 _READ_SIZE = 4096
+_SYSFS = Path("/sys/class/tty")
 
 
 class PortGone(ServoError):
@@ -92,10 +93,9 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         """The USB adapter's latency timer [s], 0 where there is none."""
         name = Path(os.path.realpath(self.port_name)).name
         try:
-            text = Path(f"/sys/class/tty/{name}/device/latency_timer").read_text()
-        except OSError:
+            return int((_SYSFS / name / "device" / "latency_timer").read_text()) / 1000.0
+        except (OSError, ValueError):
             return 0.0
-        return int(text) / 1000.0
 
     # --- bytes -------------------------------------------------------------------------------
 

@@ -92,6 +92,7 @@ class Emulator:
         baud: int = 0,
         latency: float = 0.0,
         prepared: bool = True,
+        ids: tuple[int, ...] | None = None,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
         undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
@@ -100,9 +101,10 @@ class Emulator:
 
         ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
         with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
-        rate. ``faults``: see :class:`Faults`.
-        ``table_cache``: a folder where the contact table is kept. ``undisturbed``: what keeps
-        exceptions of signal handlers out while something is made that is to be taken away.
+        rate. ``ids``: others than the settings', even one for both. ``faults``: see
+        :class:`Faults`. ``table_cache``: a folder where the contact table is kept.
+        ``undisturbed``: what keeps exceptions of signal handlers out while something is made that
+        is to be taken away.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
@@ -112,7 +114,7 @@ class Emulator:
         self._undisturbed = undisturbed
         self._watched: list[int | TactileBoard | socket.socket] | None = None
         try:
-            self._ids = settings.servos.ids
+            self._ids = settings.servos.ids if ids is None else ids
             self._events = Faults(faults, self._ids).events
             with undisturbed():
                 self._take(folder)
@@ -127,7 +129,7 @@ class Emulator:
     def _take(self, folder: Path) -> None:
         self._links = LinkFolder(folder)
         self._closers.append(self._links.close)
-        self._control = ControlPort(folder, self.tell)
+        self._control = ControlPort(folder, self._told)
         self._closers.append(self._control.close)
 
     def _build(
@@ -171,7 +173,9 @@ class Emulator:
     ) -> PtyServoBus:
         baud, latency = pace
         try:
-            bus = ServoBus.from_settings(settings, self.hand, baud=baud, prepared=prepared)
+            bus = ServoBus.from_settings(
+                settings, self.hand, ids=self._ids, baud=baud, prepared=prepared
+            )
         except KeyError as error:
             raise EmulatorError(f"servos.model: {error.args[0]}") from None
         except ValueError as error:
@@ -268,7 +272,13 @@ class Emulator:
             self._servos.bus.forget(now)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
-        self._advance(now)  # what starts now does so before the reply
+        self._advance_due = now  # so that what starts now does
+        return reply
+
+    def _told(self, text: str) -> str:
+        """:meth:`tell`, with what starts now in force before the reply goes out."""
+        reply = self.tell(text)
+        self._advance(self.clock.now())
         return reply
 
     def report(self, t: float) -> dict[str, Any]:
@@ -277,7 +287,7 @@ class Emulator:
         ``monotonic`` is time.monotonic() at ``t``, for whoever compares with a time of his own.
         """
         bus = self._servos.bus if self._servos is not None else None
-        servos = bus.report(t) if bus is not None else {}
+        servos = bus.report(t) if bus is not None else []
         return {"t": t, "monotonic": time.monotonic(), "servos": servos}
 
     def _apply(self, event: Event, t: float) -> None:

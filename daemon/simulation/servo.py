@@ -287,6 +287,7 @@ class EmulatedServo:
         """Its state, and what it was told since the record began."""
         ticks = self.table.memory[reg.BUS_WATCHDOG]
         return {
+            "id": self.id,
             "torque": self.torque_on,
             "mode": self.mode,
             "hardware_error": self.table.memory[reg.HARDWARE_ERROR_STATUS],

@@ -8,6 +8,7 @@ it has heard the one named before it; so where one is missing, those after it st
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from daemon.simulation.bus_faults import (
     FaultSource,
     parse_fault,
 )
+from daemon.simulation.collision import collide
 from daemon.simulation.joint_plant import JointPlant
 from daemon.simulation.protocol import BROADCAST, Packet, Parser
 from daemon.simulation.servo import EmulatedServo
@@ -69,6 +71,7 @@ class ServoBus:
         self.parser = Parser(gap)
         self.packets = 0
         self._crc_reply = crc_reply
+        self._jitter = random.Random(seed)
         self._now = -math.inf
         self._due = -math.inf  # no servo does anything by itself before then
         self._unicast: dict[int, Callable[[EmulatedServo, bytes, float], tuple[int, bytes]]] = {
@@ -214,10 +217,10 @@ class ServoBus:
         else:
             servo.silent = kind == "silent"
 
-    def report(self, t: float) -> dict[str, dict[str, Any]]:
-        """Each servo's state, and what it was told since the record began, by its ID."""
+    def report(self, t: float) -> list[dict[str, Any]]:
+        """Each servo's state, and what it was told since the record began."""
         self.advance(t)
-        return {str(servo.id): servo.report(t) for servo in self.servos}
+        return [servo.report(t) for servo in self.servos]
 
     def forget(self, t: float) -> None:
         """Begin the record anew."""
@@ -249,13 +252,17 @@ class ServoBus:
                     replies.append(Reply(delay, status))
             elif servo.shadow_id == packet.id and instruction != protocol.PING:
                 handler(servo, packet.parameters, t)
-        return replies
+        return self._at_once(replies, servos)
 
     def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[Reply]:
         instruction, data = packet.instruction, packet.parameters
         if instruction == protocol.PING:
-            ordered = sorted(servos, key=lambda servo: servo.id)
-            return [self._status(servo, *self._ping(servo, data, t)) for servo in ordered]
+            replies = []
+            for servo_id in sorted({servo.id for servo in servos}):
+                same = [servo for servo in servos if servo.id == servo_id]
+                answers = [self._status(servo, *self._ping(servo, data, t)) for servo in same]
+                replies += self._at_once(answers, same)
+            return replies
         if instruction in (protocol.SYNC_READ, protocol.FAST_SYNC_READ):
             if len(data) < 5:
                 return []
@@ -288,6 +295,8 @@ class ServoBus:
         fast: bool,
     ) -> list[Reply]:
         by_id = {servo.id: servo for servo in servos}
+        if len(by_id) < len(servos):
+            return self._shared_read(wanted, servos, t)
         if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
             return []  # an ID may stand in the list once only
         replies: list[Reply] = []
@@ -316,6 +325,29 @@ class ServoBus:
             return replies
         # The blocks follow each other as one packet; the delays before them add up.
         return [Reply(delay, block + piece)]
+
+    def _shared_read(
+        self, wanted: list[tuple[int, int, int]], servos: list[EmulatedServo], t: float
+    ) -> list[Reply]:
+        """A group read where several servos have one ID: they talk at once, fast read or not."""
+        replies: list[Reply] = []
+        for servo_id, address, length in wanted:
+            same = [servo for servo in servos if servo.id == servo_id]
+            if not same:
+                break
+            answers = [
+                self._status(servo, protocol.OK, servo.read(address, length, t) or b"")
+                for servo in same
+            ]
+            replies += self._at_once(answers, same)
+        return replies
+
+    def _at_once(self, replies: list[Reply], servos: list[EmulatedServo]) -> list[Reply]:
+        """Replies of servos that share an ID come as one, garbled."""
+        if len(replies) < 2:
+            return replies
+        data = collide([reply.data for reply in replies], servos[0].baud, self._jitter)
+        return [Reply(min(reply.delay for reply in replies), data)]
 
     def _sync_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
         if len(data) < 4:
