@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tools.figure_pages.sheets import Page
 
-NAMES = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig10")
+NAMES = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig7_run", "fig10", "fig10_run")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,9 +29,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, Page]:
     """All figures by name."""
-    from tools.figure_pages import experiment_pages, material_page, model_pages
+    from tools.figure_pages import experiment_pages, material_page, model_pages, run_pages
 
-    found = {"fig3": material_page.PAGE, **model_pages.PAGES, **experiment_pages.PAGES}
+    found = {
+        "fig3": material_page.PAGE,
+        **model_pages.PAGES,
+        **experiment_pages.PAGES,
+        **run_pages.PAGES,
+    }
     return {name: found[name] for name in NAMES}
 
 
