@@ -153,6 +153,7 @@ class Realtime(Section):
     """
 
     priority: Annotated[int, Field(ge=0, le=80)] = 0  # of SCHED_FIFO; 0: the usual scheduling
+    slice: Annotated[float, Field(ge=0, le=0.1)] = 1e-4  # s; short ones run sooner; 0: the system's
     cpus: tuple[Annotated[int, Field(ge=0, le=1023)], ...] = ()  # the loop's; none named: all
     lock_memory: bool = True  # nothing of the process is swapped out
     hold_latency: bool = True  # processors stay out of idle states that take long to leave

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -12,7 +14,7 @@ from typing import Any
 import pytest
 
 from daemon.clock import RealClock
-from daemon.realtime import RealTime
+from daemon.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
 from daemon.settings import Settings
 
 # What the system says of a process that asked for everything: before, during and after.
@@ -119,11 +121,37 @@ def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it() -> None:
 
 
 def test_what_is_not_wanted_is_not_asked_for() -> None:
-    nothing = {"lock_memory": False, "hold_latency": False, "timer_slack": 0.0, "spin": 0.0}
+    nothing = {
+        "lock_memory": False,
+        "hold_latency": False,
+        "timer_slack": 0.0,
+        "spin": 0.0,
+        "slice": 0.0,
+    }
     settings = Settings.model_validate({"realtime": {**nothing, "freeze_collector": False}})
     with RealTime(settings) as measures:
         assert measures.outcomes == []
         assert measures.events() == []
+
+
+def test_a_short_slice_is_had_where_the_kernel_knows_it_and_given_back() -> None:
+    calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
+    if calls is None or not _set_slice(calls, 0, 3_000_000):
+        pytest.skip("this kernel takes no slices")
+    _set_slice(calls, 0, 0)
+    with RealTime(Settings.model_validate({"realtime": {"slice": 2e-4}})) as measures:
+        assert "slices of 0.2 ms" in measures.events()[0][2]
+        assert _slice(calls[1]) == 200_000
+    assert _slice(calls[1]) not in (0, 200_000)
+    with RealTime(Settings.model_validate({"realtime": {"slice": 1e-6}})) as measures:
+        assert "slices of 0.1 ms" in measures.events()[0][2]
+
+
+def _slice(get_call: int) -> int:
+    """What the kernel says of this thread's slices [ns]."""
+    told = ctypes.create_string_buffer(48)
+    assert ctypes.CDLL(None).syscall(get_call, 0, told, 48, 0) == 0
+    return int(struct.unpack("=IIQiIQQQ", told.raw)[5])
 
 
 def test_virtual_time_waits_for_nothing_and_asks_for_nothing() -> None:
