@@ -36,10 +36,12 @@ _LATE = 0.05  # s after its deadline from which a late tick is told
 class Commands(Protocol):
     """Where commands come from: `daemon.commands.CommandServer`, or a recording."""
 
-    def serve(self, handler: Handler) -> bool:
+    refused_by_pace: int
+
+    def serve(self, handler: Handler, now: float) -> bool:
         """Carry out through ``handler`` what is due at this tick; False when nothing was."""
 
-    def drain(self, handler: Handler) -> None:
+    def drain(self, handler: Handler, now: float) -> None:
         """Answer all that has waited since before the first tick."""
 
 

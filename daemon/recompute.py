@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.commands import Refused
+from daemon.commands import Handler, Refused
 from daemon.loop import Loop
 from daemon.model import make_models
 from daemon.perception import FingerPerception
@@ -181,10 +181,12 @@ class _Sensor:
 class _Commands:
     """The commands of a tick, in the place of the command server."""
 
+    refused_by_pace = 0
+
     def __init__(self) -> None:
         self.waiting: list[dict[str, Any]] = []
 
-    def serve(self, handler: Any) -> bool:
+    def serve(self, handler: Handler, now: float) -> bool:
         for request in self.waiting:
             try:
                 handler(request)
@@ -193,7 +195,7 @@ class _Commands:
         self.waiting = []
         return True
 
-    def drain(self, handler: Any) -> None:
+    def drain(self, handler: Handler, now: float) -> None:
         pass
 
     def close(self) -> None:

@@ -33,12 +33,14 @@ Messages = list[tuple[bytes, dict[str, Any]]]
 class Script:
     """Commands at their ticks, in the place of the command server."""
 
+    refused_by_pace = 0
+
     def __init__(self, due: dict[int, dict[str, Any]]) -> None:
         self._due = due
         self._tick = 0
         self.refused = 0
 
-    def serve(self, handler: Handler) -> bool:
+    def serve(self, handler: Handler, now: float) -> bool:
         self._tick += 1
         request = self._due.get(self._tick)
         if request is not None:
@@ -48,7 +50,7 @@ class Script:
                 self.refused += 1
         return request is not None
 
-    def drain(self, handler: Handler) -> None:
+    def drain(self, handler: Handler, now: float) -> None:
         pass
 
 

@@ -167,13 +167,14 @@ class _Recorder:
         arguments = self._arguments
         stamp = message.get("timestamp")
         when = stamp if isinstance(stamp, float) else time.time()
-        if self._first is None:
-            self._first = when
-        if when - self._first < arguments.start:
-            return
-        if arguments.end is not None and when - self._first > arguments.end:
-            self._ending.asked = True
-            return
+        if message.get("again") is not True:  # what is told again is from before the first one
+            if self._first is None:
+                self._first = when
+            if arguments.start and when - self._first < arguments.start:
+                return
+            if arguments.end is not None and when - self._first > arguments.end:
+                self._ending.asked = True
+                return
         gaps = self._gaps.get(topic)
         if gaps is None:
             gaps = self._gaps[topic] = self._new_gaps()

@@ -14,6 +14,7 @@ SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 _IMAGE = "foxglove.RawImage"
+_TACTILE = tuple(field.name for field in contract.TOPICS[messages.TACTILE])  # in their order
 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -106,6 +107,7 @@ class _Restored:
                 message.pop(name, None)
             message["timestamp"] = message.pop("unix", math.nan)
             message["data"] = base64.b64decode(message.get("data") or "")
+            message = {name: message[name] for name in _TACTILE if name in message} | message
         for path in self._floats:
             place: Any = message
             for part in path[:-1]:

@@ -39,6 +39,7 @@ class Recording:
         self.end = math.nan
         self.chunks = 0
         self.attachments: dict[str, bytes] = {}
+        self._first = 0  # log time of the earliest message [ns]
         self._names: dict[int, str] = {}  # channel's number → its name
         try:
             self.size = path.stat().st_size
@@ -84,9 +85,8 @@ class Recording:
         from mcap.stream_reader import breakup_chunk
 
         loads = orjson.loads
-        first = 0.0 if math.isnan(self.start) else self.start
-        begin = _nanoseconds(first + start, 0)
-        finish = _nanoseconds(first + end, 2**63)
+        begin = self._first + int(start * 1e9) if math.isfinite(start) else 0
+        finish = self._first + int(end * 1e9) if math.isfinite(end) else 2**63
         wanted: dict[int, tuple[bytes, Converter]] = {}
         for number, name in self._names.items():
             topic = topic_of(name)
@@ -175,7 +175,8 @@ class Recording:
                 self.counts[channel.topic] = statistics.channel_message_counts.get(number, 0)
         self.chunks = statistics.chunk_count
         if statistics.message_count:
-            self.start = statistics.message_start_time * 1e-9
+            self._first = statistics.message_start_time
+            self.start = self._first * 1e-9
             self.end = statistics.message_end_time * 1e-9
 
     def _scan(self) -> None:
@@ -199,8 +200,5 @@ class Recording:
                 elif isinstance(record, Channel) and record.message_encoding == ENCODING:
                     names[record.id] = record.topic
         if end:
+            self._first = start
             self.start, self.end = start * 1e-9, end * 1e-9
-
-
-def _nanoseconds(seconds: float, otherwise: int) -> int:
-    return int(seconds * 1e9) if math.isfinite(seconds) else otherwise
