@@ -167,7 +167,10 @@ def object_from_contacts(
     """The object's angle φ̂ [rad] and width W [m] from both contacts, and their disagreement [rad].
 
     φ̂ = (θ1 + θ2 − q1 + q2)/2, W = d1 + d2 − 2a + (O2 − O1)·n(φ̂). The disagreement is
-    θ1 − θ2 − q1 − q2, zero when joints and sensors agree.
+    θ1 − θ2 − q1 − q2, zero when joints and sensors agree and the faces are parallel. Faces that
+    lean towards each other by an angle α (narrower away from the palm) make it −α; φ̂ is then that
+    of their bisector, and W, between the points of contact, is off by (2a − d1 − d2)(1 − cos α/2).
+    Of a disc φ̂ is the direction of the line between the contacts, not how it is turned.
     """
     angle = 0.5 * (theta1 + theta2 - q1 + q2)
     x1, y1 = tip_position(q1, 1.0, half_separation, length, offset)
@@ -187,12 +190,17 @@ class ContactVariables:
 
 @dataclass(frozen=True)
 class HandGeometry:
-    """Lengths of the hand [m]: pivots 2B apart, finger length L, offset e, tip radius a."""
+    """Lengths of the hand [m]: pivots 2B apart, finger length L, offset e, tip radius a.
+
+    ``q_min`` and ``q_max`` are the joints' limits [rad], left first; unlimited when not given.
+    """
 
     pivot_separation: float = 0.100
     finger_length: float = 0.080
     finger_offset: float = 0.0
     tip_radius: float = 0.020
+    q_min: tuple[float, float] = (-math.inf, -math.inf)
+    q_max: tuple[float, float] = (math.inf, math.inf)
 
     def __post_init__(self) -> None:
         for name in ("pivot_separation", "finger_length", "tip_radius"):
@@ -201,6 +209,9 @@ class HandGeometry:
                 raise ValueError(f"{name} must be a positive length, not {value!r}")
         if not math.isfinite(self.finger_offset):
             raise ValueError(f"finger_offset must be finite, not {self.finger_offset!r}")
+        for low, high in zip(self.q_min, self.q_max, strict=True):
+            if not low < high:
+                raise ValueError(f"q_min must be below q_max, not {low!r} and {high!r}")
 
     @property
     def half_separation(self) -> float:
@@ -211,6 +222,11 @@ class HandGeometry:
     def reach(self) -> float:
         """Distance from a pivot to its tip's centre, √(L² + e²) [m]."""
         return math.hypot(self.finger_length, self.finger_offset)
+
+    def within_limits(self, q: ArrayLike) -> bool:
+        """Whether both joint angles ``q`` (2,) are within their limits."""
+        angles = _vector(q, 2, "q")
+        return bool(np.all(angles >= self.q_min) and np.all(angles <= self.q_max))
 
     def tips(self, q: ArrayLike) -> FloatArray:
         """Tip centres [[x1, y1], [x2, y2]] [m] at joint angles ``q`` (2,) [rad]."""
@@ -251,18 +267,24 @@ class HandGeometry:
         """Joint angles (2,) that press ``d`` (2,) [m] into an object of ``width`` at ``pose``.
 
         Closed form: O1·n = −B cos φ + L sin θ1 + e cos θ1 and its mirror image. A negative ``d`` is
-        a gap. Raises ValueError when a finger can't reach that far.
+        a gap. Raises ValueError when a finger can't reach that far, or only past its limits.
         """
         x, y, angle = _vector(pose, 3, "pose")
         d1, d2 = _vector(d, 2, "d")
         along = x * math.cos(angle) + y * math.sin(angle)
         face = self.half_separation * math.cos(angle) - self.tip_radius - 0.5 * width
-        return np.array(
+        q = np.array(
             [
                 self._angle_for(d1 + face + along) - angle,
                 self._angle_for(d2 + face - along) + angle,
             ]
         )
+        if not self.within_limits(q):
+            raise ValueError(
+                f"out of reach: the joints would have to be at {q[0]:.3f} and {q[1]:.3f} rad, "
+                f"past their limits"
+            )
+        return q
 
     def object_from_contacts(
         self, q: ArrayLike, d: ArrayLike, theta: ArrayLike

@@ -21,12 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinematics.fingers import HandGeometry, contact_jacobian, contact_variables, rolling_rows
 from kinematics.kernels import kernel
+from kinematics.material import Material
 from kinematics.table import ContactTable, lookup
 
 FloatArray = NDArray[np.float64]
 
 _TOLERANCE = 1e-12  # of the contact forces, for balance
 _ITERATIONS = 60
+_MOMENT_NODES = 48  # exponential convergence: 1e-10 and better up to d = 0.9 a
 
 
 class GraspError(ValueError):
@@ -203,6 +205,8 @@ class Grasp:
         x = state.coordinates
         if q is not None:
             x[:2] = q
+            if not self.hand.within_limits(x[:2]):
+                raise GraspError("the joints' limits are passed")
         energy, gradient, shear, sound = self._evaluate(x, state)
         for _ in range(_ITERATIONS):
             self._check(sound)
@@ -256,10 +260,20 @@ class Grasp:
         """
         return self._hessian(state.coordinates, state)
 
-    def slip_margin(self, state: GraspState, friction: float) -> FloatArray:
-        """1 − |T|/(μN) of both contacts (2,); 0 or less slips. No moment acts about the normal."""
+    def slip_margin(
+        self,
+        state: GraspState,
+        friction: float,
+        moment: ArrayLike = 0.0,
+        largest_moment: ArrayLike = math.inf,
+    ) -> FloatArray:
+        """Distance of both contacts (2,) to the limit surface; 0 or less slips.
+
+        ``moment`` [N·m] about each face's normal is what acts out of the hand's plane, such as a
+        weight beside the tips; ``largest_moment`` is :func:`moment_limit`.
+        """
         forces = self.forces(state)
-        return slip_margin(forces.tangential, 0.0, forces.normal, friction, math.inf)
+        return slip_margin(forces.tangential, moment, forces.normal, friction, largest_moment)
 
     def _evaluate(
         self, coordinates: FloatArray, start: GraspState
@@ -311,16 +325,27 @@ def slip_margin(
     return np.asarray(1.0 - np.hypot(load, spin), dtype=np.float64)
 
 
-def moment_limit(d: ArrayLike, radius: float, modulus: float, friction: float) -> FloatArray:
-    """Largest friction moment [N·m] about the normal of an upright contact of constant modulus.
+def moment_limit(
+    d: ArrayLike, radius: float, material: Material | float, friction: float
+) -> FloatArray:
+    """Largest friction moment [N·m] about the normal of an upright contact of ``d`` [m].
 
-    M_max = 2πμE[ρ³/3 − h((a²/2) asin(ρ/a) − ρh/2)] with h = a − d, ρ² = 2ad − d².
+    2πμ ∫ σ(ε(r)) r² dr over the footprint, ε = 1 − h/√(a² − r²), for a ``material``. For a constant
+    modulus [Pa], given as a number, it is 2πμE[ρ³/3 − h((a²/2) asin(ρ/a) − ρh/2)] with h = a − d,
+    ρ² = 2ad − d².
     """
     depth = np.asarray(d, dtype=np.float64)
     h = radius - depth
     rho = np.sqrt(2.0 * radius * depth - depth * depth)
-    disc = 0.5 * radius * radius * np.arcsin(rho / radius) - 0.5 * rho * h
-    return np.asarray(2.0 * math.pi * friction * modulus * (rho**3 / 3.0 - h * disc))
+    if not isinstance(material, Material):
+        disc = 0.5 * radius * radius * np.arcsin(rho / radius) - 0.5 * rho * h
+        return np.asarray(2.0 * math.pi * friction * material * (rho**3 / 3.0 - h * disc))
+    nodes, weights = np.polynomial.legendre.leggauss(_MOMENT_NODES)
+    angle = 0.25 * math.pi * (nodes + 1.0)
+    r = rho[..., None] * np.sin(angle)
+    strain = 1.0 - h[..., None] / np.sqrt(radius * radius - r * r)
+    integral = material.stress(strain) * r * r * rho[..., None] * np.cos(angle)
+    return np.asarray(0.5 * math.pi**2 * friction * (integral @ weights))
 
 
 def _positive(hessian: FloatArray, gradient: FloatArray) -> FloatArray:

@@ -184,6 +184,43 @@ def test_moment_limit_and_limit_surface():
     assert slip_margin(3.0, 0.0, 5.0, 0.5, 0.1) < 0
 
 
+def test_moment_limit_of_any_material():
+    depths = np.array([0.0005, 0.002, 0.008, 0.016])
+    closed = moment_limit(depths, 0.020, MODULUS, 0.6)
+    by_material = moment_limit(depths, 0.020, Material.constant(MODULUS), 0.6)
+    np.testing.assert_allclose(by_material, closed, rtol=1e-9)
+    # Table I by a sum over a polar grid of the footprint.
+    material, d, cells = Material.table_i(), 0.006, 200_000
+    rho = math.sqrt(2 * 0.020 * d - d * d)
+    r = (np.arange(cells) + 0.5) * rho / cells
+    stress = material.stress(1 - (0.020 - d) / np.sqrt(0.020**2 - r * r))
+    expected = 0.6 * (stress * r * 2 * math.pi * r).sum() * rho / cells
+    assert moment_limit(d, 0.020, material, 0.6) == pytest.approx(expected, rel=1e-8)
+
+
+def test_a_moment_out_of_the_plane_takes_from_the_slip_margin(table):
+    grasp = Grasp(HandGeometry(), table, WIDTH)
+    state = grasp.steer(grasp.symmetric(0.004), 0.1)
+    forces = grasp.forces(state)
+    load = forces.tangential / (0.6 * forces.normal)
+    np.testing.assert_allclose(grasp.slip_margin(state, 0.6), 1 - np.abs(load))
+    margin = grasp.slip_margin(state, 0.6, moment=0.02, largest_moment=0.05)
+    np.testing.assert_allclose(margin, 1 - np.hypot(load, 0.4))
+
+
+def test_joint_limits_are_kept(paper):
+    hand = HandGeometry(q_min=(-0.5, -0.5), q_max=(0.18, 0.5))
+    assert hand.within_limits((0.1, 0.4))
+    assert not hand.within_limits((0.2, 0.1))
+    grasp = Grasp(hand, paper, WIDTH)
+    with pytest.raises(ValueError, match="past their limits"):
+        grasp.symmetric(0.006)
+    with pytest.raises(GraspError, match="limits"):
+        grasp.steer(grasp.symmetric(0.003), 0.05)
+    with pytest.raises(ValueError, match="q_min"):
+        HandGeometry(q_min=(0.0, 1.0), q_max=(1.0, 1.0))
+
+
 def test_impossible_grasps_are_refused(paper):
     grasp = Grasp(HandGeometry(), paper, WIDTH)
     with pytest.raises(GraspError, match="open"):

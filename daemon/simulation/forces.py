@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from daemon.simulation import layout
 from daemon.simulation.coupled import clear_extra
 from daemon.simulation.mutual import evaluate_mutual, mutual_rows, tips_are_far
@@ -98,13 +100,13 @@ def touch_palm(
     shears: int,
     nx: float,
     ny: float,
-    stage: int,
+    stage: np.int64,
 ) -> None:
     """Add the palm's forces where the object may meet it."""
     if palm_is_far(memory, position, velocity):
         for corner in range(4):
-            memory[layout.EXTRA_RATE + 6 * stage + corner] = 0.0
-        if stage == 0 and memory[layout.PALM_ENERGY] != 0.0:
+            memory[layout.EXTRA_RATE + 6 * int(stage) + corner] = 0.0
+        if stage == layout.FIRST_STAGE and memory[layout.PALM_ENERGY] != 0.0:
             memory[layout.PALM_ENERGY] = 0.0
             for corner in range(4):
                 memory[shears + corner] = 0.0
@@ -119,16 +121,16 @@ def touch_each_other(
     position: int,
     velocity: int,
     shears: int,
-    stage: int,
+    stage: np.int64,
 ) -> None:
     """Add the tips' torques on each other where they may meet; without an object always."""
-    row = layout.MUTUAL + 2 * stage * layout.TIP_ROW
+    row = layout.MUTUAL + 2 * int(stage) * layout.TIP_ROW
     near = not tips_are_far(memory) or memory[layout.SHAPE] == layout.NO_OBJECT
     touching = near and evaluate_mutual(memory, data, row, position, velocity, shears + 4)
     for finger in range(2):
         rate = memory[row + finger * layout.TIP_ROW + layout.SHEAR_RATE] if touching else 0.0
-        memory[layout.EXTRA_RATE + 6 * stage + 4 + finger] = rate
-    if stage == 0:
+        memory[layout.EXTRA_RATE + 6 * int(stage) + 4 + finger] = rate
+    if stage == layout.FIRST_STAGE:
         if memory[layout.MUTUAL_NEAR] != 0.0 and not near:
             for finger in range(2):
                 clear_row(memory, layout.MUTUAL + finger * layout.TIP_ROW)
@@ -150,11 +152,11 @@ def evaluate_hand(
     position: int,
     velocity: int,
     shears: int,
-    stage: int,
+    stage: np.int64,
     shear1: float,
     shear2: float,
 ) -> None:
-    """Evaluate all contacts into the rows of ``stage`` 0 or 1, and all forces but the motors'.
+    """Evaluate all contacts into the rows of a ``stage``, and all forces but the motors'.
 
     ``position`` and ``velocity`` are where the five coordinates and their rates stand, ``shears``
     where those of palm and mutual contact do; ``shear1`` and ``shear2`` are the tips' on the
@@ -179,7 +181,7 @@ def evaluate_hand(
     memory[layout.DRAG + 3] = drag
     memory[layout.DRAG + 4] = spin_drag
     with_object = memory[layout.SHAPE] != layout.NO_OBJECT
-    if stage == 0:
+    if stage == layout.FIRST_STAGE:
         memory[layout.COUPLED] = 0.0
     if with_object:
         touch_palm(memory, position, velocity, shears, nx, ny, stage)
@@ -211,7 +213,7 @@ def evaluate_hand(
             memory[place + 2] = side * ahead
             memory[place + 3] = -inward
             if with_object:
-                out = layout.TIP + (2 * stage + finger) * layout.TIP_ROW
+                out = layout.TIP + int(2 * stage + finger) * layout.TIP_ROW
                 evaluate_tip(
                     memory,
                     data,

@@ -6,6 +6,8 @@ another costs time. It holds state, parameters, goals and scratch, in this order
 
 from __future__ import annotations
 
+import numpy as np
+
 # State.
 POSITION = 0  # q1, q2, x, y, φ
 VELOCITY = 5
@@ -167,6 +169,10 @@ SAMPLE_THETA = 4
 SAMPLE_GAIN = 6
 SAMPLE_BEND = 8
 SAMPLE = 10
+
+# A step's two evaluations. As numbers of NumPy's they don't make Numba compile a version for each.
+FIRST_STAGE = np.int64(0)
+SECOND_STAGE = np.int64(1)
 
 # Shapes of the object.
 NO_OBJECT = 0

@@ -8,6 +8,8 @@ live here.
 
 from __future__ import annotations
 
+import numpy as np
+
 from daemon.simulation import layout
 from kinematics.kernels import kernel
 from kinematics.lanes import Pointer
@@ -27,13 +29,13 @@ def palm_is_far(memory: Pointer, position: int, velocity: int) -> bool:
 
 @kernel
 def evaluate_palm(
-    memory: Pointer, position: int, velocity: int, shear: int, nx: float, ny: float, stage: int
+    memory: Pointer, position: int, velocity: int, shear: int, nx: float, ny: float, stage: np.int64
 ) -> None:
     """Add the palm's forces on the object to FORCES; write its energy and its shears' rates.
 
     ``position``, ``velocity`` and ``shear`` are where the coordinates, their rates and the shears
-    stand; (nx, ny) is the object's n. Stage 0 also brings the shears within friction and hands the
-    rows to the coupled matrix.
+    stand; (nx, ny) is the object's n. The first ``stage`` also brings the shears within friction
+    and hands the rows to the coupled matrix.
     """
     h = memory[layout.STEP]
     height = memory[position + 3] - memory[layout.PALM]
@@ -71,8 +73,8 @@ def evaluate_palm(
             memory[layout.FORCES + 2] -= drag
             memory[layout.FORCES + 3] += push
             memory[layout.FORCES + 4] += push * lever_x + drag * lever_y
-        memory[layout.EXTRA_RATE + 6 * stage + corner] = slide if depth > 0.0 else 0.0
-        if stage == 0:
+        memory[layout.EXTRA_RATE + 6 * int(stage) + corner] = slide if depth > 0.0 else 0.0
+        if stage == layout.FIRST_STAGE:
             memory[shear + corner] = along / STIFFNESS
             up = layout.EXTRA + 2 * corner * layout.EXTRA_ROW
             side = up + layout.EXTRA_ROW

@@ -207,7 +207,7 @@ def evaluate_state(memory: Pointer, data: Pointer) -> None:
         layout.POSITION,
         layout.VELOCITY,
         layout.PALM_SHEAR,
-        0,
+        layout.FIRST_STAGE,
         memory[layout.SHEAR],
         memory[layout.SHEAR + 1],
     )
@@ -270,7 +270,7 @@ def step(block: FloatArray, table: FloatArray, ring: FloatArray, count: int) -> 
             layout.SECOND_X,
             layout.SECOND_V,
             shears,
-            1,
+            layout.SECOND_STAGE,
             memory[layout.SHEAR] + h * shear1,
             memory[layout.SHEAR + 1] + h * shear2,
         )
