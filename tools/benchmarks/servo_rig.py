@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import sys
 import tempfile
@@ -29,38 +28,20 @@ port = "{dir}/servos"
 """
 _SPAN = reg.PRESENT_POSITION + 4 - reg.PRESENT_CURRENT
 BITS_PER_BYTE = 10
-_PRIORITY = 40  # of SCHED_FIFO: below the kernel's own threads at 50
+_PATIENCE = 0.2  # s
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A running emulator."""
+
+    folder: Path
+    process: int
 
 
 @contextlib.contextmanager
-def urgent(process: int = 0) -> Iterator[bool]:
-    """SCHED_FIFO for a process (this one is 0) and no deep idle states; whether it was allowed.
-
-    What else runs on the machine then holds nothing up but the kernel's own work.
-    """
-    before = os.sched_getscheduler(process), os.sched_getparam(process)
-    try:
-        os.sched_setscheduler(process, os.SCHED_FIFO, os.sched_param(_PRIORITY))
-    except OSError:
-        yield False
-        return
-    try:
-        with contextlib.ExitStack() as stack:
-            with contextlib.suppress(OSError):
-                latency = stack.enter_context(Path("/dev/cpu_dma_latency").open("wb", buffering=0))
-                latency.write(bytes(4))
-            yield True
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(process, *before)
-
-
-@contextlib.contextmanager
-def emulated(baud: int = 0, hurry: bool = False) -> Iterator[Path]:
-    """The folder of two emulated servos: ``baud`` 0 unpaced, else with the wire's time.
-
-    ``hurry``: :func:`urgent` as far as that is allowed.
-    """
+def emulated(baud: int = 0) -> Iterator[Stand]:
+    """Two emulated servos: ``baud`` 0 unpaced, else with the wire's time."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         config = folder / "servos.toml"
@@ -75,24 +56,32 @@ def emulated(baud: int = 0, hurry: bool = False) -> Iterator[Path]:
             assert process.stdout is not None
             if process.stdout.readline().strip() != "ready":
                 raise RuntimeError("the emulated servos did not start")
-            with urgent(process.pid) if hurry else contextlib.nullcontext():
-                yield folder
+            yield Stand(folder, process.pid)
         finally:
             process.terminate()
             process.wait()
 
 
 class OurCycle:
-    """The daemon's own: one read and one write of all servos, torque on."""
+    """The daemon's own: one read and one write of all servos, torque on.
 
-    def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
+    Replies are waited for with patience, which a busy machine may need, or, where it matters, as
+    long as the settings have it (``strict``).
+    """
+
+    def __init__(self, folder: Path, baud: int = 2_000_000, strict: bool = False) -> None:
         settings = load(folder / "servos.toml", folder)
         # No bus watchdog: the line is quiet while another way of driving it has its turn.
-        servos = settings.servos.model_copy(update={"baud": baud, "watchdog": 0.0})
+        change = {"baud": baud, "watchdog": 0.0, "reply_timeout": _PATIENCE}
+        servos = settings.servos.model_copy(update=change)
+        self.deadline = settings.servos.reply_timeout if strict else _PATIENCE  # s, of a reply
         self.settings: Settings = settings.model_copy(update={"servos": servos})
-        self.servos = DynamixelServos(self.settings, RealClock())
+        self.clock = RealClock(self.settings.realtime.spin)
+        self.servos = DynamixelServos(self.settings, self.clock)
         self.servos.connect()
         self.servos.set_torque(True)
+        assert self.servos._line is not None
+        self.servos._line.port.reply_timeout = self.deadline
         self.reading = Reading()
         self.goal = Goal(q=[0.05, 0.05], current=[0.3, 0.3])
         self.failed = 0
@@ -104,16 +93,19 @@ class OurCycle:
         self.servos.write(self.goal)
 
     def bytes(self) -> Traffic:
-        """What one cycle puts on the wire."""
+        """What one cycle puts on the wire; one of many reads more than the others."""
+        return min((self._counted() for _ in range(3)), key=lambda each: each.received)
+
+    def _counted(self) -> Traffic:
         line = self.servos._line
         assert line is not None
         port = line.port
-        sent, received = 0, 0
+        sent: list[int] = []
+        received = 0
         write, fill = port.writePort, port.fill
 
         def counted_write(packet: Any) -> int:
-            nonlocal sent
-            sent += len(packet)
+            sent.append(len(packet))
             return int(write(packet))
 
         def counted_fill() -> bool:
@@ -128,7 +120,8 @@ class OurCycle:
             self()
         finally:
             del port.writePort, port.fill
-        return Traffic(sent, received)
+        request, goals = sent
+        return Traffic(request, received, goals)
 
     def close(self) -> None:
         """Torque off, port closed."""
@@ -139,12 +132,18 @@ class OurCycle:
 class Traffic:
     """Bytes of one cycle."""
 
-    sent: int
+    request: int
     received: int
+    goals: int
+
+    @property
+    def parts(self) -> tuple[int, int, int]:
+        """Request, reply, write."""
+        return self.request, self.received, self.goals
 
     def seconds(self, baud: int) -> float:
         """Their own time on the wire."""
-        return (self.sent + self.received) * BITS_PER_BYTE / baud
+        return sum(self.parts) * BITS_PER_BYTE / baud
 
 
 class PlainCycle:

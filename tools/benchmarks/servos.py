@@ -11,7 +11,10 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from daemon.realtime import RealTime
+from daemon.settings import Settings
 from daemon.simulation.control_port import send_words
+from tools.benchmarks.bare_pty import bare
 from tools.benchmarks.report import Row, row
 from tools.benchmarks.servo_rig import OurCycle, PlainCycle, emulated
 
@@ -23,23 +26,32 @@ _MISSES = 50
 
 
 def measure() -> list[Row]:
-    """Wall and processor time a cycle in µs, and what a missing reply costs in ms."""
-    rows = _unpaced()
-    for baud in _RATES:
-        rows += _paced(baud)
-    return rows + _missing()
+    """Wall and processor time a cycle in µs, and what a missing reply costs in ms.
+
+    With the real-time measures that the daemon takes by default.
+    """
+    with RealTime(Settings()):
+        rows = _unpaced()
+        for baud in _RATES:
+            rows += _paced(baud)
+        return rows + _missing()
 
 
 def _unpaced() -> list[Row]:
-    """Ours and the plain SDK's in turns, each on servos of its own."""
+    """Ours, a bare pseudo-terminal's and the plain SDK's in turns, each on a far end of its own."""
     with ExitStack() as stack:
-        ours = OurCycle(stack.enter_context(emulated()))
+        ours = OurCycle(stack.enter_context(emulated()).folder)
         stack.callback(ours.close)
-        plain = PlainCycle(stack.enter_context(emulated()))
+        floor = stack.enter_context(bare(*ours.bytes().parts))
+        plain = PlainCycle(stack.enter_context(emulated()).folder)
         stack.callback(plain.close)
-        wall: dict[str, list[float]] = {"ours": [], "plain": []}
-        busy: dict[str, list[float]] = {"ours": [], "plain": []}
-        turns: list[tuple[str, Callable[[], None]]] = [("ours", ours), ("plain", plain)]
+        turns: list[tuple[str, Callable[[], None]]] = [
+            ("ours", ours),
+            ("bare", floor),
+            ("plain", plain),
+        ]
+        wall: dict[str, list[float]] = {name: [] for name, _ in turns}
+        busy: dict[str, list[float]] = {name: [] for name, _ in turns}
         for name, cycle in turns * _ROUNDS:
             spent, cpu = timed(cycle, _CYCLES)
             wall[name] += spent
@@ -48,6 +60,8 @@ def _unpaced() -> list[Row]:
     return [
         row("read + write of two servos, unpaced pty", "µs", wall["ours"], aim=120.0),
         row("  its processor time", "µs", busy["ours"], aim=100.0),
+        row("  the same bytes with no work at either end, in turns with it", "µs", wall["bare"]),
+        row("  and their processor time", "µs", busy["bare"]),
         row("  the plain SDK's cycle, in turns with it", "µs", wall["plain"]),
         row("  and its processor time", "µs", busy["plain"]),
     ]
@@ -71,8 +85,8 @@ def timed(cycle: Callable[[], None], count: int) -> tuple[list[float], float]:
 
 
 def _paced(baud: int) -> list[Row]:
-    with emulated(baud) as folder:
-        cycle = OurCycle(folder, baud)
+    with emulated(baud) as stand:
+        cycle = OurCycle(stand.folder, baud)
         try:
             traffic = cycle.bytes()
             timed(cycle, 50)
@@ -92,14 +106,14 @@ def _paced(baud: int) -> list[Row]:
 
 
 def _missing() -> list[Row]:
-    with emulated() as folder:
-        cycle = OurCycle(folder)
+    with emulated() as stand:
+        cycle = OurCycle(stand.folder, strict=True)
         try:
-            send_words(folder, "silent=2")
+            send_words(stand.folder, "silent=2")
             spent, _ = timed(cycle, _MISSES)
-            deadline = cycle.settings.servos.reply_timeout * 1e3
+            deadline = cycle.deadline * 1e3
             missed = cycle.failed
-            send_words(folder, "answer=2")
+            send_words(stand.folder, "answer=2")
         finally:
             cycle.close()
     if missed < _MISSES - 1:
