@@ -112,7 +112,12 @@ class Daemon:
         publisher = Publisher(context, stream.address, stream.queue, guard)
         self._closers.append(publisher.close)
         server = CommandServer(
-            context, commands.address, commands.max_bytes, commands.per_second, guard
+            context,
+            commands.address,
+            commands.max_bytes,
+            commands.per_second,
+            guard,
+            self.clock.now,
         )
         self._closers.append(server.close)
         return publisher, server

@@ -10,6 +10,7 @@ is refused, so that a flood costs the tick a bounded time and no one else's comm
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -43,34 +44,36 @@ class CommandServer:
         max_bytes: int,
         per_second: float = 1e9,
         guard: Guard = OWNER_ONLY,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``per_second`` bounds each client's commands; one second's worth may come at once."""
+        """``per_second`` bounds each client's commands; one second's worth may come at once.
+
+        ``now`` [s] is the clock that their pace is measured by.
+        """
         self._bound = Bound(
             context, zmq.ROUTER, address, "commands.address", _QUEUE, 4 * max_bytes, guard
         )
         self._socket = self._bound.socket
         self._max_bytes = max_bytes
         self._per_second = per_second
+        self._now = now
         self._paces: dict[bytes, tuple[float, float]] = {}  # of a client: may send, at time
         self._waiting: deque[tuple[list[bytes], bytes]] = deque()
         self.refused_by_pace = 0
 
-    def serve(self, handler: Handler, now: float = 0.0) -> bool:
-        """Answer one waiting command through ``handler``; False when nobody waits.
-
-        ``now`` [s] is what the clients' pace is measured by.
-        """
+    def serve(self, handler: Handler) -> bool:
+        """Answer one waiting command through ``handler``; False when nobody waits."""
         for _ in range(_LOOK):
             if not self._bound.readable():
                 break
-            self._take_in(self._socket.recv_multipart(zmq.NOBLOCK), handler, now)
+            self._take_in(self._socket.recv_multipart(zmq.NOBLOCK), handler)
         if not self._waiting:
             return False
         envelope, payload = self._waiting.popleft()
         self._send(envelope, self._answer(payload, handler))
         return True
 
-    def _take_in(self, frames: list[bytes], handler: Handler, now: float) -> None:
+    def _take_in(self, frames: list[bytes], handler: Handler) -> None:
         # A REQ socket sends [identity, empty, payload]. Without the empty frame, as from a DEALER,
         # the reply goes back in the same form.
         envelope, payload = frames[:-1], frames[-1]
@@ -78,7 +81,7 @@ class CommandServer:
             return  # not the form of any client; an answer would only send its frames back
         if _is_stop(payload, self._max_bytes):
             self._send(envelope, self._answer(payload, handler))
-        elif not self._in_pace(envelope[0], now):
+        elif not self._in_pace(envelope[0], self._now()):
             self.refused_by_pace += 1
             self._refuse(envelope, f"too many commands: at most {self._per_second:g} a second")
         elif len(self._waiting) >= _QUEUE:
@@ -105,10 +108,10 @@ class CommandServer:
         except zmq.ZMQError:
             pass  # the client has gone
 
-    def drain(self, handler: Handler, now: float = 0.0) -> None:
+    def drain(self, handler: Handler) -> None:
         """Answer all that wait, up to the queue's length."""
         for _ in range(_QUEUE):
-            if not self.serve(handler, now):
+            if not self.serve(handler):
                 return
 
     def _answer(self, payload: bytes, handler: Handler) -> dict[str, Any]:

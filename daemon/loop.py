@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from daemon.broadcast import Broadcast
 from daemon.clock import Clock
-from daemon.commands import Handler, Refused
+from daemon.commands import CommandServer, Handler, Refused
 from daemon.control import Control
 from daemon.modes import Command, Lease, Mode, parse
 from daemon.perception import FingerPerception
@@ -83,6 +83,7 @@ class Loop:
         self._broadcast = None
         if publisher is not None:
             self._broadcast = Broadcast(settings, publisher, perceptions, self.statistics)
+        self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
         self._ending = False
         self._stopping = False
         self._deaf_until = -math.inf  # until then commands are from before a stall
@@ -106,7 +107,7 @@ class Loop:
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         if self._server is not None:
-            self._server.drain(self._refuse_old, self.state.t)
+            self._server.drain(self._refuse_old)
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -147,6 +148,8 @@ class Loop:
                 deadline = done
             else:
                 timing.late_in_row = 0
+            if self.heartbeat is not None:
+                self.heartbeat(done)
         clock.sleep_until(deadline)
 
     def _refuse_old(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -219,9 +222,9 @@ class Loop:
             self._by_person({"command": "stop"})
         if self._server is not None:
             if state.t < self._deaf_until:
-                self._server.drain(self._refuse_old, state.t)
+                self._server.drain(self._refuse_old)
             else:
-                self._server.serve(self._by_person, state.t)
+                self._server.serve(self._by_person)
         if self._task is not None:
             self._follow(self._task)
         state.mode = control.mode
@@ -383,7 +386,7 @@ class Loop:
         for perception in self.perceptions:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
         limited = dict(self._safety.limited)
-        if self._server is not None and self._server.refused_by_pace:
+        if isinstance(self._server, CommandServer) and self._server.refused_by_pace:
             limited["commands.pace"] = self._server.refused_by_pace
         return {
             "fault": state.fault,

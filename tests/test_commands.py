@@ -14,6 +14,7 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon.clock import VirtualClock
 from daemon.commands import CommandServer, NoAnswer, Refused, decode, send
 from daemon.sockets import AddressError, Guard
 from daemon.stream import Publisher
@@ -176,7 +177,7 @@ def arrived(server: CommandServer) -> bool:
 def test_a_stop_goes_before_all_that_waits(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    server = CommandServer(context, addresses[1], max_bytes=200, per_second=1000.0)
+    server = CommandServer(context, addresses[1], max_bytes=200)
     flood = Flood(context, addresses[1], clients=4, each=40)
     until(lambda: arrived(server))
     order: list[str] = []
@@ -185,7 +186,7 @@ def test_a_stop_goes_before_all_that_waits(
         order.append(request["command"])
         return {}
 
-    server.serve(note, 0.0)  # the flood is being worked on
+    server.serve(note)  # the flood is being worked on
     stopper = context.socket(zmq.DEALER)
     stopper.setsockopt(zmq.LINGER, 0)
     stopper.connect(addresses[1])
@@ -195,7 +196,7 @@ def test_a_stop_goes_before_all_that_waits(
     def stopped() -> bool:
         nonlocal ticks
         ticks += 1
-        server.serve(note, 0.002 * ticks)
+        server.serve(note)
         return bool(stopper.poll(1))
 
     until(stopped)
@@ -209,14 +210,15 @@ def test_a_stop_goes_before_all_that_waits(
 def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    server = CommandServer(context, addresses[1], max_bytes=200, per_second=20.0)
+    clock = VirtualClock()
+    server = CommandServer(context, addresses[1], 200, per_second=20.0, now=clock.now)
     flood = Flood(context, addresses[1], clients=1, each=60)
     quiet = Flood(context, addresses[1], clients=1, each=3)
     replies: list[dict[str, Any]] = []
     kind: list[dict[str, Any]] = []
 
     def all_answered() -> bool:
-        while server.serve(echo, 1.0):
+        while server.serve(echo):
             pass
         replies.extend(flood.replies())
         kind.extend(quiet.replies())
@@ -231,7 +233,8 @@ def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
     assert server.refused_by_pace == 40
     # A second later it may send again.
     flood.sockets[0].send(msgpack.packb({"command": "move"}))
-    until(lambda: server.serve(echo, 2.0))
+    clock.sleep_until(1.0)
+    until(lambda: server.serve(echo))
     assert flood.replies() == [{"ok": True, "heard": "move"}]
     server.close()
 

@@ -24,6 +24,7 @@ SUBCOMMANDS = {
     "calibrate": "calibrate the pressure sensor under a tip, step by step",
     "limits": "every limit of the hand: what is judged, what follows, which setting",
     "keys": "make the keys that addresses off this machine need",
+    "install-service": "a systemd unit and udev rules for this machine",
     "figures": "the paper's figures from this model, as CSV and PNG",
     "bench": "measure run time, beside what a user would otherwise pick",
 }
@@ -33,7 +34,9 @@ def _open_standard_streams() -> None:
     """Stand-ins for standard streams that were closed, so that no other file takes their place."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(descriptor, True)  # so that a child has them, too
+            setattr(sys, name, os.fdopen(descriptor, mode))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

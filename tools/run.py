@@ -7,11 +7,13 @@ import os
 import signal
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from daemon.settings import Settings, SettingsError
+from daemon.service import Service
+from daemon.settings import Settings, SettingsError, Task
 from tools.arguments import add_profile, profile, seconds
 from tools.event_log import EventLog
 from tools.recorder_beside import NoRecorder
@@ -25,6 +27,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--monitor", action="store_true", help="show the live page here; q ends both"
+    )
+    parser.add_argument(
+        "--log", choices=("plain", "json"), default="plain", help="lines for people or programs"
+    )
+    parser.add_argument(
+        "--log-file", type=Path, metavar="FILE", help="log to FILE's end, not to standard error"
+    )
+    parser.add_argument(
+        "--no-task", action="store_true", help="stay disarmed although the profile names a task"
     )
     parser.add_argument(
         "--record",
@@ -44,8 +55,15 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
+    if arguments.no_task:
+        settings = settings.model_copy(update={"task": Task()})
     signals = _Signals()
-    log = EventLog()
+    try:
+        log = EventLog(arguments.log, arguments.log_file)
+    except OSError as error:
+        print(f"softfinger: --log-file {arguments.log_file}: {error.strerror}", file=sys.stderr)
+        return 2
+    log.take_over_logging()
     try:
         return _serve(settings, arguments, signals, log)
     except Interrupted:
@@ -73,9 +91,9 @@ def _serve(
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=cache_folder())
     except (SettingsError, AddressError, ServoError, TactileError, ValueError) as error:
-        log.plain(f"softfinger: {error}")
+        log.plain(f"softfinger: {error}", "error")
         return 1
-    with daemon, RealTime(settings) as measures:
+    with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
         signals.hand_over(loop)
         for event in measures.events():
@@ -98,10 +116,25 @@ def _serve(
     _tell_times(daemon.loop, log)
     state = daemon.loop.state
     if state.fault:
-        log.plain(f"softfinger: ended with a fault: {state.fault}")
+        log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
-        log.plain("softfinger: torque could not be turned off and may still be on")
+        log.plain("softfinger: torque could not be turned off and may still be on", "error")
     return 1 if state.fault or state.torque else 0
+
+
+@contextmanager
+def _service(loop: Any) -> Iterator[None]:
+    """Where systemd wants to know: ready with the first tick, alive with each, then stopping."""
+    service = Service.of_environment()
+    if service is None:
+        yield
+        return
+    loop.heartbeat = service.alive
+    try:
+        yield
+    finally:
+        service.stopping()
+        service.close()
 
 
 def _tell_times(loop: Any, log: EventLog) -> None:

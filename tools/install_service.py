@@ -1,0 +1,169 @@
+"""``softfinger install-service``: a systemd unit for the daemon, and udev rules for its ports.
+
+Prints them, or writes them where they are asked for; nothing is enabled or started.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pwd
+import re
+import sys
+from pathlib import Path
+
+UNIT = "softfinger.service"
+RULES = "70-softfinger.rules"
+_WATCHDOG = 2  # s without a tick after which systemd ends the daemon
+_EPILOG = """\
+Without --to it only prints. To install:
+  sudo softfinger install-service --config /etc/softfinger/hand.toml --user $USER \\
+      --to /etc/systemd/system
+  sudo softfinger install-service --udev --to /etc/udev/rules.d
+  sudo systemctl daemon-reload && sudo systemctl enable --now softfinger
+  sudo udevadm control --reload && sudo udevadm trigger
+Exit status: 0 done, 1 not written."""
+
+_UNIT = """\
+[Unit]
+Description=softfinger, the daemon of a hand with soft fingertips
+After=local-fs.target network.target
+StartLimitIntervalSec=60
+StartLimitBurst=5
+
+[Service]
+Type=notify
+NotifyAccess=main
+ExecStart={command}
+{user}SupplementaryGroups=dialout
+UMask=0077
+KillSignal=SIGTERM
+# The first start compiles the kernels.
+TimeoutStartSec=300
+TimeoutStopSec=10
+# Fed by the control loop itself: a loop that stands still is ended. The servos' own bus watchdog
+# has stopped them long before.
+WatchdogSec={watchdog}
+# A daemon that died comes back disarmed, whatever task its profile names. Wrong settings (2) stay
+# wrong.
+Restart=on-failure
+RestartSec=1
+RestartPreventExitStatus=2
+LimitRTPRIO=90
+LimitNICE=-20
+LimitMEMLOCK=infinity
+OOMScoreAdjust=-900
+DevicePolicy=closed
+DeviceAllow=char-ttyUSB rw
+DeviceAllow=char-ttyACM rw
+DeviceAllow=char-ttyS rw
+DeviceAllow=/dev/cpu_dma_latency rw
+CacheDirectory=softfinger
+RuntimeDirectory=softfinger
+RuntimeDirectoryMode=0700
+Environment=XDG_CACHE_HOME=/var/cache NUMBA_CACHE_DIR=/var/cache/softfinger/kernels
+NoNewPrivileges=yes
+ProtectSystem=strict
+ProtectHome=read-only
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectControlGroups=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictSUIDSGID=yes
+LockPersonality=yes
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+_RULES = """\
+# Serial ports of servos and tactile boards: for the group dialout, out of ModemManager's hands.
+SUBSYSTEM=="tty", KERNEL=="ttyUSB*|ttyACM*", GROUP="dialout", MODE="0660", \
+ENV{ID_MM_DEVICE_IGNORE}="1"
+# A reply waits in an FTDI adapter until its latency timer is over: 1 ms in place of 16.
+ACTION=="add|change", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
+# Holding this device at 0 keeps the processor from sleeping deeply between two ticks.
+KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``install-service``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("--config", type=Path, metavar="FILE", help="the hand's profile")
+    parser.add_argument("--user", default="", help="whom it runs as; root when not given")
+    parser.add_argument("--udev", action="store_true", help="the udev rules instead of the unit")
+    parser.add_argument(
+        "--name",
+        action="append",
+        default=[],
+        metavar="NAME=SERIAL",
+        help="with --udev: /dev/NAME stands for the adapter with this serial number",
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--print", action="store_true", help="print it, which is what it does alone")
+    where.add_argument("--to", type=Path, metavar="FOLDER", help=f"write {UNIT} or {RULES} there")
+    parser.add_argument("--force", action="store_true", help="write over a file that is there")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print or write; 0, or 1 with the reason."""
+    try:
+        if arguments.udev:
+            name, text = RULES, rules(arguments.name)
+        else:
+            name, text = UNIT, unit(arguments.config, arguments.user)
+        if arguments.to is None:
+            print(text, end="")
+            return 0
+        path = arguments.to / name
+        with path.open("w" if arguments.force else "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        print(f"install-service: {path} is there already; --force writes over it", file=sys.stderr)
+        return 1
+    except (OSError, ValueError) as error:
+        print(f"install-service: {error}", file=sys.stderr)
+        return 1
+    print(path)
+    return 0
+
+
+def unit(config: Path | None, user: str) -> str:
+    """The unit's text. Raises ValueError for a user or profile that is not there."""
+    words = [sys.executable, "-P", "-m", "tools.cli", "run", "--no-task"]
+    if config is not None:
+        if not config.is_file():
+            raise ValueError(f"{config}: no such profile")
+        words += ["--config", str(config.resolve())]
+    line = ""
+    if user:
+        try:
+            pwd.getpwnam(user)
+        except KeyError:
+            raise ValueError(f"{user}: no such user") from None
+        line = f"User={user}\n"
+    command = " ".join(_quoted(word) for word in words)
+    return _UNIT.format(command=command, user=line, watchdog=_WATCHDOG)
+
+
+def _quoted(word: str) -> str:
+    """A word of ExecStart: nothing in it is a specifier, a variable or a separator."""
+    if any(ord(character) < 32 for character in word):
+        raise ValueError(f"{word!r}: control characters can't stand in a unit")
+    word = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    return f'"{word}"' if re.search(r"[\s\"';\\]", word) else word
+
+
+def rules(names: list[str]) -> str:
+    """The rules' text. Raises ValueError for a name that is none."""
+    lines = [_RULES]
+    for pair in names:
+        name, separator, serial = pair.partition("=")
+        sound = re.fullmatch(r"[A-Za-z0-9_./-]+", name) and ".." not in name and name[0] != "/"
+        if not (separator and sound and re.fullmatch(r"[A-Za-z0-9_.:-]+", serial)):
+            raise ValueError(f"found {pair!r}, expected NAME=SERIAL, as softfinger/servos=FT4THVRN")
+        lines.append(
+            f'SUBSYSTEM=="tty", ATTRS{{serial}}=="{serial}", SYMLINK+="{name}", TAG+="systemd"\n'
+        )
+    return "".join(lines)
