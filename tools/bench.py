@@ -26,7 +26,7 @@ ON_DEMAND = {
     "sustained": "a minute of 500 Hz on two servos at 2 Mbaud",
     "wakeup": "wake-ups of the loop beside cyclictest and time.sleep, three minutes",
     "neighbours": "the tick beside busy processes, many subscribers and noisy sensors",
-    "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, some minutes",
+    "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, ten minutes",
 }
 
 

@@ -1,4 +1,4 @@
-"""How accurate the estimator is over its whole envelope: a campaign of some minutes.
+"""How accurate the estimator is over its whole envelope: a campaign of ten minutes.
 
 Errors against the Cramér-Rao bound, honesty of the covariance, dead cells, 8-bit counts, faint
 contacts, false alarms, frames of other contact models and of imperfect sensors. The parts are
