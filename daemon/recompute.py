@@ -21,7 +21,7 @@ from daemon.perception import FingerPerception
 from daemon.prediction import Prediction
 from daemon.records import FINGERS, Frame, Goal, Reading, State
 from daemon.servos.base import ServoError
-from daemon.settings import Settings, TactileSettings, Task
+from daemon.settings import Settings, Task
 
 
 class Recomputation:
@@ -32,8 +32,9 @@ class Recomputation:
     ) -> None:
         """Raises SettingsError or TactileError when settings and calibrations don't fit."""
         with tempfile.TemporaryDirectory() as folder:
-            settings = _without_world(settings, calibrations, Path(folder))
+            settings = with_calibrations(settings, calibrations, Path(folder))
             models = make_models(settings, cache)
+        settings = settings.model_copy(update={"task": Task()})  # its commands are recorded
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
@@ -84,18 +85,16 @@ class Recomputation:
         return loop.state
 
 
-def _without_world(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
-    """Settings without a task, whose commands are recorded, and with calibrations from files."""
+def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
+    """Settings whose calibrations are files in ``folder``, made of these texts of JSON."""
     files = ["", ""]
     for finger, text in enumerate(calibrations):
         if text:
             path = folder / f"{FINGERS[finger]}.json"
             path.write_text(text, encoding="utf-8")
             files[finger] = str(path)
-    tactile: TactileSettings = settings.tactile.model_copy(
-        update={"calibration": (files[0], files[1])}
-    )
-    return settings.model_copy(update={"tactile": tactile, "task": Task()})
+    tactile = settings.tactile.model_copy(update={"calibration": (files[0], files[1])})
+    return settings.model_copy(update={"tactile": tactile})
 
 
 class _Clock:

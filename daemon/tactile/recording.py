@@ -12,9 +12,10 @@ Frames of whole numbers are counts; others are Pa, and become counts by ``pascal
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ class Recording:
     t: FloatArray
     live: NDArray[np.bool_]
     truths: dict[str, FloatArray] = field(default_factory=dict)
+    pitch: tuple[float, float] | None = None  # x and y [m], where the file tells it
 
 
 def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recording:
@@ -96,7 +98,8 @@ def _folder(path: Path, scale: float, rate: float) -> Recording:
 def _export(path: Path, scale: float, rate: float) -> Recording:
     export = tekscan.parse(path.read_text(encoding="latin-1"), 1.0 / rate)
     held: dict[str, NDArray[Any]] = {"frames": export.values, "t": export.t, "live": export.live}
-    return _checked(held, 1.0 if export.raw else scale, rate)
+    recording = _checked(held, 1.0 if export.raw else scale, rate)
+    return recording if math.isnan(sum(export.pitch)) else replace(recording, pitch=export.pitch)
 
 
 def _checked(held: dict[str, NDArray[Any]], scale: float, rate: float) -> Recording:

@@ -1,0 +1,106 @@
+"""Where recorded frames come from, whatever wrote them: one `Source` a sensor.
+
+A recording of the stream (.mcap) brings its own settings and calibrations. A file of frames alone
+(.npz, a folder of .npy, a Tekscan-style export) is taken as the profile's left sensor, with its own
+number of cells, and its own pitch where the file tells it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import messages
+from daemon.model import FingerModel, make_models
+from daemon.records import FINGERS
+from daemon.settings import Settings
+from daemon.tactile.recording import load_recording
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+
+Counts = NDArray[np.uint16]
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
+
+    ``t`` counts from the first frame; ``total`` is what ``progress`` counts up to. ``truths`` are
+    what was known of the contact at each frame, by name, where the file has one sensor alone.
+    """
+
+    settings: Settings
+    models: tuple[FingerModel, FingerModel]
+    fingers: tuple[int, ...]
+    total: int
+    frames: Callable[[Progress], Iterator[tuple[int, float, Counts]]]
+    truths: dict[str, NDArray[np.float64]]
+    live: NDArray[np.bool_] | None = None
+
+
+def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
+    """Open a file of frames.
+
+    With ``own`` a recording of the stream goes by the settings it was made with, else all go by
+    ``settings``. Raises RecordingError or `daemon.tactile.recording.RecordingError` naming the
+    file, and what the settings raise.
+    """
+    if path.suffix == ".mcap":
+        return _stream(path, settings, cache, own)
+    return _frames_alone(path, settings, cache)
+
+
+def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
+    from daemon.recompute import with_calibrations
+    from tools.recordings.recomputed import recorded_settings
+
+    recording = Recording(path)
+    if not recording.count(messages.TACTILE):
+        raise RecordingError(f"{path}: no tactile frames in it")
+    if own:
+        settings, calibrations = recorded_settings(recording)
+        with tempfile.TemporaryDirectory() as folder:
+            models = make_models(with_calibrations(settings, calibrations, Path(folder)), cache)
+    else:
+        models = make_models(settings, cache)
+    present = tuple(
+        finger
+        for finger, name in enumerate(FINGERS)
+        if f"{messages.TACTILE.decode()}/{name}" in recording.counts
+    )
+
+    def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
+        first = None
+        for _, message in recording.messages([messages.TACTILE], progress=progress):
+            if message.get("unit") != "count":
+                raise RecordingError(f"{path}: frames in {message.get('unit')!r}, expected counts")
+            finger = FINGERS.index(message["finger"])
+            counts = np.frombuffer(message["data"], "<u2").reshape(message["rows"], message["cols"])
+            first = message["timestamp"] if first is None else first
+            yield finger, message["timestamp"] - first, counts
+
+    return Source(settings, models, present, recording.size, frames, {})
+
+
+def _frames_alone(path: Path, settings: Settings, cache: Path | None) -> Source:
+    tactile = settings.tactile
+    recording = load_recording(path, tactile.pascal_per_count, tactile.rate)
+    count, rows, cols = recording.counts.shape
+    changes: dict[str, float] = {"rows": rows, "cols": cols}
+    if recording.pitch is not None:
+        changes["pitch"], changes["pitch_y"] = recording.pitch
+    settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
+
+    def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
+        for k, t in enumerate(recording.t.tolist()):
+            progress(k)
+            yield 0, t, recording.counts[k]
+
+    models = make_models(settings, cache)
+    return Source(settings, models, (0,), count, frames, recording.truths, recording.live)
