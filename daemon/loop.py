@@ -38,10 +38,10 @@ class Commands(Protocol):
 
     refused_by_pace: int
 
-    def serve(self, handler: Handler, now: float) -> bool:
+    def serve(self, handler: Handler) -> bool:
         """Carry out through ``handler`` what is due at this tick; False when nothing was."""
 
-    def drain(self, handler: Handler, now: float) -> None:
+    def drain(self, handler: Handler) -> None:
         """Answer all that has waited since before the first tick."""
 
 

@@ -185,7 +185,7 @@ class _Commands:
     def __init__(self) -> None:
         self.waiting: list[dict[str, Any]] = []
 
-    def serve(self, handler: Handler, now: float) -> bool:
+    def serve(self, handler: Handler) -> bool:
         for request in self.waiting:
             try:
                 handler(request)
@@ -194,7 +194,7 @@ class _Commands:
         self.waiting = []
         return True
 
-    def drain(self, handler: Handler, now: float) -> None:
+    def drain(self, handler: Handler) -> None:
         pass
 
     def close(self) -> None:

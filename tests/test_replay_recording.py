@@ -40,7 +40,7 @@ class Script:
         self._tick = 0
         self.refused = 0
 
-    def serve(self, handler: Handler, now: float) -> bool:
+    def serve(self, handler: Handler) -> bool:
         self._tick += 1
         request = self._due.get(self._tick)
         if request is not None:
@@ -50,7 +50,7 @@ class Script:
                 self.refused += 1
         return request is not None
 
-    def drain(self, handler: Handler, now: float) -> None:
+    def drain(self, handler: Handler) -> None:
         pass
 
 
