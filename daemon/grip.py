@@ -29,7 +29,7 @@ from daemon.slip import SlipWatch
 _INTEGRAL_SHARE = 0.3  # the integral's bound, as a share of the force wanted
 _SHARE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
 _SHARE_ANGLE = 3e-3  # rad that the object may turn by that
-_QUIET = 2.0  # standard deviations of the angle that the joints at rest don't follow
+_QUIET = 3.0  # standard deviations of the angle that the joints at rest don't follow
 _STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
 
 
@@ -43,6 +43,8 @@ class Grip:
         self._fingers = fingers
         self._dt = 1.0 / settings.loop.rate
         self._by_energy = law.law == "energy" and len(fingers) == 2
+        # Joints that are held to angles give whatever torque that takes: it tells no load.
+        self._watches = law.law != "position" and len(fingers) == 2
         self._torque_max = settings.safety.current_max * law.torque_constant  # N·m
         self.joint_stiffness = law.joint_stiffness
         self.force = Reference(self._dt, law.smooth_time)
@@ -137,7 +139,7 @@ class Grip:
 
     def _wanted(self, contacts: list[Contact], held: Held) -> float:
         """The force [N] at this tick: the target, raised where the tips would be near slipping."""
-        if len(self._fingers) == 2:
+        if self._watches:
             self.force.target = self.slip.step(
                 held, contacts, self.force_target, self.holding, self._closing_friction
             )

@@ -8,7 +8,8 @@ What these sensors show, and what they don't:
   at the default hand. What stands when holding begins is taken as friction up to that, and as load
   beyond; what comes slower than a second is followed as friction up to that, too. Half of it is no
   sign, and a load that is seen is taken as so much more as friction may hide. So a grip whose
-  friction bears less than about twice that is not guarded well: at the default hand, below 7 N.
+  friction bears less than about twice that is not guarded well, at the default hand below 7 N; one
+  that bears less than it is not guarded, below 2.8 N.
 - A torque constant that is wrong by a share looks like a load in proportion to the grip: up to 10 %
   of the torque are taken out when holding begins.
 - A load towards the palm wedges the object between the tips: it shows less, and needs more to slip.
@@ -39,6 +40,7 @@ _WELL = 1.5  # times what the tips' shear explains: the object turns in the grip
 _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth, creep
 _SIGNS = 3.0  # standard deviations of the angle, more than that
 _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
+_LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 _FORCE_SHARE = 0.9  # of the force that is a fault
 
 
@@ -106,10 +108,12 @@ class SlipWatch:
             self._stray = held.stray
         # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
         spare = law.tip_friction * (1.0 - law.slip_margin) - held.shear
-        load = max(self.load, 0.5 * law.object_load)
+        # A grip that bears less than the joints' friction hides is told nothing by their torques.
+        told = self.load if law.tip_friction * asked > self._friction else 0.0
+        load = max(told, 0.5 * law.object_load)
         needed = 0.0
         if load > 0.0:
-            needed = load / spare if spare > 0.0 else most
+            needed = load / max(spare, _LEAST_SPARE * law.tip_friction)
         if self.turned:
             needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, self._needed))
         if needed >= self._needed:
@@ -129,8 +133,9 @@ class SlipWatch:
             # So little may as well be friction that gives way; what comes slower stays hidden.
             still = self._still + (self._smooth - self._still) * self._dt / self._age
             self._still = min(max(still, -self._friction), self._friction)
-        # Half the friction is no sign yet; from all of it on as much may be hidden.
-        sure = seen - 0.5 * self._friction
+        # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
+        # as much may be hidden.
+        sure = seen - (0.5 + max(1.0 - self._age / _LEARN, 0.0)) * self._friction
         lever = max(held.load_lever, _LEAST_LEVER * self._width)
         hidden = max(self._law.joint_friction / lever, self._friction)
         self.load = min(max(4.0 * sure, 0.0), seen + hidden)

@@ -15,7 +15,7 @@ from daemon.commands import Refused
 from daemon.profiles import load
 from daemon.reference import Reference
 from daemon.settings import Settings
-from tools.benchmarks.control import Watched
+from tools.benchmarks.control_rig import Watched
 
 PAPER: dict[str, dict[str, Any]] = {
     "material": {"law": "constant"},

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -232,7 +232,7 @@ def draw_tilt_and_roll(figure: Figure, sheets: Sequence[Sheet]) -> None:
 
 
 def _relative(
-    axes: Axes, theta: FloatArray, model: FloatArray, found: FloatArray, style: dict[str, object]
+    axes: Axes, theta: FloatArray, model: FloatArray, found: FloatArray, style: dict[str, Any]
 ) -> None:
     level = float(np.interp(0.0, theta, model))
     axes.plot(theta, found / level, **(style | {"linewidth": 0.9}))

@@ -22,6 +22,9 @@ from daemon.simulation import layout
 from daemon.simulation.hand import SimulatedHand
 from tools.figure_pages.sheets import FloatArray
 
+Sections = dict[str, dict[str, Any]]
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true d and θ; estimates, as `_told` has them
+
 MODULUS = 0.304e6  # Pa
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
@@ -55,7 +58,7 @@ class Run:
 def compression(tilt: float) -> Run:
     """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
     x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
-    sections = {
+    sections: Sections = {
         "servos": {"backend": "none"},
         "simulation": {
             "object_position": (x, 0.080),
@@ -75,7 +78,7 @@ def rotation() -> Run:
     what is predicted from it since the last frame.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
-    sections = {
+    sections: Sections = {
         "hand": {"finger_length": length},
         "control": {"move_speed": 0.05},
         "simulation": {
@@ -90,7 +93,7 @@ def rotation() -> Run:
         # The servo gives way under the force: its goal lies beyond.
         loop.command({"command": "move", "left": TILTED + _GIVES})
         assert daemon.hand is not None
-        rows = []
+        rows: list[Row] = []
         while loop.state.mode == "moving" or not rows:
             loop.advance(0.5 * SCAN)
             truth = float(daemon.hand.d[0]), float(daemon.hand.theta[0])
@@ -102,7 +105,7 @@ def rotation() -> Run:
 
 def rolling(d: float) -> Run:
     """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held."""
-    sections = {
+    sections: Sections = {
         "servos": {"backend": "none"},
         "hand": {"open_angle": (TILTED, 0.0)},
         "simulation": {"object_height": 0.2, "compression_speed": 0.0},
@@ -115,7 +118,7 @@ def rolling(d: float) -> Run:
         return _collect(_frames(daemon, _ROLL_STEPS, place), daemon)
 
 
-def _daemon(sections: dict[str, dict[str, Any]]) -> Daemon:
+def _daemon(sections: Sections) -> Daemon:
     simulation = {"tactile_delay": SCAN, "tactile_noise": 0.005 * MODULUS, "object_height": 0.2}
     merged = {
         "scene": {"fingers": ("left",)},
@@ -133,7 +136,7 @@ def _frames(
     daemon: Daemon,
     count: int,
     place: Callable[[SimulatedHand, float], None] | None = None,
-) -> Iterator[tuple[tuple[float, float], tuple[float, ...]]]:
+) -> Iterator[Row]:
     """Truth at each frame's instant, and what the frame alone says."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
@@ -160,7 +163,7 @@ def _told(contact: Contact) -> tuple[float, ...]:
     return contact.d, contact.theta, contact.force, contact.energy
 
 
-def _collect(rows: Iterator[tuple[tuple[float, float], tuple[float, ...]]], daemon: Daemon) -> Run:
+def _collect(rows: Iterator[Row], daemon: Daemon) -> Run:
     found = list(rows)
     truth = np.array([each for each, _ in found])
     told = np.array([each for _, each in found])

@@ -1,0 +1,104 @@
+"""A daemon on virtual time whose hand's truth is recorded: for bench and tests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.assembly import Daemon
+from daemon.settings import Settings
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The truth, tick by tick."""
+
+    t: NDArray[np.float64]  # s
+    force: NDArray[np.float64]  # N [n, 2]
+    angle: NDArray[np.float64]  # rad
+    slip: NDArray[np.float64]  # |T|/μN, the greater of both tips
+
+    def since(self, index: int) -> Seen:
+        """From this tick on."""
+        return Seen(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
+
+    def settled(self, off: NDArray[np.bool_]) -> float:
+        """Time until nothing is ``off`` any more [s]."""
+        where = np.flatnonzero(off)
+        return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
+
+
+class Watched:
+    """A daemon on virtual time, its hand's truth recorded."""
+
+    def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
+        settings = Settings.model_validate(sections | {"loop": {"clock": "virtual"}})
+        self._daemon = Daemon(settings, wire=False)
+        assert self._daemon.hand is not None
+        assert self._daemon.prediction is not None
+        self.plant = self._daemon.hand
+        self.prediction = self._daemon.prediction
+        self._friction = settings.simulation.tip_friction
+
+    def __enter__(self) -> Watched:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._daemon.close()
+
+    @property
+    def now(self) -> float:
+        """The clock's time [s]."""
+        return self._daemon.clock.now()
+
+    @property
+    def mode(self) -> str:
+        """The hand's mode."""
+        return self._daemon.loop.state.mode
+
+    def command(self, name: str, **numbers: float) -> None:
+        """Carry out a command."""
+        self._daemon.loop.command({"command": name, **numbers})
+
+    def grasp(self, force: float) -> None:
+        """Arm and start to grasp."""
+        self._daemon.loop.advance(0.3)
+        self.command("arm")
+        self._daemon.loop.advance(0.2)
+        self.command("grasp", force=force)
+
+    def run(self, seconds: float) -> None:
+        """Go on for ``seconds`` without looking."""
+        self._daemon.loop.advance(seconds)
+
+    def watch(self, seconds: float) -> Seen:
+        """Go on for ``seconds``; the truth at each tick."""
+        return Seen(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
+
+    def _ticks(self, seconds: float) -> Iterator[tuple[float, tuple[float, ...], float, float]]:
+        loop, plant = self._daemon.loop, self.plant
+        for _ in range(max(round(seconds / loop.period), 1)):
+            loop.advance(loop.period)
+            normal = self._friction * np.maximum(plant.normal, 1e-9)
+            used = np.where(plant.normal > 0.1, np.abs(plant.tangential) / normal, 0.0)
+            yield self.now, tuple(plant.force), float(plant.object_pose[2]), float(used.max())
+
+
+def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> float:
+    """Push the object along its faces from ``start`` to ``force`` [N], ``rate`` [N/s].
+
+    Positive is away from the palm; the push stays. Returns the largest share of friction used.
+    """
+    dt, used = 0.02, 0.0
+    count = max(round(abs(force - start) / (rate * dt)), 1)
+    for k in range(1, count + 1):
+        now = start + (force - start) * k / count
+        angle = float(hand.plant.object_pose[2])
+        hand.plant.push(-now * math.sin(angle), now * math.cos(angle))
+        used = max(used, float(hand.watch(dt).slip.max()))
+    return used
