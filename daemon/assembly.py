@@ -97,6 +97,7 @@ class Daemon:
             server,
             on_event,
         )
+        self.loop.tell_truth(self.hand)
         if publisher is not None:
             publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from daemon.messages import Parts, Rates
+from daemon.messages import Parts, Rates, Truth
 from daemon.perception import FingerPerception
 from daemon.records import Frame, State
 from daemon.schedule import Schedule
@@ -45,6 +45,7 @@ class Broadcast:
         self._schedule = Schedule(settings)
         self._period = 1.0 / settings.loop.rate
         self._scene = Parts.of(settings)
+        self.truth: Truth | None = None  # a simulated hand's
         self._published = [-1, -1]  # of which n frames one went out, for each finger
         self._states = self._maps = 0  # messages that went out
         self._told = _Counts()  # when the rates were last told
@@ -66,6 +67,8 @@ class Broadcast:
         if publisher.wants_state and schedule.state.due(seq):
             self._states += 1
             publisher.state(state, self._scene, schedule.state.every)
+        if self.truth is not None and publisher.wants_truth and schedule.state.due(seq):
+            publisher.truth(state, self.truth, schedule.state.every)
         if schedule.stats.due(seq):
             rates = self._rates(state)
             if publisher.wants_stats:

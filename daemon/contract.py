@@ -139,6 +139,25 @@ _INPUT = (
     Field("write_error", "str", "", "what the bus failed with when written to, or empty"),
 )
 
+_TRUE = (
+    Field("d", "float", "m", "maximum displacement of the tip, negative: a gap"),
+    Field("theta", "float", "rad", "the object's angle in the tip's frame"),
+    Field("force", "float", "N", "on the tip's base"),
+)
+
+_TRUTH = (
+    *_SENT,
+    Field("mono_ns", "int", "ns", "the daemon's monotonic clock at the tick"),
+    *(
+        part._replace(name=f"{finger}.{part.name}", meaning=f"{finger} finger: {part.meaning}")
+        for finger in FINGERS
+        for part in _TRUE
+    ),
+    Field("object.x", "float", "m", "the object's centre in the hand's frame"),
+    Field("object.y", "float", "m", "and along y"),
+    Field("object.angle", "float", "rad", "the object's angle in the hand's frame"),
+)
+
 _SETTINGS = (
     *_TOLD,
     Field("version", "str", "", "of softfinger"),
@@ -211,6 +230,7 @@ TOPICS: dict[bytes, tuple[Field, ...]] = {
     messages.SETTINGS: _SETTINGS,
     messages.COMMAND: _COMMAND,
     messages.INPUT: _INPUT,
+    messages.TRUTH: _TRUTH,
 }
 
 _SUMMARY = {
@@ -220,6 +240,7 @@ _SUMMARY = {
     messages.STATS: "Once a second, how the loop keeps its time.",
     messages.SETTINGS: "Once, and again for whoever subscribes later: what this hand is.",
     messages.INPUT: "All that a tick took in, every tick: what `replay --recompute` starts from.",
+    messages.TRUTH: "A simulated hand's own knowledge, with each state. No real hand has it.",
     messages.COMMAND: "Each command that was answered, by whomever; `status` is left out.",
 }
 

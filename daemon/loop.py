@@ -14,6 +14,7 @@ from daemon.broadcast import Broadcast
 from daemon.clock import Clock
 from daemon.commands import CommandServer, Handler, Refused
 from daemon.control import Control
+from daemon.messages import Truth
 from daemon.modes import Command, Lease, Mode, parse
 from daemon.perception import FingerPerception
 from daemon.prediction import Held, Prediction
@@ -99,6 +100,11 @@ class Loop:
     def stop(self) -> None:
         """Turn torque off at the next tick, as the command does."""
         self._stopping = True
+
+    def tell_truth(self, truth: Truth | None) -> None:
+        """Publish what a simulated hand knows, too, to those who ask."""
+        if self._broadcast is not None:
+            self._broadcast.truth = truth
 
     # Time
 

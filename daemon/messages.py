@@ -9,7 +9,7 @@ and fields are only ever added. SI units.
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgpack
 import numpy as np
@@ -29,6 +29,7 @@ STATS = b"hand/stats"
 SETTINGS = b"hand/settings"
 COMMAND = b"hand/command"
 INPUT = b"hand/input"
+TRUTH = b"hand/truth"
 
 pack = msgpack.Packer(use_bin_type=True).pack
 
@@ -48,6 +49,15 @@ class Parts(NamedTuple):
             servos=settings.servos.backend != "none",
             sensors=settings.tactile.backend != "none",
         )
+
+
+class Truth(Protocol):
+    """What a simulated hand knows: arrays of both tips, and the object's x, y, φ."""
+
+    d: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    force: NDArray[np.float64]
+    object_pose: NDArray[np.float64]
 
 
 class SensorFacts(NamedTuple):
@@ -179,6 +189,25 @@ def input_message(state: State, frames: tuple[Frame | None, Frame | None]) -> di
         "left": left,
         "right": right,
         "write_error": state.write_error,
+    }
+
+
+def truth_message(state: State, truth: Truth, step: int = 1) -> dict[str, Any]:
+    """The ``hand/truth`` map of a simulated hand, sent every ``step`` ticks."""
+    x, y, angle = (float(value) for value in truth.object_pose)
+    left, right = (
+        {"d": float(d), "theta": float(theta), "force": float(force)}
+        for d, theta, force in zip(truth.d, truth.theta, truth.force, strict=True)
+    )
+    return {
+        "schema": SCHEMA,
+        "seq": state.seq,
+        "seq_step": step,
+        "timestamp": state.wall,
+        "mono_ns": int(state.t * 1e9),
+        "left": left,
+        "right": right,
+        "object": {"x": x, "y": y, "angle": angle},
     }
 
 

@@ -38,6 +38,7 @@ class Publisher:
         self.wants_tactile = False
         self.wants_stats = False
         self.wants_input = False
+        self.wants_truth = False
         self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
         self._told = {messages.EVENT: 0, messages.COMMAND: 0, messages.SETTINGS: 0}
         self._kept: deque[tuple[bytes, dict[str, Any]]] = deque(maxlen=_KEPT)
@@ -61,6 +62,7 @@ class Publisher:
         self.wants_tactile = self._wanted(messages.TACTILE)
         self.wants_stats = self._wanted(messages.STATS)
         self.wants_input = self._wanted(messages.INPUT)
+        self.wants_truth = self._wanted(messages.TRUTH)
 
     def _wanted(self, topic: bytes) -> bool:
         return any(topic.startswith(prefix) for prefix in self._subscriptions)
@@ -72,6 +74,10 @@ class Publisher:
     def input(self, state: State, frames: tuple[Frame | None, Frame | None]) -> None:
         """Publish ``hand/input``, every tick."""
         self._send(messages.INPUT, messages.input_message(state, frames))
+
+    def truth(self, state: State, truth: messages.Truth, step: int = 1) -> None:
+        """Publish ``hand/truth``, every ``step`` ticks."""
+        self._send(messages.TRUTH, messages.truth_message(state, truth, step))
 
     def tactile(
         self,

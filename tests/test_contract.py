@@ -20,6 +20,13 @@ PAGE = Path(daemon.__file__).with_name("STREAM.md")
 KINDS = {"int": int, "float": float, "bool": bool, "str": str, "bin": bytes}
 
 
+class SampleTruth:
+    d = np.array([0.004, -0.001])
+    theta = np.array([0.1, -0.1])
+    force = np.array([10.5, 0.0])
+    object_pose = np.array([0.001, 0.08, 0.05])
+
+
 def sample_state() -> State:
     """A state in which no two fields have the same value."""
     state = State(seq=1234, t=12.5, wall=1.7e9 + 0.25, mode="holding", fault="", torque=True)
@@ -67,6 +74,8 @@ def sample(topic: bytes) -> dict[str, Any]:
             record(statistics.counts, statistics.largest, *times)
         rates = messages.Rates(500.0, 100.0, 99.5, 50.0, 25.0)
         return messages.stats_message(sample_state(), 0.002, rates, statistics, 500)
+    if topic == messages.TRUTH:
+        return messages.truth_message(sample_state(), SampleTruth(), 5)
     if topic == messages.INPUT:
         counts = np.zeros((4, 5), np.uint16)
         frame = Frame(seq=77, t_sample=12.48, t_arrival=12.49, valid=True, data=counts)

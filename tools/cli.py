@@ -20,6 +20,7 @@ SUBCOMMANDS = {
     "record": "record the running daemon's stream into an MCAP file",
     "replay": "publish a recording again, or compare it with what today's code makes of it",
     "analyse": "contact, force and energy over time from recorded pressure frames",
+    "export": "a recording's topics as CSV or Parquet",
     "doctor": "check ports, servos, boards and this machine, and tell what mends them",
     "scan": "find the servos on a port, at any rate",
     "calibrate": "calibrate the pressure sensor under a tip, step by step",

@@ -64,6 +64,11 @@ class Recording:
         """Messages of all channels."""
         return sum(self.counts.values())
 
+    @property
+    def topics(self) -> list[bytes]:
+        """The topics that it has messages of."""
+        return sorted({topic_of(name) for name, count in self.counts.items() if count})
+
     def count(self, topic: bytes) -> int:
         """Messages of one topic."""
         return sum(n for name, n in self.counts.items() if topic_of(name) == topic)
