@@ -118,16 +118,19 @@ def presses_outside(
     d: float,
     n_x: float,
     n_y: float,
+    blur: float,
 ) -> bool:
     """Whether a cell of ``level`` or more, and not it alone, lies two cells off the footprint.
 
-    ``level`` is in the frame's unit; the neighbours' weighted mean must reach a third of it.
+    Three times the ``blur`` [m] are added to the two cells. ``level`` is in the frame's unit; the
+    neighbours' weighted mean must reach a third of it.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape
     readings = address(frame)
     height = address(middles)
     rho = math.sqrt(max(d * (2.0 * a - d), 0.0)) + 2.0 * math.hypot(pitch_x, pitch_y)
+    rho += 3.0 * blur
     if rho >= 0.99 * a:
         return False
     u, v, w = plane(a, a - math.sqrt(a * a - rho * rho), n_x, n_y)

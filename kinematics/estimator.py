@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics import ladder
+from kinematics import ladder, workspace
+from kinematics.blur import parts_to_fit, weights
 from kinematics.cells import CELL_PLANES, LIVE, face_integrals
 from kinematics.contact import Fingertip
 from kinematics.footprint import FloatArray, IntArray
@@ -23,7 +24,6 @@ from kinematics.material import Material
 from kinematics.middles import cell_middles
 from kinematics.moments import moment_ratios
 from kinematics.pressure import SensorGrid
-from kinematics.workspace import INTEGERS, floats_needed
 
 
 @dataclass(slots=True)
@@ -151,14 +151,13 @@ class ContactEstimator:
         face_integrals(geometry, self._cells)
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
         self._cells[:, LIVE] = alive
-        middles, bounds = cell_middles(geometry, alive, tip.radius)
+        middles, bounds = cell_middles(geometry, alive, tip.radius + 3.0 * grid.blur)
         self._tables = np.concatenate(
             [moment_ratios(tip, material).ravel(), fit_law(material.law).ravel()]
         )
-        self._integers = np.zeros(INTEGERS, dtype=np.int64)
-        self._integers[: len(bounds)] = bounds
-        self._floats = np.zeros(floats_needed(rows, cols))
-        self._floats[: middles.size] = middles.ravel()
+        self._floats, self._integers = workspace.make(
+            middles, bounds, grid.shape, _parts(grid, tip) if grid.blur > 0.0 else None
+        )
         plan = np.zeros(ladder.OPTIONS)
         plan[:5] = geometry
         plan[ladder.NOISE] = noise
@@ -173,6 +172,7 @@ class ContactEstimator:
         plan[ladder.EXPLAINED_MIN] = explained_min
         plan[ladder.MODULUS] = material.reference_modulus
         plan[ladder.ROTATION] = grid.rotation
+        plan[ladder.BLUR] = grid.blur
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
         plan[ladder.FLOOR] = max(threshold - 0.5, 0.0)
         self._plan = plan
@@ -242,8 +242,8 @@ class ContactEstimator:
         if full is None:
             kind = getattr(frame, "dtype", type(frame).__name__)
             raise ValueError(f"a frame is uint8, uint16, float32 or float64, got {kind}")
-        if frame.shape != self._frame.shape:
-            raise ValueError(f"a frame must have shape {self._frame.shape}, got {frame.shape}")
+        if frame.shape != self.grid.shape:
+            raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
         self._plan[ladder.SATURATION] = full if self._saturation is None else self._saturation
@@ -272,3 +272,21 @@ class ContactEstimator:
         result.rejected = int(state[ladder.REJECTED])
         result.second = state[ladder.SECOND] > 0.0
         return result
+
+
+def _parts(grid: SensorGrid, tip: Fingertip) -> workspace.Parts:
+    """The parts of cells that a blurred grid is modelled on."""
+    pitch_x, pitch_y = grid.pitches
+    number = parts_to_fit(grid.blur / pitch_x), parts_to_fit(grid.blur / pitch_y)
+    (across, along), finer = grid.finer(number)
+    planes = np.zeros((finer.rows, CELL_PLANES, finer.cols))
+    face_integrals(finer.geometry(tip), planes)
+    planes[:, LIVE] = 1.0
+    return workspace.Parts(
+        number,
+        (len(across) // 2, len(along) // 2),
+        # By the remainder of a part's column first.
+        weights(across, number[0]).reshape(-1, number[0]).T.ravel(),
+        weights(along, number[1]),
+        planes,
+    )

@@ -9,12 +9,30 @@ from __future__ import annotations
 
 import math
 
+from kinematics.blur import spread
+from kinematics.cells import CELL_PLANES
 from kinematics.cut_cells import LEVELS, OWNERS, PLANES, STRIP_ROWS, STRIPS
 from kinematics.footprint import FloatArray, Geometry, IntArray, plane
 from kinematics.kernels import kernel
-from kinematics.likelihood import accumulate, footprint_energy, is_bent
+from kinematics.lane_sums import LANES
+from kinematics.likelihood import accumulate, footprint_energy, is_bent, press
 from kinematics.packing import pack
-from kinematics.workspace import GRID, INTEGERS, INVERSE, OWNED, QUEUES, STEP, SUMS, WORK
+from kinematics.workspace import (
+    GRID,
+    INTEGERS,
+    INVERSE,
+    OWNED,
+    PARTS_X,
+    PARTS_Y,
+    QUEUES,
+    SPREAD_X,
+    SPREAD_Y,
+    STEP,
+    SUMS,
+    WEIGHTS_X,
+    WEIGHTS_Y,
+    WORK,
+)
 
 # Places in what a fit leaves in ``result``.
 D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)
@@ -187,16 +205,54 @@ def fit(
     step = floats[STEP:INVERSE]
     inverse = floats[INVERSE:WORK].reshape(4, 4)
     work = floats[WORK:GRID]
+    # With a blur the parts of cells are modelled, and more of them than the sensor has.
+    places = integers[INTEGERS:]
+    blurred = places.shape[0] > 0
+    parts_x = integers[PARTS_X]
+    parts_y = integers[PARTS_Y]
+    high = rows * parts_y + 2 * integers[SPREAD_Y]
+    wide = cols * parts_x + 2 * integers[SPREAD_X]
+    size = high * wide
     at = GRID
-    columns = floats[at : at + 2 * (cols + 1)].reshape(2, cols + 1)
-    at += 2 * (cols + 1)
-    lines = floats[at : at + 2 * (rows + 1)].reshape(2, rows + 1)
-    at += 2 * (rows + 1)
+    columns = floats[at : at + 2 * (wide + 1)].reshape(2, wide + 1)
+    at += 2 * (wide + 1)
+    lines = floats[at : at + 2 * (high + 1)].reshape(2, high + 1)
+    at += 2 * (high + 1)
     strips = floats[at : at + LEVELS * STRIP_ROWS * STRIPS].reshape(LEVELS, STRIP_ROWS, STRIPS)
     at += LEVELS * STRIP_ROWS * STRIPS
-    packed = floats[at : at + PLANES * rows * cols].reshape(PLANES, rows * cols)
+    packed = floats[at : at + PLANES * size].reshape(PLANES, size)
+    at += PLANES * size
     queues = integers[QUEUES:OWNED].reshape(LEVELS, 2)
     owners = integers[OWNED:INTEGERS].reshape(LEVELS, 2, OWNERS)
+    modelled = geometry
+    readings = frame
+    planes = cells
+    along = half = floats[at:at]
+    across = fine = floats[at:at].reshape(0, 0)
+    if blurred:
+        pitch_x = geometry[3] / parts_x
+        pitch_y = geometry[4] / parts_y
+        modelled = (
+            a,
+            geometry[1] - integers[SPREAD_X] * pitch_x,
+            geometry[2] - integers[SPREAD_Y] * pitch_y,
+            pitch_x,
+            pitch_y,
+        )
+        n_x = integers[WEIGHTS_X]
+        n_y = integers[WEIGHTS_Y]
+        across = floats[at : at + n_x].reshape(parts_x, n_x // parts_x)
+        at += n_x
+        along = floats[at : at + n_y]
+        at += n_y
+        planes = floats[at : at + CELL_PLANES * size].reshape(high, CELL_PLANES, wide)
+        at += CELL_PLANES * size
+        padded = parts_x * (cols + 2 * LANES) + n_x
+        fine = floats[at : at + (high + 1) * padded].reshape(high + 1, padded)
+        # Parts have no readings of their own; what stands here is not used.
+        readings = floats[at : at + size].reshape(high, wide)
+        at += (high + 1) * padded
+        half = floats[at : at + padded]
     bent = is_bent(law)
     u, v, w = plane(a, result[D], result[N_X], result[N_Y])
     gain = result[GAIN]
@@ -209,9 +265,9 @@ def fit(
             u,
             v,
             w,
-            geometry,
-            cells,
-            frame,
+            modelled,
+            planes,
+            readings,
             scale,
             bent,
             columns,
@@ -220,7 +276,23 @@ def fit(
             queues,
             owners,
             packed,
+            places,
         )
+        press(packed, count, u, v, w, law)
+        if blurred:
+            count = spread(
+                packed,
+                count,
+                places,
+                frame,
+                scale,
+                cells,
+                across,
+                along,
+                parts_y,
+                fine,
+                half,
+            )
         clip = 0.0
         if clipped:
             # Free cells show how much of the noise there is; where a board sends none at all
@@ -230,7 +302,7 @@ def fit(
             if number - inside_number >= 16.0:
                 free_square = max(energy - inside, 0.0) / (number - inside_number)
                 clip = min(clip, free_noise(free_square, floor))
-        accumulate(packed, count, u, v, w, gain, saturation, floor, clip, law, sums)
+        accumulate(packed, count, gain, saturation, floor, clip, sums)
         now = sums[14] - sums[15]
         if solved and not now <= cost + variance and halvings < 5:
             # Too far: half way back.

@@ -59,8 +59,9 @@ STATE = COVARIANCE + 16
     MODULUS,
     ROTATION,
     FLOOR,
-) = range(5, 18)
-OPTIONS = 18
+    BLUR,
+) = range(5, 19)
+OPTIONS = 19
 
 # Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
 CLIPPED_MORE = 0.5
@@ -106,6 +107,7 @@ def _start(
             modulus,
             fixed,
             noise,
+            plan[BLUR],
             d,
             n_x,
             n_y,
@@ -144,6 +146,7 @@ def _moments(
             plan[MODULUS] / scale,
             fixed,
             noise,
+            plan[BLUR],
             state[D],
             state[N_X],
             state[N_Y],
@@ -224,7 +227,15 @@ def _likelihood(
             if misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * noise, 0.15 * state[PEAK] / scale)
                 state[SECOND] = presses_outside(
-                    frame, middles, geometry, integers, level, state[D], state[N_X], state[N_Y]
+                    frame,
+                    middles,
+                    geometry,
+                    integers,
+                    level,
+                    state[D],
+                    state[N_X],
+                    state[N_Y],
+                    plan[BLUR],
                 )
             if not state[SECOND] > 0.0:
                 return True

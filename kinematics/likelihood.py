@@ -18,6 +18,9 @@ from kinematics.footprint import FloatArray
 from kinematics.kernels import fast_kernel, inlined_kernel, kernel
 
 SUMS = 17
+
+# What `press` makes of the first planes of the packed cells.
+STRESS, BY_U, BY_V, BY_W = SHARE, PLAIN, ALONG_X, ALONG_Y
 Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 
 # A cell that can't read below its floor (0, or the smallest count sent) reads more than the
@@ -129,34 +132,15 @@ def _compared(
 
 
 @fast_kernel
-def accumulate(
-    packed: FloatArray,
-    count: int,
-    u: float,
-    v: float,
-    w: float,
-    gain: float,
-    saturation: float,
-    floor: float,
-    clip: float,
-    law: FloatArray,
-    sums: FloatArray,
-) -> None:
-    """Sums for one Gauss-Newton step over the packed cells, into ``sums`` [17].
+def press(packed: FloatArray, count: int, u: float, v: float, w: float, law: FloatArray) -> None:
+    """Put the material into the packed cells, in place.
 
-    Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
-    factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
-    sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
-    below its end. No reading is less than ``floor`` [Pa], below which a board sends 0; −inf for
-    none. ``clip`` > 0 is the noise [Pa] of cells that end there; without it a cell that the model
-    puts below the floor doesn't count.
+    STRESS takes the mean stress over each cell, BY_U, BY_V and BY_W its derivatives by −u, v and w:
+    σ' times the means of g, x g and y g.
     """
-    # Neither changes within the loop, of which the compiler makes four.
+    # It doesn't change within the loop, of which the compiler makes two.
     polynomial = law.shape[0] == 2
-    clipped = clip > 0.0
     c = (law[0, 0], law[0, 1], law[0, 2], law[0, 3], law[1, 0], law[1, 1], law[1, 2], law[1, 3])
-    s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
-    r0 = r1 = r2 = r3 = rr = yy = ww = 0.0
     for k in range(count):
         # Arrays are read here alone: a function that took one would keep the loop out of lanes.
         share = packed[SHARE, k]
@@ -180,6 +164,39 @@ def accumulate(
         half = half if strain < 1.0 else 0.0
         stress = share * (stress + half * packed[VARIANCE, k])
         slope *= share
+        packed[STRESS, k] = stress
+        packed[BY_U, k] = slope * g
+        packed[BY_V, k] = slope * g_x
+        packed[BY_W, k] = slope * g_y
+
+
+@fast_kernel
+def accumulate(
+    packed: FloatArray,
+    count: int,
+    gain: float,
+    saturation: float,
+    floor: float,
+    clip: float,
+    sums: FloatArray,
+) -> None:
+    """Sums for one Gauss-Newton step over the pressed cells, into ``sums`` [17].
+
+    Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
+    factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
+    sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
+    below its end. No reading is less than ``floor`` [Pa], below which a board sends 0; −inf for
+    none. ``clip`` > 0 is the noise [Pa] of cells that end there; without it a cell that the model
+    puts below the floor doesn't count.
+    """
+    clipped = clip > 0.0
+    s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
+    r0 = r1 = r2 = r3 = rr = yy = ww = 0.0
+    for k in range(count):
+        stress = packed[STRESS, k]
+        a1 = packed[BY_U, k]
+        a2 = packed[BY_V, k]
+        a3 = packed[BY_W, k]
         reading = packed[READING, k]
         residual, response, counts = _compared(
             stress, gain, reading, saturation, floor, clip, clipped
@@ -188,10 +205,9 @@ def accumulate(
         weight = packed[WEIGHT, k] * counts
         if clipped:
             stress *= response
-            slope *= response
-        a1 = slope * g
-        a2 = slope * g_x
-        a3 = slope * g_y
+            a1 *= response
+            a2 *= response
+            a3 *= response
         w0 = weight * stress
         w1 = weight * a1
         w2 = weight * a2

@@ -26,6 +26,7 @@ from kinematics.middles import FIRST, LAST, X, Y, next_above, sums_above, sums_i
 # How much wider than the footprint the cells' middles are looked for, in a cell's diagonals: so all
 # that touch it are in, even where the contact moved a little.
 _MARGIN = 0.75
+_BLUR_MARGIN = 2.0  # and in standard deviations of the blur
 
 RATIO_POINTS = 33
 RATIO_END = 0.8  # of the radius
@@ -89,13 +90,14 @@ def footprint_moments(
     u: float,
     v: float,
     w: float,
+    own: float,
 ) -> tuple[float, float, float, float, float]:
     """(Σp, centroid x, y, trace of the covariance, cells) over the cells that the face presses.
 
-    Those whose middle lies in the footprint of (u, v, w). Lengths in m from the tip's centre, the
-    cells' own variance pitch²/12 already taken off.
+    Those whose middle lies in the footprint of (u, v, w). Lengths in m from the tip's centre;
+    ``own`` [m²] is the trace of a point's own spread over cells, which is taken off.
     """
-    a, _, y_first, pitch_x, pitch_y = geometry
+    a, _, y_first, _, pitch_y = geometry
     rows, cols = frame.shape
     total = sum_x = sum_y = square = number = 0.0
     ends = extremes(u, v, w, a)
@@ -117,7 +119,6 @@ def footprint_moments(
         return 0.0, 0.0, 0.0, 0.0, number
     x = sum_x / total
     y = sum_y / total
-    own = (pitch_x * pitch_x + pitch_y * pitch_y) / 12.0
     return total, x, y, square / total - x * x - y * y - own, number
 
 
@@ -231,6 +232,7 @@ def refine(
     modulus: float,
     fixed_gain: float,
     noise: float,
+    blur: float,
     d: float,
     n_x: float,
     n_y: float,
@@ -238,16 +240,19 @@ def refine(
 ) -> tuple[float, float, float, float]:
     """(d, n_x, n_y, gain) from the moments over the footprint of the contact given, a cell wider.
 
+    ``blur`` [m] is the standard deviation of a point's spread, besides the cells' own pitch²/12.
+
     ``modulus`` E₀ and ``noise`` are in the frame's unit. With ``fixed_gain`` > 0 the displacement
     comes from the force, otherwise from the extent and the gain from the force. ``covariance``
     float64 [16] takes that of (d, n_x, n_y, gain) from white noise over those cells; the gain is 0
     where nothing presses.
     """
     a = geometry[0]
-    margin = _MARGIN * math.hypot(geometry[3], geometry[4])
+    margin = _MARGIN * math.hypot(geometry[3], geometry[4]) + _BLUR_MARGIN * blur
     rho = min(math.sqrt(max(d * (2.0 * a - d), 0.0)) + margin, 0.99 * a)
     u, v, w = plane(a, a - math.sqrt(a * a - rho * rho), n_x, n_y)
-    moments = footprint_moments(frame, middles, bounds, geometry, u, v, w)
+    own = (geometry[3] * geometry[3] + geometry[4] * geometry[4]) / 12.0 + 2.0 * blur * blur
+    moments = footprint_moments(frame, middles, bounds, geometry, u, v, w, own)
     covariance[:] = 0.0
     gain = 0.0
     if moments[0] > 0.0:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from kinematics.blur import PLACE_BITS
 from kinematics.cells import (
     LIVE,
     PLAIN_MEAN,
@@ -67,12 +68,14 @@ def pack(
     queues: IntArray,
     owners: IntArray,
     packed: FloatArray,
+    places: IntArray,
 ) -> int:
     """Gather the footprint's cells into ``packed`` [PLANES, n]; returns n.
 
     ``cells`` [rows, CELL_PLANES, cols] is what :func:`kinematics.cells.face_integrals` gives.
-    ``bent``: the strain's variance is wanted, too. ``columns`` [2, cols + 1], ``lines`` [2,
-    rows + 1], ``strips``, ``queues`` and ``owners`` are scratch, see workspace.py.
+    ``bent``: the strain's variance is wanted, too. ``places`` takes the cells' rows and columns,
+    see :func:`kinematics.blur.spread`, unless it is empty. ``columns`` [2, cols + 1], ``lines``
+    [2, rows + 1], ``strips``, ``queues`` and ``owners`` are scratch, see workspace.py.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape
@@ -89,6 +92,7 @@ def pack(
     cosine2 = 1.0 / (1.0 + v * v + w * w)
     rho2 = max(a * a - u * u * cosine2, 0.0)
     low = u * cosine2 - math.sqrt(rho2 * (1.0 - cosine2)) < 0.2 * a
+    placed = places.shape[0] > 0
     count = 0
     for i in range(first_row, last_row):
         y0 = y_first + i * pitch_y
@@ -128,6 +132,8 @@ def pack(
                 live = cells[i, LIVE, j]
                 packed[READING, count] = frame[i, j] * scale if live > 0.0 else 0.0
                 packed[WEIGHT, count] = live
+                if placed:
+                    places[count] = (i << PLACE_BITS) | j
                 waiting = queues[level, WAITING]
                 owners[level, 0, waiting] = count
                 owners[level, 1, waiting] = filled
@@ -149,6 +155,9 @@ def pack(
                     )
         n = inner_last - inner_first
         if n > 0:
+            if placed:
+                for k in range(n):
+                    places[count + k] = (i << PLACE_BITS) | (inner_first + k)
             copy_whole(
                 cells[i, :, inner_first:inner_last],
                 frame[i, inner_first:inner_last],

@@ -11,7 +11,7 @@ from kinematics.contact import Fingertip
 from kinematics.cut_cells import PLANES
 from kinematics.estimator import ContactEstimator
 from kinematics.gauss_newton import free_noise
-from kinematics.likelihood import CLIP_BELOW, accumulate, fit_law
+from kinematics.likelihood import CLIP_BELOW, accumulate, fit_law, press
 from kinematics.material import Material
 from kinematics.pressure import SensorGrid
 
@@ -40,7 +40,9 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
         u = (1.0 - model / gain / E) / g
         sums = np.zeros(17)
         law = fit_law(LINEAR.law)
-        accumulate(packed, 1, u, 0.0, 0.0, gain, math.inf, floor, noise, law, sums)
+        pressed = packed.copy()
+        press(pressed, 1, u, 0.0, 0.0, law)
+        accumulate(pressed, 1, gain, math.inf, floor, noise, sums)
         mean, response = mean_of(np.array(model), floor, noise)
         residual = 3300.0 - mean
         assert sums[14] == pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
@@ -52,7 +54,9 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
     below = floor - (CLIP_BELOW + 0.1) * noise
     if below > 0.0:
         u = (1.0 - below / gain / E) / g
-        accumulate(packed, 1, u, 0.0, 0.0, gain, math.inf, floor, noise, law, sums)
+        pressed = packed.copy()
+        press(pressed, 1, u, 0.0, 0.0, law)
+        accumulate(pressed, 1, gain, math.inf, floor, noise, sums)
         assert sums[16] == 0.0
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from kinematics.activity import activity
 from kinematics.cut_cells import PLANES
-from kinematics.likelihood import SUMS, accumulate, fit_law, is_bent
+from kinematics.likelihood import SUMS, accumulate, fit_law, is_bent, press
 from kinematics.material import Material
 from kinematics.middles import cell_middles
 
@@ -65,7 +65,9 @@ def test_normal_equations_match_their_plain_twin():
     sums = np.zeros(SUMS)
     saturation = 2e4
     floor = 1.3e4
-    accumulate(packed, n, u, v, w, gain, saturation, floor, 0.0, fit_law(MEASURED.law), sums)
+    pressed = packed.copy()
+    press(pressed, n, u, v, w, fit_law(MEASURED.law))
+    accumulate(pressed, n, gain, saturation, floor, 0.0, sums)
     strain = 1.0 - (u * packed[1] - v * packed[2] - w * packed[3])
     step = 1e-4
     stress = MEASURED.stress(strain)

@@ -1,0 +1,239 @@
+"""The elastomer's blur: forward against a dense convolution, and in the estimator at the bound."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from kinematics.blur import PLACE_BITS, PLANES, spread, stencil, weights
+from kinematics.cells import CELL_PLANES, LIVE
+from kinematics.contact import Fingertip
+from kinematics.cut_cells import READING, WEIGHT
+from kinematics.estimator import ContactEstimator
+from kinematics.lane_sums import LANES
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+
+A = 0.020
+E = 0.304e6
+TIP = Fingertip(A)
+LINEAR = Material.constant(E)
+MEASURED = Material.table_i()
+PITCH = 0.058 / 44
+NOISE = 0.002
+
+
+def dense(grid, material, contact, parts=16, margin=6):
+    """Pressure sampled ``parts`` times a cell's side, blurred by SciPy, averaged over cells."""
+    d, tilt_x, tilt_y = contact
+    axes = []
+    for cells, pitch, centre in zip((grid.cols, grid.rows), grid.pitches, grid.centre, strict=True):
+        count = (cells + 2 * margin) * parts
+        axes.append((np.arange(count) + 0.5 - 0.5 * count) * pitch / parts - centre)
+    x, y = axes[0][None, :], axes[1][:, None]
+    n_x, n_y = grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
+    face = (A - d - n_x * x - n_y * y) / math.sqrt(1.0 - n_x**2 - n_y**2)
+    inside = x * x + y * y < A * A
+    height = np.sqrt(np.where(inside, A * A - x * x - y * y, 1.0))
+    strain = np.where(inside, 1.0 - np.maximum(face, 0.0) / height, 0.0)
+    pressure = material.stress(np.clip(strain, 0.0, 1.0))
+    widths = [grid.blur / pitch * parts for pitch in grid.pitches[::-1]]
+    pressure = gaussian_filter(pressure, widths, truncate=6.0)
+    edge = margin * parts
+    kept = pressure[edge:-edge, edge:-edge]
+    return kept.reshape(grid.rows, parts, grid.cols, parts).mean(axis=(1, 3))
+
+
+def tilts(degrees, azimuth):
+    s = math.sin(math.radians(degrees))
+    return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
+
+
+def bound(grid, material, truth, noise, free):
+    columns = []
+    for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free else 3]):
+        ends = []
+        for sign in (1.0, -1.0):
+            at = [*truth, 1.0]
+            at[k] += sign * step
+            ends.append(grid.pressure(TIP, material, *at))
+        columns.append(((ends[0] - ends[1]) / (2 * step)).ravel())
+    jacobian = np.stack(columns, axis=1)
+    return np.linalg.inv(jacobian.T @ jacobian) * noise**2
+
+
+@pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
+@pytest.mark.parametrize("blur", [0.0002, 0.0006, 0.0016])
+def test_the_forward_model_is_a_convolution_of_the_pressure(material, blur):
+    for contact in ((0.0005, 0.1, 0.0), (0.002, 0.3, -0.1), (0.006, 0.3, 0.2)):
+        grid = SensorGrid(44, 44, PITCH, (0.0004, -0.0003), blur=blur)
+        found = grid.pressure(TIP, material, *contact)
+        miss = np.abs(found - dense(grid, material, contact)) / material.reference_modulus
+        assert miss.max() < 1.5e-4
+
+
+def test_the_forward_model_takes_in_what_presses_beyond_the_edge_of_an_oblong_turned_sensor():
+    grid = SensorGrid(20, 30, (0.0013, 0.0017), (0.013, 0.002), rotation=0.6, blur=0.0012)
+    contact = (0.005, 0.2, 0.1)
+    found = grid.pressure(TIP, LINEAR, *contact)
+    assert found[:, -1].max() > 0.2 * found.max()
+    np.testing.assert_allclose(found, dense(grid, LINEAR, contact), atol=1e-4 * E)
+
+
+def test_stencils_have_the_gaussians_moments():
+    for width in (0.05, 0.3, 0.6, 0.74, 0.76, 1.0, 3.0):
+        w = stencil(width)
+        k = np.arange(len(w)) - len(w) // 2
+        assert w.sum() == pytest.approx(1.0, abs=1e-12)
+        assert w @ k**2 == pytest.approx(width**2, rel=1e-3)
+        assert w @ k**4 == pytest.approx(3.0 * width**4, rel=5e-3)
+    assert stencil(0.0).tolist() == [1.0]
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("width", [0.3, 1.4])
+def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
+    rng = np.random.default_rng(6)
+    rows, cols = 13, 17
+    one = stencil(width * parts)
+    reach = len(one) // 2
+    high, wide = rows * parts + 2 * reach, cols * parts + 2 * reach
+    whole = weights(one, parts)
+    across = np.ascontiguousarray(whole.reshape(-1, parts).T)
+    frame = rng.random((rows, cols))
+    cells = np.zeros((rows, CELL_PLANES, cols))
+    cells[:, LIVE] = rng.random((rows, cols)) > 0.1
+    padded = parts * (cols + 2 * LANES) + len(whole)
+    scratch = np.zeros((high + 1, padded)), np.zeros(padded)
+    for low, left, tall, broad in ((0, 0, high, wide), (3, 4, 5, 6), (high - 2, wide - 3, 2, 3)):
+        i, j = (each.ravel() for each in np.mgrid[low : low + tall, left : left + broad])
+        places = (i << PLACE_BITS) | j
+        packed = np.zeros((7, high * wide))
+        packed[:PLANES, : len(i)] = rng.random((PLANES, len(i)))
+        expected = np.zeros((PLANES, rows, cols))
+        for plane in range(PLANES):
+            field = np.zeros((high, wide))
+            field[i, j] = packed[plane, : len(i)]
+            blurred = np.zeros((rows * parts, cols * parts))
+            for y in range(len(one)):
+                for x in range(len(one)):
+                    part = field[y : y + rows * parts, x : x + cols * parts]
+                    blurred += one[y] * one[x] * part
+            expected[plane] = blurred.reshape(rows, parts, cols, parts).mean(axis=(1, 3))
+        count = spread(
+            packed, len(i), places.copy(), frame, 2.0, cells, across, whole, parts, *scratch
+        )
+        # Cells that take part are told by their readings, of which no two are equal.
+        seen = 0
+        for k in range(count):
+            if packed[WEIGHT, k]:
+                at = np.argwhere(2.0 * frame == packed[READING, k])[0]
+                np.testing.assert_allclose(
+                    packed[:PLANES, k], expected[:, at[0], at[1]], atol=1e-12
+                )
+                expected[:, at[0], at[1]] = 0.0
+                seen += 1
+        assert seen > 0
+        assert np.all(expected * cells[:, LIVE] == 0.0)
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+@pytest.mark.parametrize(
+    ("material", "blur", "d", "degrees"),
+    [
+        (LINEAR, 0.0006, 0.001, 20.0),
+        (LINEAR, 0.001, 0.004, 15.0),
+        (MEASURED, 0.0016, 0.006, 25.0),
+        (MEASURED, 0.0004, 0.002, 10.0),
+    ],
+)
+def test_errors_with_a_blur_are_at_the_bound_and_the_covariance_says_so(
+    material, blur, d, degrees, free_gain
+):
+    noise = NOISE * material.reference_modulus
+    grid = SensorGrid(44, 44, PITCH, (2e-4, -5e-4), blur=blur)
+    truth = (d, *tilts(degrees, 0.8))
+    covariance = bound(grid, material, truth, noise, free_gain)
+    estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
+    rng = np.random.default_rng(9)
+    clean = dense(grid, material, truth)  # not the estimator's own forward model
+    frames = 300
+    miss = np.empty((frames, 3))
+    nees = np.empty(frames)
+    for k in range(frames):
+        e = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
+        assert e.valid
+        miss[k] = (e.d - truth[0], e.tilt_x - truth[1], e.tilt_y - truth[2])
+        nees[k] = miss[k] @ np.linalg.solve(e.covariance[:3, :3], miss[k]) / 3.0
+    ratio = np.sqrt((miss**2).mean(axis=0) / np.diag(covariance)[:3])
+    # 300 frames scatter the ratio by 4 %.
+    assert np.all(ratio < 1.13), ratio
+    assert np.all(ratio > 0.85), ratio
+    assert abs(nees.mean() - 1.0) < 4.0 * math.sqrt(2.0 / (3 * frames)) + 0.05
+
+
+def test_a_blur_that_is_not_modelled_shows():
+    grid = SensorGrid(44, 44, PITCH, blur=0.001)
+    truth = (0.004, *tilts(15.0, 0.3))
+    frame = grid.pressure(TIP, LINEAR, *truth)
+    sharp = ContactEstimator(TIP, LINEAR, SensorGrid(44, 44, PITCH), NOISE * E)(frame)
+    aware = ContactEstimator(TIP, LINEAR, grid, NOISE * E)(frame)
+    assert abs(aware.d - truth[0]) < 0.1 * aware.d_std
+    assert abs(sharp.d - truth[0]) > 5.0 * aware.d_std
+    assert sharp.chi2 > 10 * aware.chi2
+
+
+@pytest.mark.parametrize("blur", [0.0005, 0.0015])
+def test_moments_are_corrected_for_the_blur(blur):
+    grid = SensorGrid(44, 44, PITCH, (3e-4, 1e-4), blur=blur)
+    plain = SensorGrid(44, 44, PITCH, (3e-4, 1e-4))
+    for d in (0.002, 0.004, 0.008):
+        truth = (d, *tilts(15.0, 1.0))
+        frame = grid.pressure(TIP, LINEAR, *truth)
+        e = ContactEstimator(TIP, LINEAR, grid, NOISE * E, method="moments")(frame)
+        assert e.d == pytest.approx(d, rel=0.01)
+        assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:], abs=0.004)
+        off = ContactEstimator(TIP, LINEAR, plain, NOISE * E, method="moments")(frame)
+        assert abs(off.d - d) > 3.0 * abs(e.d - d)
+
+
+def test_a_blurred_footprint_cut_by_the_sensors_edge_still_fits():
+    grid = SensorGrid(44, 44, PITCH, centre=(0.021, 0.0), blur=0.001)
+    truth = (0.004, 0.35, 0.1)
+    clean = grid.pressure(TIP, LINEAR, *truth)
+    assert clean[:, -1].max() > 0.05 * clean.max()
+    rng = np.random.default_rng(5)
+    estimator = ContactEstimator(TIP, LINEAR, grid, NOISE * E)
+    for _ in range(20):
+        e = estimator(clean + rng.normal(0.0, NOISE * E, grid.shape))
+        assert e.valid
+        miss = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
+        assert np.all(np.abs(miss) < 4.5 * np.sqrt(np.diag(e.covariance))[:3])
+
+
+def test_dead_cells_counts_and_thresholds_go_with_a_blur():
+    rng = np.random.default_rng(7)
+    grid = SensorGrid(44, 44, PITCH, blur=0.0008)
+    live = rng.random(grid.shape) > 0.02
+    truth = (0.003, 0.2, -0.1)
+    clean = grid.pressure(TIP, MEASURED, *truth)
+    estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, live=live, free_gain=False)
+    score = []
+    for _ in range(150):
+        counts = np.clip(np.round((clean + rng.normal(0.0, 600.0, grid.shape)) / 50.0), 0, 65535)
+        counts[~live] = 65535
+        e = estimator.update(counts.astype(np.uint16), 50.0)
+        assert e.valid
+        miss = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
+        score.append(miss / np.sqrt(np.diag(e.covariance))[:3])
+    assert np.all(np.abs(np.mean(score, axis=0)) < 4.5 / math.sqrt(150))
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)
+
+
+@pytest.mark.parametrize("blur", [-1e-4, math.nan, math.inf, 0.05])
+def test_a_blur_that_is_none_is_refused(blur):
+    with pytest.raises(ValueError, match="blur"):
+        SensorGrid(44, 44, PITCH, blur=blur)
