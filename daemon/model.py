@@ -111,20 +111,27 @@ def make_table(
 def make_grid(
     settings: Settings, finger: int = 0, calibration: Calibration | None = None
 ) -> SensorGrid:
-    """The sensor's cells under one finger, where the calibration says if there is one."""
+    """The sensor's cells under one finger, where the calibration says if there is one.
+
+    Raises SettingsError for a blur wider than half the sensor.
+    """
     tactile = settings.tactile
     centre, rotation = tactile.centre, tactile.rotation[finger]
     if calibration is not None and calibration.centre is not None:
         centre = calibration.centre.centre
         if calibration.centre.rotation is not None:
             rotation = calibration.centre.rotation
-    return SensorGrid(
-        rows=tactile.rows,
-        cols=tactile.cols,
-        pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
-        centre=centre,
-        rotation=rotation,
-    )
+    try:
+        return SensorGrid(
+            rows=tactile.rows,
+            cols=tactile.cols,
+            pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
+            centre=centre,
+            rotation=rotation,
+            blur=tactile.blur,
+        )
+    except ValueError as error:
+        raise SettingsError(f"tactile.blur: {error}") from None
 
 
 def live_cells(settings: Settings, finger: int) -> NDArray[np.bool_]:

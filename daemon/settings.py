@@ -118,6 +118,7 @@ class TactileSettings(Section):
     pitch_y: NonNegative = 0.0  # from row to row; 0: as pitch
     centre: tuple[Place, Place] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
     rotation: tuple[Angle, Angle] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
+    blur: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, the elastomer's standard deviation
     dead: tuple[Cells, Cells] = ((), ())  # cells [row, col] that are left out
     threshold: Annotated[int, Field(ge=0, le=255)] = 0  # smallest count sent; 0 stands for less
     pascal_per_count: Positive = 4.0

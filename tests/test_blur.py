@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from daemon.model import make_estimator, make_grid, make_material
+from daemon.settings import Settings, SettingsError
+from daemon.simulation.sensor_model import Imperfections, SensorModel
 from kinematics.blur import PLACE_BITS, PLANES, spread, stencil, weights
 from kinematics.cells import CELL_PLANES, LIVE
 from kinematics.contact import Fingertip
@@ -237,3 +240,27 @@ def test_dead_cells_counts_and_thresholds_go_with_a_blur():
 def test_a_blur_that_is_none_is_refused(blur):
     with pytest.raises(ValueError, match="blur"):
         SensorGrid(44, 44, PITCH, blur=blur)
+
+
+def test_the_settings_blur_goes_into_the_fingers_estimator():
+    blurred = {"tactile": {"blur": 0.001}, "simulation": {"tactile_blur": 0.001}}
+    settings = Settings.model_validate(blurred)
+    material = make_material(settings.material)
+    tactile = settings.tactile
+    sensor = SensorModel(
+        make_grid(settings),
+        TIP,
+        material,
+        tactile.pascal_per_count,
+        flaws=Imperfections(noise=300.0, blur=settings.simulation.tactile_blur),
+    )
+    estimator = make_estimator(settings, material)
+    counts = np.zeros((tactile.rows, tactile.cols), np.uint16)
+    sensor.frame(0.004, 0.2, -0.1, counts)
+    e = estimator(counts, tactile.pascal_per_count)
+    assert e.valid
+    assert e.d == pytest.approx(0.004, abs=2e-5)
+    assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=2e-3)
+    few = Settings.model_validate({"tactile": {"rows": 4, "cols": 4, "blur": 0.005}})
+    with pytest.raises(SettingsError, match=r"tactile\.blur"):
+        make_grid(few)
