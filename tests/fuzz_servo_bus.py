@@ -15,7 +15,8 @@ from typing import NamedTuple
 from daemon.servos import registers as reg
 from daemon.simulation import protocol
 from daemon.simulation.protocol import BROADCAST, Parser, frame
-from daemon.simulation.servo import REBOOT_TIME
+from daemon.simulation.servo import REBOOT_TIME, EmulatedServo
+from daemon.simulation.servo_bus import ServoBus
 from tests.servo_harness import make_bus
 
 SEEDS = (
@@ -75,9 +76,16 @@ def fuzz(count: int, seed: int) -> Report:
         slowest = max(slowest, time.perf_counter() - begin)
     t += REBOOT_TIME + 0.1
     bus.advance(t)
-    names = {servo.id for servo in bus.servos}
+    alive = all(_answers_alone(bus, servo, t) for servo in bus.servos)
+    return Report(bus.packets, alive, slowest)
+
+
+def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
+    """To a ping, with the others unplugged: by now they may all have one ID."""
+    for each in bus.servos:
+        each.silent = each is not servo
     found = Parser().feed(bus.feed(frame(BROADCAST, protocol.PING), t), 0.0)
-    return Report(bus.packets, {packet.id for packet in found} == names, slowest)
+    return [packet.id for packet in found] == [servo.id]
 
 
 def main() -> int:
