@@ -20,6 +20,20 @@ def test_each_rung_each_step_and_the_bound_have_rows(rows):
     for rung in ("moments", "ml, gain free", "ml, gain known"):
         assert {f"{rung}, warm: kernel", f"{rung}, cold: kernel"} <= set(times)
     assert times["ml, gain free, warm: kernel"].aim_us == 15.0
+    for skip_on, skip_off in (
+        ("no contact, activity test: kernel", "no contact, fitted all the same: kernel"),
+        ("frame already seen: call", "ml, gain free, warm: call"),
+        ("ml, gain free, warm: kernel", "ml, gain free, warm, no early stop: kernel"),
+        (
+            "moments' sums over the rows of the footprint's box: kernel",
+            "moments' sums over the rows of the tip's disc: kernel",
+        ),
+        ("no contact, activity test: kernel", "no contact, the whole grid looked at: kernel"),
+        ("ml, gain free, warm: kernel", "ml, gain free, blur 1 mm, warm: kernel"),
+    ):
+        assert {skip_on, skip_off} <= set(times)
+    assert times["moments at (8 mm, 30°), warm: kernel"].d_rms < 8e-6
+    assert times["ml, gain free, blur 1 mm, warm: kernel"].d_rms < 1e-5
     limit = times["the bound, gain free"].d_rms
     assert 0.6 * limit < times["ml, gain free, warm: call"].d_rms < 1.6 * limit
     assert times["NumPy moments over a threshold"].d_rms > 3 * limit

@@ -1,4 +1,4 @@
-"""A compiled loop that calls the estimator's entry frame by frame."""
+"""Compiled loops that call the estimator's entry, or one step of it, frame by frame."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from numpy.typing import NDArray
 
 from kinematics import ladder
 from kinematics.estimator import ContactEstimator
+from kinematics.footprint import plane
 from kinematics.kernels import kernel
-from kinematics.middles import BOUNDS, HEIGHT
+from kinematics.lanes import address
+from kinematics.middles import BOUNDS, FIRST, HEIGHT, LAST, PLANES, sums_inside
+from kinematics.moments import footprint_moments
 
 FloatArray = NDArray[np.float64]
 OUTPUTS = 4  # d, tilt_x, tilt_y, 1 for a valid contact
@@ -53,3 +56,57 @@ def whole_grid(estimator: ContactEstimator) -> ContactEstimator:
     height[:] = np.maximum(height, 0.0)
     integers[:BOUNDS] = 0, size, size
     return estimator
+
+
+@kernel
+def _moments_loop(
+    repeat: int,
+    frames: FloatArray,
+    boxed: bool,
+    plan: FloatArray,
+    middles: FloatArray,
+    bounds: NDArray[np.int64],
+    truth: tuple[float, float, float],
+    out: FloatArray,
+) -> None:
+    geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
+    a, d = plan[0], truth[0]
+    u, v, w = plane(a, d, truth[1], truth[2])
+    rows, cols = frames.shape[1], frames.shape[2]
+    own = (plan[3] * plan[3] + plan[4] * plan[4]) / 12.0
+    for _ in range(repeat):
+        for k in range(frames.shape[0]):
+            if boxed:
+                found = footprint_moments(frames[k], middles, bounds, geometry, u, v, w, own)
+            else:
+                found = disc_moments(frames[k], middles, bounds, rows * cols, u, v, w)
+            out[k, 0] = found[0]
+
+
+@kernel
+def disc_moments(
+    frame: FloatArray,
+    middles: FloatArray,
+    bounds: NDArray[np.int64],
+    size: int,
+    u: float,
+    v: float,
+    w: float,
+) -> tuple[float, float, float, float, float]:
+    """The same sums as the footprint's, over all rows of the tip's disc."""
+    return sums_inside(address(frame), address(middles), size, bounds[FIRST], bounds[LAST], u, v, w)
+
+
+def run_moments(
+    estimator: ContactEstimator,
+    frames: FloatArray,
+    truth: tuple[float, float, float],
+    boxed: bool,
+    out: FloatArray,
+    repeat: int = 1,
+) -> None:
+    """The moments' sums for a contact (d, n_x, n_y), over the rows of its box or all; Σp in out."""
+    plan, _, _, _, floats, integers = estimator.compiled_arguments()
+    size = frames[0].size
+    middles = floats[: PLANES * size].reshape(PLANES, size)
+    _moments_loop(repeat, frames, boxed, plan, middles, integers, truth, out)
