@@ -22,7 +22,8 @@ from daemon.settings import Settings
 GRIPPING = frozenset({Mode.GRASPING, Mode.HOLDING, Mode.ROTATING})
 HELD = frozenset({Mode.HOLDING, Mode.ROTATING})
 PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
-_FULL_CURRENT = 0.9  # of the bound: a joint that takes more has no reserve
+_FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
+_ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
 _SLOW = 0.05  # rad/s below which a joint stands
 
 
@@ -150,7 +151,7 @@ def joint_strained(view: View, state: State, share: float) -> str:
     if not state.torque or state.mode not in GRIPPING:
         return ""
     for index in view.fingers:
-        if state.goal.current[index] >= share * view.limits.current_max:
+        if abs(state.reading.current[index]) >= _ALL * share * view.limits.current_max:
             return f"{FINGERS[index]} joint grips with all of its {view.limits.current_max:g} A"
     return ""
 

@@ -374,7 +374,7 @@ def unequal_forces(state: State) -> None:
 
 
 def strained(state: State) -> None:
-    state.goal.current = [1.2, 0.3]
+    state.reading.current = [1.19, 0.3]
 
 
 def warm(state: State) -> None:
