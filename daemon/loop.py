@@ -60,7 +60,7 @@ class Loop:
         server: Commands | None,
         on_event: EventSink | None = None,
     ) -> None:
-        self.state = State()
+        self.state = State(t=clock.now(), wall=clock.wall())
         self.period = 1.0 / settings.loop.rate
         self._settings = settings
         self._clock = clock

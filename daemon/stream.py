@@ -43,6 +43,7 @@ class Publisher:
         self._told = {messages.EVENT: 0, messages.COMMAND: 0, messages.SETTINGS: 0}
         self._kept: deque[tuple[bytes, dict[str, Any]]] = deque(maxlen=_KEPT)
         self._settings: list[tuple[bytes, dict[str, Any]]] = []
+        self._owed: set[bytes] = set()  # topics to tell again
         self._again: deque[tuple[bytes, dict[str, Any]]] = deque()
 
     def refresh(self) -> None:
@@ -55,7 +56,7 @@ class Publisher:
                 continue
             if change[:1] == b"\x01":
                 self._subscriptions.add(change[1:])
-                self._tell_again(change[1:])
+                self._owe(change[1:])
             else:
                 self._subscriptions.discard(change[1:])
         self.wants_state = self._wanted(messages.STATE)
@@ -127,16 +128,23 @@ class Publisher:
         self._send(messages.SETTINGS, message)
 
     def repeat(self) -> None:
-        """Send one of the messages that a late subscriber missed, if any waits."""
-        if self._again:
-            topic, message = self._again.popleft()
-            self._send(topic, {**message, "again": True})
-
-    def _tell_again(self, prefix: bytes) -> None:
-        # A flood of subscribers gets the one list that is being sent; it makes no second one.
+        """Send one of the messages that a late subscriber missed, if any is owed."""
         if not self._again:
+            if not self._owed:
+                return
             held = [*self._settings, *self._kept]
-            self._again.extend(each for each in held if each[0].startswith(prefix))
+            self._again.extend(each for each in held if each[0] in self._owed)
+            self._owed.clear()
+            if not self._again:
+                return
+        topic, message = self._again.popleft()
+        self._send(topic, {**message, "again": True})
+
+    def _owe(self, prefix: bytes) -> None:
+        # Who comes while a list is being sent is told by the next one: a flood makes no more.
+        for topic in (messages.SETTINGS, messages.EVENT):
+            if topic.startswith(prefix):
+                self._owed.add(topic)
 
     def _count(self, topic: bytes) -> int:
         self._told[topic] += 1

@@ -335,3 +335,13 @@ def test_a_missing_extra_is_named(tmp_path: Path, missing: str) -> None:
 def test_fake_states_are_of_the_contract() -> None:
     """What these tests publish is what a daemon would."""
     assert set(flat(state(0.0, 1))) == set(flat(sample(messages.STATE)))
+
+
+def test_topics_by_name(fake: FakeDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    words = ("--address", fake.state_address, "--duration", "0.5", "--topics", "hand/tactile")
+    assert ended(record(path, *words))[0] == 0
+    assert set(Recording(path).counts) == {"hand/tactile/left", "hand/tactile/right"}
+    status, _, error = ended(record(tmp_path / "b.mcap", "--topics", "dreams"))
+    assert status == 2
+    assert "found topic 'dreams', expected one of state, tactile" in error

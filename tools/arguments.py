@@ -67,3 +67,22 @@ def megabytes(text: str) -> float:
     if not 0.0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"expected a size above 0 MB, found {text!r}")
     return value
+
+
+ALL = b"all"
+
+
+def topic(text: str) -> bytes:
+    """A topic of the stream by its name, with or without ``hand/``; or ``all``.
+
+    Raises ArgumentTypeError with what was found.
+    """
+    from daemon import contract
+
+    if text.encode() == ALL:
+        return ALL
+    name = (text if text.startswith("hand/") else f"hand/{text}").encode()
+    if name not in contract.TOPICS:
+        known = ", ".join(each.decode().removeprefix("hand/") for each in contract.TOPICS)
+        raise argparse.ArgumentTypeError(f"found topic {text!r}, expected one of {known}, all")
+    return name

@@ -25,6 +25,7 @@ MEASUREMENTS = {
 ON_DEMAND = {
     "sustained": "a minute of 500 Hz on two servos at 2 Mbaud",
     "wakeup": "wake-ups of the loop beside cyclictest and time.sleep, three minutes",
+    "recording": "ten readers and a recorder at 1 kHz for ten minutes; recordings read again",
     "neighbours": "the tick beside busy processes, many subscribers and noisy sensors",
     "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, ten minutes",
 }

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.settings import Stream
-from tools.arguments import megabytes, moment, seconds
+from tools.arguments import ALL, megabytes, moment, seconds, topic
 from tools.recordings.errors import RecordingError
 
 _EPILOG = """\
@@ -42,6 +42,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--to", type=seconds, metavar="S", dest="end", help="and end S seconds after its start"
+    )
+    parser.add_argument(
+        "--topics",
+        nargs="+",
+        type=topic,
+        metavar="TOPIC",
+        help="as state or hand/state, or all; all but input if none is named (`replay --recompute` "
+        "needs input, which is what every tick took in)",
     )
     parser.add_argument("--split-size", type=megabytes, metavar="MB", help="a new file after MB")
     parser.add_argument(
@@ -111,7 +119,7 @@ class _Recorder:
         began = shown = heard = time.monotonic()
         failure = ""
         try:
-            prepare(socket, arguments.address, b"hand/")
+            prepare(socket, arguments.address, *_topics(arguments.topics))
             while not self._ending.asked:
                 waiting = socket.poll(int(_LOOK * 1e3))
                 now = time.monotonic()
@@ -238,6 +246,14 @@ class _Recorder:
         if failure:
             print(f"record: {failure}", file=sys.stderr)
         return 1 if failure else 0
+
+
+def _topics(named: list[bytes] | None) -> list[bytes]:
+    from daemon import contract, messages
+
+    if named is None:
+        return [each for each in contract.TOPICS if each != messages.INPUT]
+    return list(contract.TOPICS) if ALL in named else named
 
 
 def _hung_up(lifeline: int) -> bool:

@@ -31,7 +31,7 @@ class RecorderBeside:
         reads, self._lifeline = os.pipe()  # its end is the end of this process
         # -P: a folder named tools where the daemon was started is not ours.
         words = [sys.executable, "-P", "-m", "tools.cli", "record", str(path)]
-        words += ["--address", address, "--lifeline", str(reads)]
+        words += ["--topics", "all", "--address", address, "--lifeline", str(reads)]
         # A session of its own: Ctrl-C is the daemon's, whose last messages are to be recorded, too.
         self._process = subprocess.Popen(
             words,

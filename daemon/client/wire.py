@@ -22,13 +22,14 @@ READERS: dict[bytes, Callable[[dict[str, Any]], Any]] = {
 }
 
 
-def prepare(socket: Any, address: str, topic: bytes) -> None:
-    """Subscribe a SUB socket to one topic. Raises zmq.ZMQError when the address can't be read."""
+def prepare(socket: Any, address: str, *topics: bytes) -> None:
+    """Subscribe a SUB socket to topics. Raises zmq.ZMQError when the address can't be read."""
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.RCVHWM, _QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
-    socket.setsockopt(zmq.SUBSCRIBE, topic)
+    for topic in topics:
+        socket.setsockopt(zmq.SUBSCRIBE, topic)
     socket.connect(address)
 
 

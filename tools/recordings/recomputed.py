@@ -75,7 +75,7 @@ def recompute(
     """
     own, calibrations = recorded_settings(recording)
     if not recording.count(messages.INPUT):
-        raise RecordingError(f"{recording.path}: no hand/input in it; `record` takes it along")
+        raise RecordingError(f"{recording.path}: no hand/input in it: record with --topics all")
     used = settings or own
     machine = Recomputation(used, calibrations, cache)
     scene = messages.Parts.of(used)
