@@ -60,7 +60,7 @@ def test_an_old_reading_or_frame_ends_it(soak: Soak) -> None:
     soak.sensors[0].last_sent = state.t - 0.2
     with pytest.raises(AssertionError, match="frame"):
         soak._judge_torque(state, "holding", 1)
+    soak._judge_torque(state, "disarmed", 1)  # as late as the next tick
     with pytest.raises(AssertionError, match="torque is on"):
-        for count in range(3):
-            soak._judge_torque(state, "disarmed", count)
+        soak._judge_torque(state, "disarmed", 3)
     servos.set_torque(False)

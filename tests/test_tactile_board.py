@@ -180,6 +180,12 @@ def test_silent_and_frozen_begin_when_they_are_asked_to():
     assert [data[-1] for data in got] == [*range(20), *[19] * 20]
 
 
+def test_saturated_and_zero_boards_send_whole_frames_of_one_count():
+    for word, count in (("saturated", 255), ("zero", 0)):
+        got, _ = stream(word)
+        assert {data[2:] for data in got} == {bytes((count,)) * (SIZE - 2)}
+
+
 def test_wrong_size_is_half_the_grid():
     got, _ = stream("wrong-size")
     assert {len(data) for data in got} == {ROWS * COLS // 4 + 2}

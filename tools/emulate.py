@@ -17,7 +17,7 @@ from tools.arguments import add_settings, profile
 
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
-  tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size;
+  tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
                    both boards, or one: left:silent, right:torn=0.2
   servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY
   servos           silent, answer, reboot, overheat, overload, undervoltage, recover =ID

@@ -26,8 +26,8 @@ class Event(NamedTuple):
 class Faults:
     """What shall go wrong: sorted from words of text to the servos and to each board.
 
-    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size`` for both boards, with ``left:`` or
-      ``right:`` before it for one; see :class:`BoardFault`.
+    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` for both
+      boards, with ``left:`` or ``right:`` before it for one; see :class:`BoardFault`.
     - ``drop=0.01``, ``silent=2`` … for the servos; see :meth:`ServoBus.fault`.
     - ``unplug`` and ``plug`` for the servos' port, ``left:unplug`` … for a board's.
     - ``well`` ends what is wrong with replies and boards, ``left:well`` with one board.

@@ -40,13 +40,14 @@ class BoardFault:
     - ``silent``: it says nothing more.
     - ``frozen``: it repeats its last frame.
     - ``wrong-size``: it sends a grid of half the rows and half the columns.
+    - ``saturated``, ``zero``: all its cells read the greatest count, or none.
     """
 
     kind: str
     value: float = 1.0
     start: float = 0.0
 
-    KINDS = ("torn", "noisy", "silent", "frozen", "wrong-size")
+    KINDS = ("torn", "noisy", "silent", "frozen", "wrong-size", "saturated", "zero")
 
     @classmethod
     def parse(cls, text: str) -> BoardFault:
@@ -245,6 +246,10 @@ class TactileBoard:
         if "frozen" in kinds:
             counts = counts if self._kept is None else self._kept
         self._kept = counts
+        if "saturated" in kinds:
+            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # framings clip it
+        elif "zero" in kinds:
+            counts = np.zeros_like(counts)
         if "wrong-size" in kinds:
             counts = counts[: counts.shape[0] // 2, : counts.shape[1] // 2]
         data = self._encoder.encode(counts, frame.seq, frame.t_sample)
