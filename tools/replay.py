@@ -18,8 +18,8 @@ Without --recompute the messages go out on the stream's socket as they were, at 
 --speed times that; the monitor, a recorder or a program of your own can't tell it from a daemon.
 
 --recompute runs readings, frames and commands through today's estimator, tables, control and
-limits, and compares every state with the recorded one. It needs `record --topics all`; recorded from
-the first tick on, with `run --record`, the same code and settings give the same to the last bit.
+limits, and compares every state with the recorded one. It needs `record --topics all`. Recorded
+from the first tick on, with `run --record`, the same code and settings give the same bits.
 Exit status: 0 the same, 1 can't be read, 3 states differ."""
 
 _READERS = 10.0  # s that subscribers are waited for

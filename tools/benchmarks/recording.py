@@ -1,7 +1,7 @@
 """Ten readers of the stream, one of them stuck, and a recorder; then recordings read again.
 
-A real daemon at 1 kHz publishes every state and two sensors' frames at 100 Hz, for ten minutes. What counts: messages the recorder lost, the publish step, memory and
-processor time.
+A real daemon at 1 kHz publishes every state and two sensors' frames at 100 Hz, for ten minutes.
+What counts: messages the recorder lost, the publish step, memory and processor time.
 """
 
 from __future__ import annotations
