@@ -10,11 +10,11 @@ import json
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daemon.settings import Finite, Positive, Settings
 from daemon.tactile.base import TactileError
@@ -42,10 +42,10 @@ class Sensor(_Part):
 
     finger: Literal["left", "right"]
     label: str
-    rows: int
-    cols: int
+    rows: Annotated[int, Field(ge=1, le=256)]
+    cols: Annotated[int, Field(ge=1, le=256)]
     pitch: tuple[Positive, Positive]  # x, y [m]
-    full_count: int
+    full_count: Annotated[int, Field(ge=1, le=65535)]
 
 
 class TareStep(_Part):

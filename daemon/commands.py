@@ -62,13 +62,15 @@ class CommandServer:
         self.refused_by_pace = 0
 
     def serve(self, handler: Handler) -> bool:
-        """Answer one waiting command through ``handler``; False when nobody waits."""
+        """Answer one waiting command through ``handler``; False when there was nothing at all."""
+        came = False
         for _ in range(_LOOK):
             if not self._bound.readable():
                 break
+            came = True
             self._take_in(self._socket.recv_multipart(zmq.NOBLOCK), handler)
         if not self._waiting:
-            return False
+            return came
         envelope, payload = self._waiting.popleft()
         self._send(envelope, self._answer(payload, handler))
         return True
