@@ -30,6 +30,7 @@ from daemon.prediction import Held
 from daemon.records import Contact
 from daemon.settings import Settings
 
+_EACH = 0.008  # s between two looks
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
 _LEARN = 1.0  # s in which the friction at rest is learnt
 _SCALE_OFF = 0.1  # share by which the torque constant may be off
@@ -49,7 +50,8 @@ class SlipWatch:
 
     def __init__(self, settings: Settings) -> None:
         self._law = settings.control
-        self._dt = 1.0 / settings.loop.rate
+        self._every = max(round(_EACH * settings.loop.rate), 1)
+        self._dt = self._every / settings.loop.rate
         self._width = settings.object.width
         self._force_most = _FORCE_SHARE * settings.safety.force_max
         self._friction = 0.0  # what a joint's friction looks like, as a load [N]
@@ -57,6 +59,7 @@ class SlipWatch:
 
     def forget(self) -> None:
         """Nothing is held any more, or something else."""
+        self._ticks = 0  # until the next look
         self.load = 0.0  # N that each tip may bear along its face, hidden part included
         self.turned = False  # the object has turned in the grip, at this tick
         self._known = False  # what stood when holding began is known:
@@ -67,6 +70,7 @@ class SlipWatch:
         self._stray = 0.0  # sum of unexplained turning that has been looked at [rad]
         self._away = 0.0  # unexplained turning that is not forgotten yet [rad]
         self._needed = 0.0  # force for the margin, kept for a while [N]
+        self._most = 0.0  # N that the grip may be raised to
         self._idle = 0.0  # s since that was needed
 
     def begin(self, held: Held) -> None:
@@ -96,8 +100,13 @@ class SlipWatch:
         ``holding`` says that nothing but loads moves the joints; ``closing``, -1 to 1, how much of
         the joints' friction is given at present for closing.
         """
+        self.turned = False
+        if self._ticks:
+            self._ticks -= 1
+            return max(asked, min(self._needed, self._most))
+        self._ticks = self._every - 1
         law = self._law
-        most = max(min(asked + law.grip_raise_max, self._force_most), asked)
+        self._most = most = max(min(asked + law.grip_raise_max, self._force_most), asked)
         self.turned = False
         found = held.load - closing * self._friction - self._share * _mean(held.normal)
         self._smooth += (found - self._smooth) * self._dt / _SMOOTH
