@@ -227,12 +227,12 @@ def hand_angle(view: View, state: State, share: float) -> str:
     if not (left.contact and right.contact) or left.theta_std + right.theta_std > 0.25 * bound:
         return ""
     q = state.reading.q
-    apart = (left.theta - q[0]) - (right.theta + q[1])
+    apart = (left.theta - q[0]) - (right.theta + q[1]) + view.settings.object.taper
     if abs(apart) <= bound:
         return ""
     return (
-        f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: "
-        "a sensor has shifted, or its centre or rotation is wrong"
+        f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: a sensor has "
+        "shifted, its centre or rotation is wrong, or the object tapers (object.taper)"
     )
 
 

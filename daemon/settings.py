@@ -251,6 +251,9 @@ class ObjectSettings(Section):
     """What the daemon assumes of the object."""
 
     width: Length = 0.040
+    taper: Annotated[float, Field(ge=-1.5, le=1.5)] = (
+        0.0  # rad between its faces; above 0 it is wider at the palm
+    )
 
 
 class Simulation(Section):

@@ -221,3 +221,14 @@ def test_status_tells_the_faults_name_and_what_was_limited(make: Make) -> None:
     status = hand.command("status")
     assert status["fault_name"] == ""
     assert status["limited"]["goal.slew"] > 0
+
+
+@pytest.mark.parametrize(("taper", "told"), [(0.0, ["hand.angle"]), (0.17, [])])
+def test_a_wedge_looks_like_a_shifted_sensor_unless_it_is_told(
+    make: Make, taper: float, told: list[str]
+) -> None:
+    simulation = {"object_shape": "wedge", "object_taper": 0.17}
+    hand = make(simulation=simulation, object={"taper": taper}).grasp()
+    hand.loop.advance(1.0)
+    assert hand.state.fault == ""
+    assert hand.warnings() == told
