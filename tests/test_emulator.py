@@ -43,6 +43,9 @@ OPERATING_MODE, TORQUE_ENABLE = 11, 64
 GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
 
 
+_TRIES = 4
+
+
 def until(condition: Callable[[], object], timeout: float = 10.0) -> None:
     """Wait for what another process or thread brings about."""
     end = time.monotonic() + timeout
@@ -123,8 +126,12 @@ class Servos:
         self.packets = PacketHandler(2.0)
 
     def ping(self, servo: int) -> int | None:
-        model, result, _ = self.packets.ping(self.port, servo)
-        return model if result == COMM_SUCCESS else None
+        """The model; asked again, since a busy machine may exceed the SDK's 34 ms."""
+        for _ in range(_TRIES):
+            model, result, _ = self.packets.ping(self.port, servo)
+            if result == COMM_SUCCESS:
+                return int(model)
+        return None
 
     def read(self, servo: int, address: int, size: int) -> int:
         read = {
@@ -132,7 +139,10 @@ class Servos:
             2: self.packets.read2ByteTxRx,
             4: self.packets.read4ByteTxRx,
         }[size]
-        value, result, error = read(self.port, servo, address)
+        for _ in range(_TRIES):
+            value, result, error = read(self.port, servo, address)
+            if result == COMM_SUCCESS:
+                break
         assert (result, error) == (COMM_SUCCESS, 0)
         return int(value)
 
@@ -580,14 +590,14 @@ def test_factory_new_servos(tmp_path):
 
 
 def test_an_adapters_latency_timer(tmp_path, capsys):
-    with Process("--dir", tmp_path, "--baud", "2000000", "--latency", "20").ready() as process:
+    with Process("--dir", tmp_path, "--baud", "2000000", "--latency", "8").ready() as process:
         servos = Servos(tmp_path)
         assert servos.ping(1) == 1020
         start = time.monotonic()
         for _ in range(5):
             assert servos.ping(1) == 1020
         # Each reply waits for the timer, and so for the one after it.
-        assert time.monotonic() - start > 4 * 0.020
+        assert time.monotonic() - start > 4 * 0.008
         servos.close()
         assert process.end() == (0, "", "")
     with pytest.raises(SystemExit):
