@@ -1,0 +1,130 @@
+"""The page of errors: estimates of a simulated hand beside what it really did."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daemon.records import FINGERS
+from tools.analysis.plots_data import BoolArray, FloatArray, Missing, Run
+from tools.analysis.plots_time import DEGREES, LINES
+from tools.figure_pages import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BINS = 41
+_BAND = 800  # corners of a band of uncertainty, at most
+# Title, field, factor to the unit shown, unit
+_ROWS = (
+    ("d", "d", 1e6, "µm"),
+    ("θ", "theta", DEGREES, "°"),
+    ("force F", "force", 1.0, "N"),
+)
+
+
+def draw_error(run: Run) -> Figure:
+    """Estimate less truth over time within ± 2σ as reported, and their histograms."""
+    run.need_states()
+    if not run.truth:
+        raise Missing("no hand/truth in it: only a simulated hand knows it")
+    at, true = run.matched()
+    both = {
+        name: run.touching(name)[at] & (run.truth[f"{name}.d"][true] > 0.0) for name in run.fingers
+    }
+    if not any(each.any() for each in both.values()):
+        raise Missing("no contact in it")
+    figure = style.new_figure(7.2, 7.6)
+    axes = figure.subplots(4, 2, width_ratios=[3.4, 1.0], sharey="row", sharex="col")
+    t = run.t[at]
+    for panels, (title, field, factor, unit) in zip(axes, _ROWS, strict=False):
+        entries = []
+        for name, sound in both.items():
+            key = f"{name}.{field}"
+            error = (run.states[key][at] - run.truth[key][true]) * factor
+            entries.append((name, error, _spread(run, name, field)[at] * factor, sound))
+        _row(panels, t, entries)
+        panels[0].set_ylabel(f"error of {title} [{unit}]")
+    error = (run.states["object.angle"][at] - run.truth["object.angle"][true]) * DEGREES
+    sound = (run.states["object.valid"][at] > 0.0) & np.all(list(both.values()), axis=0)
+    _row(axes[3], t, [("object", error, np.full(t.size, np.nan), sound)])
+    axes[3, 0].set(ylabel="error of φ [°]", xlabel="time [s]")
+    axes[3, 1].set_xlabel("share [%]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    more, names = axes[3, 0].get_legend_handles_labels()
+    figure.legend(handles + more, labels + names, loc="outside lower center", ncols=5)
+    title = f"{run.name}: estimate less truth; thin lines: ± 2σ as reported"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
+    figure.align_ylabels()
+    axes[3, 0].set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
+    return figure
+
+
+def _spread(run: Run, finger: str, field: str) -> FloatArray:
+    """The reported standard deviation; a force's from those of d and θ, NaN without a model."""
+    if field != "force":
+        return run.states[f"{finger}.{field}_std"]
+    if run.models is None:
+        return np.full(run.t.size, np.nan)
+    d, theta = run.states[f"{finger}.d"], run.states[f"{finger}.theta"]
+    contact = run.models[FINGERS.index(finger)].table(np.nan_to_num(d), np.nan_to_num(theta))
+    spread: FloatArray = run.states[f"{finger}.gain"] * np.hypot(
+        contact.force_d * run.states[f"{finger}.d_std"],
+        contact.force_theta * run.states[f"{finger}.theta_std"],
+    )
+    return spread
+
+
+def _row(
+    panels: tuple[Axes, Axes],
+    t: FloatArray,
+    entries: list[tuple[str, FloatArray, FloatArray, BoolArray]],
+) -> None:
+    """One quantity: name, error, reported σ and where both are sound, of each finger."""
+    panel, side = panels
+    known = [error[sound & np.isfinite(error)] for _, error, _, sound in entries]
+    together = np.concatenate(known)
+    if not together.size:
+        return
+    reach = 1.3 * float(np.quantile(np.abs(together), 0.995)) or 1e-12
+    for k, (name, error, spread, sound) in enumerate(entries):
+        if not known[k].size:
+            continue
+        look = LINES.get(name, {"color": style.KINDS[2], "linestyle": "-"})
+        colour = look["color"]
+        panel.plot(t, np.where(sound, error, np.nan), label=name, linewidth=0.7, **look)
+        said = f"{name}: mean {known[k].mean():.2g}, std {known[k].std():.2g}"
+        if np.isfinite(spread[sound]).any():
+            times, band = _envelope(t, np.where(sound, 2.0 * spread, np.nan))
+            panel.fill_between(times, -band, band, color=colour, alpha=0.10, lw=0)
+            for sign in (-1.0, 1.0):
+                panel.plot(times, sign * band, color=colour, linewidth=0.6, alpha=0.8)
+            inside = np.abs(error[sound]) <= 2.0 * spread[sound]
+            said += f", {100.0 * inside.mean():.1f} % within 2σ"
+            reach = max(reach, 1.15 * float(np.nanquantile(2.0 * spread[sound], 0.97)))
+        panel.text(0.52 * k, 1.02, said, transform=panel.transAxes, fontsize=6.8, color=colour)
+    for (name, *_), each in zip(entries, known, strict=True):
+        if each.size:
+            shares, edges = np.histogram(each, _BINS, (-reach, reach))
+            look = LINES.get(name, {"color": style.KINDS[2]})
+            side.stairs(100.0 * shares / each.size, edges, orientation="horizontal", **look)
+    panel.set_ylim(-reach, reach)
+    beyond = float((np.abs(together) > reach).mean())
+    if beyond > 0.0:
+        side.text(
+            1.0,
+            1.02,
+            f"{100.0 * beyond:.2g} % beyond",
+            transform=side.transAxes,
+            fontsize=6.8,
+            ha="right",
+        )
+
+
+def _envelope(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The largest of each few values, for a band that grows between frames; NaN where one is."""
+    step = -(-t.size // _BAND)
+    starts = np.arange(0, t.size, step)
+    return t[starts], np.maximum.reduceat(values, starts)

@@ -1,0 +1,153 @@
+"""Pages over time: what the contacts and the object did, and what the joints did."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tools.analysis.plots_data import MODES, FloatArray, Run
+from tools.figure_pages import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DEGREES = 180.0 / np.pi
+LINES: dict[str, dict[str, Any]] = {
+    "left": {"color": style.KINDS[0], "linestyle": "-"},
+    "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
+}
+TARGET: dict[str, Any] = {"color": style.INK, "linestyle": (0, (1, 1.2)), "linewidth": 1.2}
+
+# Shade and hatch of each mode, told apart in print; what the hand does most is plain.
+_LOOKS = {
+    "disarmed": ("#ffffff", ""),
+    "armed": ("#e3e3e3", ""),
+    "moving": ("#e3e3e3", "----"),
+    "grasping": ("#c4c4c4", "////"),
+    "holding": ("#9a9a9a", ""),
+    "rotating": ("#c4c4c4", "\\\\\\\\"),
+    "releasing": ("#e3e3e3", "...."),
+    "fault": ("#202020", ""),
+}
+
+# Title, field, factor to the unit shown, unit
+_CONTACT = (
+    ("force F", "force", 1.0, "N"),
+    ("energy U", "energy", 1e3, "mJ"),
+    ("displacement d", "d", 1e3, "mm"),
+)
+# Title, field, its goal, factor, unit
+_JOINT = (
+    ("joint q", "q", "goal_q", DEGREES, "°"),
+    ("current", "current", "goal_current", 1.0, "A"),
+    ("temperature", "temperature", "", 1.0, "°C"),
+)
+
+
+def draw_time(run: Run) -> Figure:
+    """Force, energy, displacement and the object's angle over time, with the targets."""
+    run.need_contact()
+    figure, strip, panels = _sheet(run, 4, 7.6)
+    for panel, (name, field, factor, unit) in zip(panels, _CONTACT, strict=False):
+        for finger in run.fingers:
+            shown = np.where(run.touching(finger), run.states[f"{finger}.{field}"] * factor, np.nan)
+            _line(panel, run, shown, label=finger, **LINES[finger])
+        panel.set_ylabel(f"{name} [{unit}]")
+        panel.set_ylim(bottom=0.0)
+    _line(panels[0], run, run.target_force(), label="asked for", **TARGET)
+    sound = run.states["object.valid"] > 0.0
+    angle = np.where(sound, run.states["object.angle"] * DEGREES, np.nan)
+    _line(panels[3], run, angle, color=style.KINDS[2], label="object")
+    _line(panels[3], run, run.target_angle() * DEGREES, **TARGET)
+    panels[3].set_ylabel("object's angle φ [°]")
+    _finish(figure, run, strip, panels)
+    return figure
+
+
+def draw_joints(run: Run) -> Figure:
+    """Joint angles and currents with their goals, and the servos' temperature, over time."""
+    run.need_states()
+    figure, strip, panels = _sheet(run, 3, 6.2)
+    for panel, (name, field, goal, factor, unit) in zip(panels, _JOINT, strict=True):
+        for finger in run.fingers:
+            values = run.states[f"{finger}.{field}"] * factor
+            if field == "temperature":
+                values = np.where(values != 0.0, values, np.nan)  # 0: not known
+            _line(panel, run, values, label=finger, **LINES[finger])
+            if goal:
+                look = {**LINES[finger], "linestyle": (0, (1, 1.2)), "linewidth": 0.9}
+                _line(panel, run, run.states[f"{finger}.{goal}"] * factor, **look)
+        panel.set_ylabel(f"{name} [{unit}]")
+    panels[0].plot([], [], color=style.GREY, linestyle=(0, (1, 1.2)), label="goal, or bound of it")
+    panels[2].margins(y=0.3)
+    _finish(figure, run, strip, panels)
+    return figure
+
+
+def _sheet(run: Run, count: int, height: float) -> tuple[Figure, Axes, list[Axes]]:
+    figure = style.new_figure(7.0, height)
+    axes = figure.subplots(
+        1 + count, 1, sharex=True, gridspec_kw={"height_ratios": [0.13, *[1.0] * count]}
+    )
+    return figure, axes[0], list(axes[1:])
+
+
+def _line(panel: Axes, run: Run, values: FloatArray, **look: Any) -> None:
+    panel.plot(*run.gapped(values), **look)
+
+
+def _finish(figure: Figure, run: Run, strip: Axes, panels: list[Axes]) -> None:
+    from matplotlib.patches import Patch
+
+    _draw_modes(strip, run)
+    for panel in panels:
+        for when, _ in run.faults:
+            panel.axvline(when, color=style.INK, linewidth=0.9)
+    for when, reason in run.faults[:1]:
+        panels[0].annotate(
+            reason if len(reason) < 60 else reason[:59] + "…",
+            (when, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, -3),
+            textcoords="offset points",
+            va="top",
+            fontsize=7.0,
+        )
+    strip.set_title(run.name, loc="left")
+    panels[-1].set_xlabel("time [s]")
+    panels[-1].set_xlim(float(run.t[0]), float(max(run.t[-1], run.t[0] + 1e-3)))
+    figure.align_ylabels()
+    used = [name for k, name in enumerate(MODES) if (run.modes == k).any()]
+    handles: list[Any] = [
+        Patch(facecolor=_LOOKS[name][0], hatch=_LOOKS[name][1], edgecolor=style.INK, lw=0.4)
+        for name in used
+    ]
+    names = list(used)
+    for panel in panels:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            if label not in names:
+                handles.append(handle)
+                names.append(label)
+    figure.legend(handles, names, loc="outside lower center", ncols=6)
+
+
+def _draw_modes(strip: Axes, run: Run) -> None:
+    """The hand's modes as one band."""
+    edges = np.flatnonzero(np.diff(run.modes)) + 1
+    starts = [0, *edges.tolist()]
+    for first, after in itertools.zip_longest(starts, starts[1:], fillvalue=len(run.modes)):
+        if run.modes[first] < 0:
+            continue
+        colour, hatch = _LOOKS[MODES[run.modes[first]]]
+        left, right = run.t[first], run.t[min(after, len(run.t) - 1)]
+        strip.axvspan(left, right, facecolor=colour, hatch=hatch, edgecolor=style.INK, lw=0.3)
+    strip.set_yticks([])
+    strip.set_ylim(0.0, 1.0)
+    strip.grid(visible=False)
+    strip.tick_params(bottom=False, labelbottom=False)
+    strip.set_ylabel("mode", rotation=0, ha="right", va="center")
+    for side in strip.spines.values():
+        side.set_visible(False)
