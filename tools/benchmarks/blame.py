@@ -2,8 +2,9 @@
 
 A cycle is the program's own fault when its computing and the bytes' own time on the wire alone take
 more than a period: it would have been missed on a machine that does nothing else. Otherwise the
-largest of what held it up is named, each as the kernel counts it. A virtual machine's kernel charges
-what its host takes to whoever runs, so that a cycle that the host held up may count as its own.
+largest of what held it up is named, each as the kernel counts it. A virtual machine's kernel
+charges what its host takes to whoever runs, so that a cycle that the host held up may count as its
+own.
 """
 
 from __future__ import annotations
