@@ -10,6 +10,7 @@ from pathlib import Path
 
 from daemon.checkup.result import Result
 from daemon.commands import NoAnswer, send
+from daemon.keys import KeyFileError, load_client
 from daemon.settings import Settings
 
 _PATIENCE = 0.5  # s for a daemon to answer
@@ -30,7 +31,7 @@ def check_addresses(settings: Settings) -> list[Result]:
         if trouble != "in use":
             results.append(Result("FAIL", f"socket {address}", trouble, f"set {key}"))
             continue
-        mode = daemon_mode(commands)
+        mode = daemon_mode(commands, settings.access.keys)
         if mode:
             results.append(
                 Result(
@@ -52,11 +53,15 @@ def check_addresses(settings: Settings) -> list[Result]:
     return results
 
 
-def daemon_mode(address: str) -> str:
-    """The mode of the daemon that answers commands at ``address``; empty when none does."""
+def daemon_mode(address: str, keys: str = "") -> str:
+    """The mode of the daemon that answers commands at ``address``; empty when none does.
+
+    ``keys`` is the folder of `softfinger keys`, where the daemon wants some.
+    """
     try:
-        reply = send(address, {"command": "status"}, _PATIENCE)
-    except (NoAnswer, OSError):
+        own = load_client(Path(keys)) if keys else None
+        reply = send(address, {"command": "status"}, _PATIENCE, own)
+    except (NoAnswer, KeyFileError, OSError):
         return ""
     return str(reply.get("mode", "running")) if reply.get("ok") else "starting"
 
