@@ -1,0 +1,271 @@
+"""From the stream's messages to what Rerun shows.
+
+`Bridge.take` sorts a message in, `Bridge.draw` logs what came since: every state goes into the
+plots, all else is drawn from the newest. Messages are data of unknown origin: what is missing or of
+another type in them is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from daemon import messages
+from daemon.client.wire import Gaps
+from daemon.records import FINGERS
+from tools.feed import number, printable, text
+from tools.viewing import layout
+from tools.viewing.drawing import Drawing
+from tools.viewing.known import Hand, Wanted, read_settings
+from tools.viewing.statistics import table
+
+TOPICS = (
+    messages.SETTINGS,
+    messages.COMMAND,
+    messages.EVENT,
+    messages.STATE,
+    messages.TRUTH,
+    messages.TACTILE,
+    messages.STATS,
+)
+_EVENTS = 500  # events that wait to be drawn
+_PATIENCE = 20  # drawings that the layout waits for the settings
+
+
+class Bridge:
+    """Takes messages, logs to ``recording``.
+
+    ``shown`` counts the states that went into the plots, ``dropped`` those that were passed over
+    since more came than are kept for one drawing, ``unreadable`` messages that are none; ``notes``
+    is what a person should be told, once each.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, keep: int = 2000) -> None:
+        self._recording = recording
+        self._states: deque[tuple[dict[str, Any], float, float]] = deque(maxlen=keep)
+        self._frames: dict[str, dict[str, Any]] = {}
+        self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+        self._truth: dict[str, Any] | None = None
+        self._statistics: dict[str, Any] | None = None
+        self._gaps = {topic: Gaps() for topic in TOPICS}
+        self._hand = Hand()
+        self._known = False  # the settings have come
+        self._wanted = Wanted()
+        self._drawing: Drawing | None = None
+        self._waited = 0
+        self._state: dict[str, Any] | None = None
+        self._mode = ""
+        self._time = math.nan
+        self._schema_told = False
+        self._plots: dict[str, layout.Plot] = {}
+        self.shown = 0
+        self.dropped = 0
+        self.unreadable = 0
+        self.notes: list[str] = []
+
+    @property
+    def lost(self) -> int:
+        """Messages that were published and never came."""
+        return sum(gaps.lost for gaps in self._gaps.values())
+
+    @property
+    def time(self) -> float:
+        """The newest message's Unix time [s], NaN before the first."""
+        return self._time
+
+    def take(self, topic: bytes, message: Any) -> None:
+        """One message, whatever it holds."""
+        if not isinstance(message, dict) or topic not in self._gaps:
+            self.unreadable += topic in self._gaps
+            return
+        if not self._gaps[topic].take(message):
+            return  # told again for somebody who came later
+        self._check_schema(message)
+        when = number(message, "timestamp")
+        if not math.isfinite(when) or not 0.0 <= when < 2.0**33:
+            self.unreadable += 1
+        elif topic == messages.STATE:
+            self._take_state(message, when)
+        elif topic == messages.TACTILE:
+            finger = text(message, "finger")
+            if finger in FINGERS:
+                self._frames[finger] = message
+        elif topic == messages.EVENT:
+            self._events.append(message)
+        elif topic == messages.STATS:
+            self._statistics = message
+        elif topic == messages.TRUTH:
+            self._truth = message
+        elif topic == messages.COMMAND:
+            self._wanted.take(message, self._hand)
+        elif topic == messages.SETTINGS:
+            self._take_settings(message)
+
+    def _take_state(self, message: dict[str, Any], when: float) -> None:
+        newest = self._states[-1][0] if self._states else self._state
+        if newest is not None and number(message, "seq") < number(newest, "seq"):
+            self._forget()
+        mode = text(message, "mode")
+        self.dropped += len(self._states) == self._states.maxlen
+        self._states.append((message, self._wanted.force(mode), self._wanted.angle(mode)))
+        self._time = when
+
+    def _forget(self) -> None:
+        """Another daemon, or the same one started again."""
+        self._wanted = Wanted()
+        if self._drawing is not None:
+            self._drawing.forget()
+
+    def _take_settings(self, message: dict[str, Any]) -> None:
+        settings, passed = read_settings(message)
+        if passed:
+            version = text(message, "version") or "another version"
+            self.notes.append(
+                f"settings of {version} that are not known here: {printable(', '.join(passed))}"
+            )
+        if self._known and settings == self._hand.settings:
+            return
+        self._hand = Hand(settings)
+        self._known = True
+        self._drawing = None
+
+    def _check_schema(self, message: dict[str, Any]) -> None:
+        schema = message.get("schema")
+        if schema != messages.SCHEMA and not self._schema_told:
+            self._schema_told = True
+            self.notes.append(
+                f"the stream is of schema {schema!r:.20}, this viewer knows {messages.SCHEMA}; "
+                "it keeps to the fields it knows"
+            )
+
+    # Logging
+
+    def draw(self, last: bool = False) -> None:
+        """Log what came since the last drawing. The layout comes first, once settings are known.
+
+        ``last``: nothing more will come, so that settings are not waited for.
+        """
+        if self._drawing is None:
+            if not (self._states or self._frames or self._known):
+                return
+            self._waited += 1
+            if not self._known and self._waited < _PATIENCE and not last:
+                return
+            self._begin()
+        drawing = self._drawing
+        assert drawing is not None
+        if self._states:
+            self._plot()
+            self._state = self._states[-1][0]
+            self._states.clear()
+            self._recording.set_time(layout.TIME, timestamp=self._time)
+            drawing.state(self._state)
+        if self._truth is not None:
+            self._at(self._truth)
+            drawing.truth(self._truth)
+            self._truth = None
+        for frame in self._frames.values():
+            self._at(frame)
+            try:
+                drawing.frame(frame, self._state)
+            except ValueError:
+                self.unreadable += 1
+        self._frames.clear()
+        self._tell()
+
+    def _begin(self) -> None:
+        """The layout and all that stands still, for the hand as it is known now."""
+        self._recording.send_blueprint(layout.blueprint(self._hand))
+        self._drawing = Drawing(self._recording, self._hand)
+        self._drawing.prepare()
+        self._plots = layout.plots(self._hand)
+        for plot in self._plots.values():
+            self._recording.log(plot.entity, plot.style(), static=True)
+        self._recording.log(
+            "mode",
+            rr.StateConfiguration(values=list(layout.MODES), colors=list(layout.MODES.values())),
+            static=True,
+        )
+        self._mode = ""
+
+    def _plot(self) -> None:
+        """Every state since the last drawing, as columns."""
+        states = [state for state, _, _ in self._states]
+        force, angle = np.array([(force, angle) for _, force, angle in self._states]).T
+        landscape = self._drawing.landscape if self._drawing is not None else None
+        energy = np.full_like(force, np.nan) if landscape is None else landscape.energy_of(force)
+        stamps = np.array([number(state, "timestamp") for state in states])
+        times = [rr.TimeColumn(layout.TIME, timestamp=stamps)]
+        fingers = self._hand.fingers
+
+        def each(key: str, factor: float) -> list[Any]:
+            return [
+                factor * np.array([number(state, name, key) for state in states])
+                for name in fingers
+            ]
+
+        degree = 180.0 / math.pi
+        angles = np.array([number(state, "object", "angle") for state in states])
+        held = [bool((state.get("object") or {}).get("valid")) for state in states]
+        columns = {
+            "force": [*each("force", 1.0), force],
+            "energy": [*each("energy", 1e3), 1e3 * energy],
+            "d": each("d", 1e3),
+            "theta": each("theta", degree),
+            "object": [degree * np.where(held, angles, np.nan), degree * angle],
+            "q": [*each("q", degree), *each("goal_q", degree)],
+            "current": [*each("current", 1.0), *each("goal_current", 1.0)],
+            "tick": [
+                1e6 * np.array([number(state, key) for state in states])
+                for key in ("compute_s", "wake_late_s")
+            ],
+        }
+        for name, plot in self._plots.items():
+            values = np.column_stack(columns[name])
+            scalars = rr.Scalars.columns(scalars=values.ravel())
+            lengths = np.full(len(states), values.shape[1])
+            self._recording.send_columns(plot.entity, times, scalars.partition(lengths))
+        self._modes(states, stamps)
+        self.shown += len(states)
+
+    def _modes(self, states: list[dict[str, Any]], stamps: Any) -> None:
+        for state, stamp in zip(states, stamps, strict=True):
+            mode = text(state, "mode")
+            if mode != self._mode:
+                self._mode = mode
+                self._recording.set_time(layout.TIME, timestamp=stamp)
+                self._recording.log("mode", rr.StateChange(state=mode))
+
+    def _tell(self) -> None:
+        """Events, and the loop's own statistics."""
+        while self._events:
+            event = self._events.popleft()
+            self._at(event)
+            level, kind = text(event, "level"), text(event, "kind")
+            self._recording.log(
+                f"events/{kind if kind.isidentifier() else 'other'}",
+                rr.TextLog(
+                    f"{_clock(event)}  {kind}: {text(event, 'text')}",
+                    level={"warning": "WARN", "error": "ERROR"}.get(level, "INFO"),
+                    color=layout.LEVELS.get(level, layout.WANTED),
+                ),
+            )
+        if self._statistics is not None:
+            self._at(self._statistics)
+            self._recording.log(
+                "statistics",
+                rr.TextDocument(table(self._statistics), media_type=rr.MediaType.MARKDOWN),
+            )
+            self._statistics = None
+
+    def _at(self, message: dict[str, Any]) -> None:
+        self._recording.set_time(layout.TIME, timestamp=number(message, "timestamp"))
+
+
+def _clock(event: dict[str, Any]) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(number(event, "timestamp")))

@@ -1,0 +1,324 @@
+"""Logs the hand, the pressure maps and the landscape to Rerun, each from its newest message.
+
+Rerun's pictures have y downwards; the hand's plane has it upwards, so y changes its sign here, and
+lengths become mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from daemon.client.records import read_frame
+from daemon.records import FINGERS
+from tools.feed import field, number
+from tools.viewing import layout
+from tools.viewing.footprint import Footprint, footprint, grid_of, tip_circle
+from tools.viewing.known import Hand
+from tools.viewing.landscape import Landscape
+from tools.viewing.planar import Contact, FingerLines, HeldObject, finger_lines
+
+_TRAIL = 160  # points in a trail on the landscape
+_ARROW = 1.6e-3  # m of a force's arrow a newton
+_ARROW_LONGEST = 0.045  # m
+_FADE = 0.995  # of the colour range with each frame, so that a single peak does not stay
+_DARKEST = 8.0  # standard deviations of the noise that the colour range has at least
+
+
+class Drawing:
+    """One hand's pictures. ``prepare`` logs once what stands still."""
+
+    def __init__(self, recording: rr.RecordingStream, hand: Hand) -> None:
+        self._recording = recording
+        self._hand = hand
+        self._object = HeldObject(hand.geometry)
+        self._trails: dict[str, deque[tuple[float, float]]] = {
+            name: deque(maxlen=_TRAIL) for name in hand.fingers
+        }
+        tactile = hand.settings.tactile
+        self._floor = _DARKEST * tactile.noise
+        self._peak = self._floor
+        self._grids: dict[str, Any] = {}
+        self._height = hand.settings.simulation.object_height
+        self.landscape: Landscape | None = None
+
+    def prepare(self) -> None:
+        """Log the landscape and the palm."""
+        half = 1e3 * self._hand.geometry.half_separation
+        self._still(
+            "hand/palm",
+            rr.LineStrips2D(
+                [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[layout.SPRING], radii=[1.2]
+            ),
+        )
+        landscape = self.landscape = self._hand.landscape()
+        if landscape is None:
+            return
+        self._still("landscape/picture", rr.Image(landscape.picture()))
+        contours = [each for each in landscape.contours() if len(each.line) > 1]
+        self._still(
+            "landscape/contours",
+            rr.LineStrips2D(
+                [each.line for each in contours],
+                colors=[(255, 255, 255, 110)] * len(contours),
+                radii=rr.Radius.ui_points(0.6),
+                draw_order=1.0,
+            ),
+        )
+        spots = [each.line[len(each.line) // 8] for each in contours]
+        names = [f"{1e3 * each.energy:g} mJ" for each in contours]
+        ticks = landscape.ticks()
+        self._still(
+            "landscape/scale",
+            rr.Points2D(
+                [*spots, *(place for place, _ in ticks)],
+                labels=[*names, *(name for _, name in ticks)],
+                show_labels=True,
+                radii=rr.Radius.ui_points(0.0),
+                colors=[(235, 235, 235)] * len(spots) + [layout.WANTED] * len(ticks),
+                draw_order=2.0,
+            ),
+        )
+
+    def forget(self) -> None:
+        """Another story begins: no trail leads from the old one to it."""
+        for trail in self._trails.values():
+            trail.clear()
+        self._object.lose()
+        self._peak = self._floor
+
+    # The hand in its plane
+
+    def state(self, state: dict[str, Any]) -> None:
+        """The hand, and its points on the landscape, as ``state`` tells them."""
+        lines: list[FingerLines] = []
+        contacts: list[Contact | None] = []
+        for index, name in enumerate(FINGERS):
+            if name not in self._hand.fingers:
+                continue
+            q = number(state, name, "q")
+            contact = _contact(state, name)
+            contacts.append(contact)
+            lines.append(
+                finger_lines(self._hand.geometry, index, q if math.isfinite(q) else 0.0, contact)
+            )
+        self._fingers(lines)
+        self._contacts(lines, contacts)
+        self._held(state, contacts)
+        self._points(contacts)
+
+    def _fingers(self, lines: list[FingerLines]) -> None:
+        strips, colours, radii = [], [], []
+        for name, finger in zip(self._hand.fingers, lines, strict=True):
+            for strip, radius in ((finger.link, 2.6), (finger.base, 1.2), (finger.skin, 0.5)):
+                strips.append(_view(strip))
+                colours.append((*layout.COLOURS[name], 255))
+                radii.append(radius)
+            for spring, strain in zip(finger.springs, finger.strain, strict=True):
+                share = min(4.0 * float(strain), 1.0)
+                strips.append(_view(spring))
+                colours.append((*_between(layout.SPRING, layout.LEVELS["error"], share), 200))
+                radii.append(0.25 + 0.35 * share)
+        self._log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
+
+    def _contacts(self, lines: list[FingerLines], contacts: list[Contact | None]) -> None:
+        faces, origins, vectors, labels, colours, normals = [], [], [], [], [], []
+        touching = zip(self._hand.fingers, lines, contacts, strict=True)
+        for name, finger, contact in touching:
+            if contact is None or finger.face is None or finger.push is None:
+                continue
+            faces.append(_view(finger.face))
+            normals.append(_view(finger.normal))
+            at, direction = finger.push
+            length = min(_ARROW * contact.force, _ARROW_LONGEST)
+            origins.append(_view(at[None])[0])
+            vectors.append(_view(length * direction[None])[0])
+            labels.append(f"{contact.force:.1f} N")
+            colours.append(layout.COLOURS[name])
+        strips = [*faces, *normals]
+        shades = [layout.OBJECT] * len(faces) + [layout.WANTED] * len(normals)
+        radii = [1.0] * len(faces) + [0.35] * len(normals)
+        self._log("hand/contact", rr.LineStrips2D(strips, colors=shades, radii=radii, draw_order=2))
+        self._log(
+            "hand/force",
+            rr.Arrows2D(
+                origins=origins,
+                vectors=vectors,
+                labels=labels,
+                show_labels=True,
+                colors=colours,
+                radii=[0.9] * len(origins),
+                draw_order=3.0,
+            ),
+        )
+
+    def _held(self, state: dict[str, Any], contacts: list[Contact | None]) -> None:
+        left, right = contacts if len(contacts) == 2 else (None, None)
+        width = number(state, "object", "width")
+        outlines = []
+        if left and right and field(state, "object", "valid") is True and math.isfinite(width):
+            outline = self._object.outline(
+                (number(state, "left", "q"), number(state, "right", "q")),
+                np.array([left.d, right.d]),
+                np.array([left.theta, right.theta]),
+                width,
+                self._height,
+            )
+            if np.isfinite(outline).all():
+                outlines.append(_view(outline))
+        else:
+            self._object.lose()
+        self._log("hand/object", rr.LineStrips2D(outlines, colors=[layout.OBJECT], radii=[0.7]))
+
+    def truth(self, truth: dict[str, Any]) -> None:
+        """The simulated object where it is, which only a simulation knows."""
+        x, y = number(truth, "object", "x"), number(truth, "object", "y")
+        angle = number(truth, "object", "angle")
+        simulated = self._hand.settings.simulation
+        outline = _outline(simulated.object_shape, simulated, x, y, angle)
+        strips = [] if outline is None or not np.isfinite(outline).all() else [_view(outline)]
+        self._log("hand/simulated", rr.LineStrips2D(strips, colors=[layout.WANTED], radii=[0.3]))
+
+    # The landscape
+
+    def _points(self, contacts: list[Contact | None]) -> None:
+        if self.landscape is None:
+            return
+        trails, now, colours, shades = [], [], [], []
+        for name, contact in zip(self._hand.fingers, contacts, strict=True):
+            trail = self._trails[name]
+            if contact is None:
+                trail.clear()
+                continue
+            trail.append((contact.d, contact.theta))
+            d, theta = np.array(trail).T
+            trails.append(self.landscape.place(d, theta))
+            now.append(trails[-1][-1])
+            colours.append(layout.COLOURS[name])
+            shades.append((*layout.COLOURS[name], 170))
+        self._log(
+            "landscape/trails",
+            rr.LineStrips2D(trails, colors=shades, radii=rr.Radius.ui_points(1.4), draw_order=3.0),
+        )
+        self._log(
+            "landscape/now",
+            rr.Points2D(now, colors=colours, radii=rr.Radius.ui_points(6.0), draw_order=4.0),
+        )
+
+    # The pressure maps
+
+    def frame(self, message: dict[str, Any], state: dict[str, Any] | None) -> None:
+        """One frame with its footprint. Raises ValueError when it is none of this hand's."""
+        frame = read_frame(message)
+        name = frame.finger
+        if name not in self._hand.fingers:
+            raise ValueError(f"a frame of finger {name!r}")
+        scale = frame.scale if 0.0 < frame.scale < math.inf else 1.0
+        self._peak = max(_FADE * self._peak, self._floor, float(frame.counts.max()) * scale)
+        self._log(
+            f"pressure/{name}/cells",
+            rr.DepthImage(
+                frame.counts,
+                colormap=rr.components.Colormap.Inferno,
+                depth_range=(0.0, self._peak / scale),
+            ),
+        )
+        grid = grid_of(message)
+        if grid is None:
+            return
+        if self._grids.get(name) != grid:
+            self._grids[name] = grid
+            rim = tip_circle(grid, self._hand.settings.tip.radius)
+            colours = [(*layout.COLOURS[name], 120)]
+            self._still(
+                f"pressure/{name}/rim",
+                rr.LineStrips2D([rim], colors=colours, radii=rr.Radius.ui_points(0.7)),
+            )
+        contact = _contact(state, name)
+        place = None
+        if contact is not None:
+            tilt_y = number(state, name, "tilt_y")
+            radius = self._hand.settings.tip.radius
+            tilt_y = tilt_y if math.isfinite(tilt_y) else 0.0
+            place = footprint(grid, radius, contact.d, contact.theta, tilt_y)
+        self._footprint(name, place, grid.shape, float(frame.counts.max()) * scale)
+
+    def _footprint(
+        self, name: str, place: Footprint | None, shape: tuple[int, int], peak: float
+    ) -> None:
+        outlines = [] if place is None else [place.outline]
+        self._log(
+            f"pressure/{name}/footprint",
+            rr.LineStrips2D(
+                outlines, colors=[(255, 255, 255)], radii=rr.Radius.ui_points(1.2), draw_order=2.0
+            ),
+        )
+        spots: list[Any] = [] if place is None else [place.centroid]
+        sizes: list[Any] = [rr.Radius.ui_points(5.0)] * len(spots)
+        self._log(
+            f"pressure/{name}/centroid",
+            rr.Points2D(
+                [*spots, (0.5 * shape[1], shape[0] - 1.5)],
+                colors=[*[layout.COLOURS[name]] * len(spots), (200, 200, 200)],
+                radii=[*sizes, rr.Radius.ui_points(0.0)],
+                labels=[*[""] * len(spots), f"peak {1e-3 * peak:.1f} kPa"],
+                show_labels=True,
+                draw_order=3.0,
+            ),
+        )
+
+    def _log(self, entity: str, what: Any) -> None:
+        self._recording.log(entity, what)
+
+    def _still(self, entity: str, what: Any) -> None:
+        self._recording.log(entity, what, static=True)
+
+
+def _contact(state: dict[str, Any] | None, name: str) -> Contact | None:
+    """What ``state`` tells of one tip's contact, None where there is none."""
+    if field(state, name, "contact") is not True:
+        return None
+    d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))
+    if not (math.isfinite(d) and math.isfinite(theta) and d > 0.0):
+        return None
+    return Contact(d, theta, force if math.isfinite(force) else 0.0)
+
+
+def _outline(
+    shape: str, simulated: Any, x: float, y: float, angle: float
+) -> NDArray[np.float64] | None:
+    """The simulated object's outline [n, 2] m, closed; None where there is no object."""
+    if shape == "none":
+        return None
+    if shape == "disc":
+        turn = np.linspace(0.0, 2.0 * math.pi, 49)
+        own = simulated.object_radius * np.column_stack((np.cos(turn), np.sin(turn)))
+    else:
+        half_height = 0.5 * simulated.object_height
+        lean = math.tan(0.5 * simulated.object_taper) if shape == "wedge" else 0.0
+        low = 0.5 * simulated.object_width + half_height * lean
+        high = 0.5 * simulated.object_width - half_height * lean
+        own = np.array([(-low, -1.0), (-high, 1.0), (high, 1.0), (low, -1.0), (-low, -1.0)])
+        own[:, 1] *= half_height
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turned: NDArray[np.float64] = own @ np.array([(cosine, sine), (-sine, cosine)]) + (x, y)
+    return turned
+
+
+def _view(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """The hand's plane [m, y up] → Rerun's 2-D view [mm, y down]."""
+    assert points is not None
+    shown: NDArray[np.float64] = points * (1e3, -1e3)
+    return shown
+
+
+def _between(
+    first: tuple[int, int, int], second: tuple[int, int, int], share: float
+) -> tuple[int, int, int]:
+    red, green, blue = (round(a + share * (b - a)) for a, b in zip(first, second, strict=True))
+    return red, green, blue

@@ -1,0 +1,138 @@
+"""The planar hand as lines to draw: fingers, soft tips with their springs, object, forces.
+
+Pure geometry, in the hand's plane: m, x from the left pivot to the right one, y away from the palm.
+A tip's own axes are x along its base and z out of it; the object's face stands at
+``x sin θ + z cos θ = a − d`` in them (`kinematics.fingers` has where the tips are).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinematics.fingers import HandGeometry
+
+FloatArray = NDArray[np.float64]
+
+SPRINGS = 17  # drawn in a tip, of the continuum that the model has
+_ANGLES = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What is felt at one tip: d [m], θ [rad], F [N]."""
+
+    d: float
+    theta: float
+    force: float
+
+
+@dataclass(frozen=True)
+class FingerLines:
+    """One finger's lines, each [n, 2] m. ``springs`` [SPRINGS, 2, 2] go from base to skin."""
+
+    link: FloatArray  # pivot, end of the link, centre of the tip's base
+    base: FloatArray
+    skin: FloatArray
+    springs: FloatArray
+    strain: FloatArray  # [SPRINGS]
+    face: FloatArray | None  # where the object's face touches, end to end
+    normal: FloatArray | None  # [2, 2], from the face's middle out of the object, a fixed length
+    push: FloatArray | None  # [2, 2], where the tip pushes on the object and in which direction (1)
+
+
+def finger_lines(
+    hand: HandGeometry, finger: int, q: float, contact: Contact | None = None
+) -> FingerLines:
+    """The lines of finger 0 (left) or 1 (right) at joint angle ``q`` [rad]."""
+    a = hand.tip_radius
+    centre = hand.tips((q, q))[finger]
+    along, out = tip_axes(finger, q)
+    side = 1.0 if finger == 0 else -1.0
+    pivot = np.array([-side * hand.half_separation, 0.0])
+    end = pivot + hand.finger_length * np.array([side * math.sin(q), math.cos(q)])
+
+    def place(x: FloatArray, z: FloatArray) -> FloatArray:
+        placed: FloatArray = centre + x[:, None] * along + z[:, None] * out
+        return placed
+
+    rim = a * np.sin(_ANGLES)
+    inner = a * np.linspace(-0.94, 0.94, SPRINGS)
+    free = np.sqrt(a * a - inner * inner)
+    skin, length = a * np.cos(_ANGLES), free
+    face = normal = push = None
+    if contact is not None and 0.0 < contact.d < a and abs(contact.theta) < 0.5 * math.pi:
+        sine, cosine, h = math.sin(contact.theta), math.cos(contact.theta), a - contact.d
+        skin = np.clip((h - rim * sine) / cosine, 0.0, skin)
+        length = np.clip((h - inner * sine) / cosine, 0.0, free)
+        rho = math.sqrt(2.0 * a * contact.d - contact.d**2)
+        middle, inwards = h * np.array([sine, cosine]), np.array([sine, cosine])
+        ends = middle + np.outer((-rho, rho), (cosine, -sine))
+        face = place(ends[:, 0], ends[:, 1])
+        lines = np.array([middle, middle - 0.6 * a * inwards])
+        normal = place(lines[:, 0], lines[:, 1])
+        x = (a - contact.d / 3.0) * sine  # the centroid of pressure
+        at = place(np.array([x]), np.array([(h - x * sine) / cosine]))[0]
+        push = np.array([at, out])
+    springs = np.stack((place(inner, np.zeros(SPRINGS)), place(inner, length)), axis=1)
+    return FingerLines(
+        np.array([pivot, end, centre]),
+        place(np.array([-a, a]), np.zeros(2)),
+        place(rim, skin),
+        springs,
+        1.0 - length / free,
+        face,
+        normal,
+        push,
+    )
+
+
+def tip_axes(finger: int, q: float) -> tuple[FloatArray, FloatArray]:
+    """A tip's own x and z in the hand's plane, unit vectors [2]: n·x = sin θ, n·z = cos θ."""
+    sine, cosine = math.sin(q), math.cos(q)
+    if finger == 0:
+        return np.array([sine, cosine]), np.array([cosine, -sine])
+    return np.array([sine, -cosine]), np.array([-cosine, -sine])
+
+
+class HeldObject:
+    """Where the object between both tips is, from contact to contact.
+
+    Across its faces the contacts tell it. Along them nothing does: it is taken to stand centred on
+    the contacts when both begin, and to roll on the tips without slip from then on,
+    ṡ1 = (a − d1) θ̇1, ṡ2 = −(a − d2) θ̇2, with s the tips' places along its faces.
+    """
+
+    def __init__(self, hand: HandGeometry) -> None:
+        self._hand = hand
+        self._along: FloatArray | None = None  # s of both tips [m]
+        self._theta = np.zeros(2)
+
+    def lose(self) -> None:
+        """It is held no more."""
+        self._along = None
+
+    def outline(
+        self, q: tuple[float, float], d: FloatArray, theta: FloatArray, width: float, height: float
+    ) -> FloatArray:
+        """Its outline [5, 2] m, closed, from joints [rad], contacts (left, right), W and height."""
+        hand, a = self._hand, self._hand.tip_radius
+        angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
+        n = np.array([math.cos(angle), math.sin(angle)])
+        t = np.array([-n[1], n[0]])
+        tips = hand.tips(q)
+        across = 0.5 * (tips[0] @ n + a - d[0] + tips[1] @ n - a + d[1])
+        if self._along is None:
+            self._along = tips @ t - (tips @ t).mean()
+        else:
+            self._along = self._along + (a - d) * (theta - self._theta) * (1.0, -1.0)
+        self._theta = theta.copy()
+        centre = across * n + (tips @ t - self._along).mean() * t
+        corners = np.array([(-1, -1), (-1, 1), (1, 1), (1, -1), (-1, -1)])
+        outline: FloatArray = (
+            centre + 0.5 * width * corners[:, :1] * n + 0.5 * height * corners[:, 1:] * t
+        )
+        return outline
