@@ -51,6 +51,7 @@ _FINGER = (
     Field("d_std", "float", "m", "standard deviation of d"),
     Field("theta_std", "float", "rad", "standard deviation of theta"),
     Field("gain", "float", "", "measured over modelled pressure"),
+    Field("misfit", "bool", "", "the frame fits no contact of the model: d, theta may be biased"),
     Field("contact", "bool", "", "something touches the tip"),
     Field(
         "frame_seq", "int", "", "the tactile frame that the estimate rests on, 0 before the first"

@@ -327,6 +327,16 @@ def _same(data: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
     return np.array_equal(data, other)
 
 
+def misfit(view: View, state: State, _: float) -> str:
+    for finger in view.fingers:
+        if state.contacts[finger].misfit:
+            return (
+                f"tactile: what the {FINGERS[finger]} tip feels fits no contact of the model; d "
+                "and theta may be biased (another material, unequal cells, more noise than told)"
+            )
+    return ""
+
+
 def saturated(view: View, state: State, share: float) -> str:
     full, most = view.settings.tactile.full_count, share * view.limits.saturated
     for sensor in view.sensors:

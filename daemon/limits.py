@@ -94,6 +94,8 @@ ROWS: tuple[Row, ...] = (
         "fault", ("safety.frozen_after",), by.frozen, _T),
     Row("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), by.saturated, _T,
         lasts=0.1),
+    Row("tactile.misfit", "frames that fit no contact of the model", "warn", ("tactile.noise",),
+        by.misfit, _T, lasts=0.5),
     Row("hand.angle", "object's angle by one finger against the other's", "warn",
         ("safety.residual_angle", "object.taper"), by.hand_angle, _T, lasts=0.2, share=0.5),
     Row("hand.angle", "object's angle by one finger against the other's", "fault",

@@ -162,6 +162,7 @@ def _finger(
         "d_std": contact.d_std,
         "theta_std": contact.theta_std,
         "gain": contact.gain,
+        "misfit": contact.misfit,
         "contact": contact.contact,
         "frame_seq": contact.seq,
         "frame_age_s": state.t - contact.t if contact.seq else 0.0,

@@ -102,6 +102,7 @@ class FingerPerception:
         contact.valid = estimate.valid
         contact.contact = estimate.contact
         contact.gain = estimate.gain
+        contact.misfit = estimate.misfit
         if not estimate.contact:
             contact.d = contact.theta = contact.tilt_y = 0.0
             contact.force = contact.energy = 0.0

@@ -63,6 +63,7 @@ class Contact:
     d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
     theta_std: float = 0.0
     gain: float = 1.0  # measured pressure over modelled pressure
+    misfit: bool = False  # the frame is no contact of the model's: d and theta may be biased
     force: float = 0.0  # F(d, θ) [N]
     energy: float = 0.0  # U(d, θ) [J]
     inside: bool = True  # (d, θ) lies inside the model's domain

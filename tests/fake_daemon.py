@@ -34,6 +34,7 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "theta_std": math.radians(0.1),
         "tilt_y": 0.0,
         "gain": 1.0,
+        "misfit": False,
         "contact": True,
         "frame_seq": 7,
         "frame_age_s": 0.012,

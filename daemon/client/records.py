@@ -40,6 +40,7 @@ class FingerState:
     d_std: float  # standard deviations [m], [rad]
     theta_std: float
     gain: float  # measured over modelled pressure
+    misfit: bool  # the frame fits no contact of the model: d and theta may be biased
     contact: bool  # something touches the tip
     frame_seq: int  # of the tactile frame that the estimate rests on
     frame_age_s: float
