@@ -141,6 +141,8 @@ def _past(history: FloatArray, newest: int, t: float) -> tuple[int, int, float]:
     later = newest
     for back in range(size):
         row = (newest - back) % size
+        if history[row, _H_T] == -math.inf:
+            break  # nothing was read before: a frame may be older than the first reading
         if history[row, _H_T] <= t:
             span = history[later, _H_T] - history[row, _H_T]
             share = (t - history[row, _H_T]) / span if span > 0.0 else 0.0
@@ -332,8 +334,9 @@ class Prediction:
             return
         for name in Contact.__slots__:
             setattr(contact, name, getattr(frame, name))
-        self._live[finger] = frame.contact
-        if not frame.contact:
+        # Before a first reading nothing is known of the joints: the frame stands for itself.
+        live = self._live[finger] = frame.contact and self._m[_T] > -math.inf
+        if not live:
             self._m[_LIVE + finger] = self._m[_D + finger] = 0.0
             return
         _correct(
