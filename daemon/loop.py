@@ -24,6 +24,7 @@ from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
 from daemon.statistics import Statistics, record
 from daemon.stream import Publisher
+from daemon.tactile.base import TactileError
 from daemon.task import Task, TaskOver
 
 EventSink = Callable[[str, str, str], None]
@@ -330,6 +331,8 @@ class Loop:
         self._lease.check(command, self.state.t)
         if command.name == "clear":
             self._reconnect()
+        if command.name in ("clear", "arm"):
+            self._reopen(command.name)
         self._refuse_unsafe(command.name)
         reply = control.command(command)
         self._lease.renew(command, self.state.t)
@@ -365,6 +368,28 @@ class Loop:
         except ServoError as error:
             raise Refused(f"clear: {error}") from None
         self.emit("info", "servos", "connected anew")
+
+    def _reopen(self, name: str) -> None:
+        """Sensors whose port was lost are opened anew: only on command and with torque off.
+
+        Raises Refused for ``clear`` where one can't be; without sensors a hand may be armed.
+        """
+        if self.state.torque:
+            return
+        for perception in self.perceptions:
+            sensor, side = perception.sensor, FINGERS[perception.finger]
+            if not sensor.counters().get("port_lost"):
+                continue
+            sensor.close()
+            try:
+                sensor.open()
+            except TactileError as error:
+                if name == "clear":
+                    raise Refused(f"{name}: {error}") from None
+                self.emit("warning", "tactile", str(error))
+            else:
+                self.emit("info", "tactile", f"{side} sensor opened anew")
+                self._feel()
 
     def _refuse_unsafe(self, name: str) -> None:
         """What neither the mode nor the control law knows, and still speaks against a command."""

@@ -470,6 +470,27 @@ def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus: RunningBus) ->
     backend.close()
 
 
+def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(bus: RunningBus) -> None:
+    # As where an adapter held packets up that the port had taken.
+    backend = connected(bus, watchdog=2.0)
+    backend.set_torque(True)
+    goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
+    backend.write(goal)
+    servo = bus.servo(1)
+    bus.call(lambda: servo.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR))
+    begin = time.monotonic()
+
+    def go_on() -> None:
+        while time.monotonic() < begin + 5.0:
+            backend.read(reading)
+            backend.write(goal)
+
+    with pytest.raises(ServoError, match=r"right.*: its bus watchdog stopped it"):
+        go_on()
+    assert time.monotonic() < begin + 1.5
+    backend.close()
+
+
 def test_a_port_that_goes_away(bus: RunningBus) -> None:
     backend = connected(bus)
     backend.set_torque(True)

@@ -20,7 +20,7 @@ from tests.conftest import until
 class Rig:
     """A daemon on an emulated hand's servos, both in this process."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **sections: Any) -> None:
         servos = {
             "backend": "dynamixel",
             "port": str(folder / "servos"),
@@ -28,9 +28,8 @@ class Rig:
             "fault_after": 0.5,
             "watchdog": 0.0,  # a motor that was left on stays on
         }
-        self.settings = Settings.model_validate(
-            {"servos": servos, "tactile": {"backend": "none"}, "loop": {"rate": 100.0}}
-        )
+        own = {"servos": servos, "tactile": {"backend": "none"}, "loop": {"rate": 100.0}}
+        self.settings = Settings.model_validate(own | sections)
         self.emulator = Emulator(self.settings, folder)
         ready = threading.Event()
         self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,))
@@ -110,3 +109,57 @@ def test_clear_of_another_fault_leaves_the_port_alone(rig: Rig) -> None:
     with pytest.raises(Refused, match="hardware error reported by left"):
         loop.command({"command": "clear"})
     assert ("info", "servos", "connected anew") not in rig.events
+
+
+def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path: Path) -> None:
+    board = {
+        "backend": "flexitac",
+        "port": (str(tmp_path / "tactile-left"), str(tmp_path / "tactile-right")),
+        "rows": 8,
+        "cols": 8,
+        "pitch": 0.00725,
+        "pascal_per_count": 500.0,
+        "full_count": 255,
+        "rate": 50.0,
+    }
+    # Frames may be late, since the emulator shares this process's interpreter lock.
+    rig = Rig(tmp_path, tactile=board, safety={"frame_age_hold": 30.0, "frame_age_fault": 40.0})
+    try:
+        loop, left = rig.loop, rig.loop.perceptions[0].sensor
+        loop.advance(0.1)
+        loop.command({"command": "arm"})
+        loop.command({"command": "grasp"})
+        assert rig.emulator.tell("left:unplug") == "ok"
+        until(lambda: left.counters()["port_lost"] == 1)
+        loop.advance(1.0)
+        assert (loop.state.mode, loop.state.fault_name) == ("fault", "tactile.silent")
+        for _ in range(2):  # a try that failed is no last one
+            with pytest.raises(Refused, match="no such port"):
+                loop.command({"command": "clear"})
+        assert rig.emulator.tell("left:plug") == "ok"
+        until(Path(rig.settings.tactile.port[0]).exists)
+        loop.advance(0.1)
+        assert loop.command({"command": "clear"})["mode"] == "disarmed"
+        assert ("info", "tactile", "left sensor opened anew") in rig.events
+        seq = loop.state.contacts[0].seq
+        loop.advance(0.3)
+        assert loop.state.contacts[0].seq > seq
+        assert loop.state.contacts[0].valid
+
+        # While nothing grips its loss is no fault: there is nothing to clear.
+        assert rig.emulator.tell("left:unplug") == "ok"
+        until(lambda: left.counters()["port_lost"] == 1)
+        loop.advance(0.1)
+        loop.command({"command": "arm"})
+        assert rig.events[-1][:2] != ("info", "tactile")
+        assert any("no such port" in text for level, _, text in rig.events if level == "warning")
+        loop.command({"command": "disarm"})
+        loop.advance(0.1)
+        assert rig.emulator.tell("left:plug") == "ok"
+        until(Path(rig.settings.tactile.port[0]).exists)
+        loop.command({"command": "arm"})
+        loop.command({"command": "grasp"})
+        loop.advance(0.2)
+        assert loop.state.mode == "grasping"
+    finally:
+        rig.close()

@@ -30,6 +30,7 @@ _GOAL_BYTES = (
     reg.GOAL_POSITION + 2,
     reg.GOAL_POSITION + 3,
 )
+_ASK_EVERY = 0.5  # s
 
 
 class Torque:
@@ -55,8 +56,10 @@ class Torque:
             ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
             ticks = min(max(ticks, 1), reg.WATCHDOG_MAX)
         self._ticks = ticks
+        self._ask_every = _ASK_EVERY if ticks else math.inf
         self._quiet_limit = 0.8 * ticks * reg.WATCHDOG_UNIT if ticks else math.inf
         self._was_quiet = False  # the bus watchdog may have stopped the servos
+        self._next_ask = math.inf  # when they are asked, time.monotonic()
         self._last_sent = 0.0  # time.monotonic() of the last packet the servos must have heard
 
     # --- on and off --------------------------------------------------------------------------
@@ -98,6 +101,7 @@ class Torque:
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
         self._last_sent = time.monotonic()
+        self._next_ask = self._last_sent + self._ask_every
         self._was_quiet = False
         self.goals = goals
 
@@ -183,11 +187,15 @@ class Torque:
     def ask_watchdog_if_quiet(self, t: float) -> None:
         """Where the line was quiet for long, make sure that no servo's watchdog has stopped it.
 
+        It is asked now and then all the same: what was sent in time may have been held up below.
+
         Raises:
             ServoError: one has.
         """
-        if not self._was_quiet and t - self._last_sent <= self._quiet_limit:
+        quiet = self._was_quiet or t - self._last_sent > self._quiet_limit
+        if not quiet and t < self._next_ask:
             return
+        self._next_ask = t + self._ask_every
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.BUS_WATCHDOG, 1)
             if raw is not None and raw[0] == reg.WATCHDOG_ERROR:

@@ -157,9 +157,9 @@ class SerialReader:
         self._decoder = self._make_decoder()
         self._sensor_clock = SensorClock()
         self._latest, self._bytes = None, 0
-        self._error, self._gone = "", False
         self._event.clear()
         self._port = open_port(self._path, self._baud)
+        self._error, self._gone = "", False
         self._stop = os.pipe()
         self._thread = threading.Thread(
             target=self._run,
@@ -170,15 +170,20 @@ class SerialReader:
         self._thread.start()
         self._event.wait(self._open_timeout)
         if self._latest is None or not self._latest.valid:
+            trouble = self._trouble()
             self.close()
-            raise TactileError(f"{self._path}: {self._trouble()}")
+            self._gone = True
+            raise TactileError(f"{self._path}: {trouble}")
 
     def latest(self) -> Frame | None:
         """The newest complete frame, the same object until a newer came; None before the first."""
         return self._latest
 
     def counters(self) -> dict[str, int]:
-        """``bytes`` read, ``port_lost`` 0 or 1, and the framing's own counters."""
+        """``bytes`` read, the framing's own counters, and ``port_lost``.
+
+        That is 1 from when the port was lost until it is open again and frames come.
+        """
         return {
             "bytes": self._bytes,
             "port_lost": int(self._gone),
