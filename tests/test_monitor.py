@@ -8,13 +8,15 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgpack
 import pytest
 
+from daemon.client import Hand
 from tests.conftest import until
+from tests.daemon_process import Running
 from tests.fake_daemon import FakeDaemon
 from tests.terminal_process import TerminalProcess
 
@@ -128,7 +130,7 @@ def test_keys_command_the_hand(fake: FakeDaemon) -> None:
         for key, sent, shown in (
             (b"g", {"command": "grasp"}, "✓ grasp: ok"),
             (b"c", {"command": "clear"}, "✗ clear: not while holding"),
-            (b"o", {"command": "release"}, "✓ open: ok"),
+            (b"r", {"command": "release"}, "✓ release: ok"),
             (b"a", {"command": "arm"}, "✗ arm: an answer that can't be read"),
             (b"d", {"command": "disarm"}, "✓ disarm: ok"),
             (b" ", {"command": "stop"}, "✓ stop: ok"),
@@ -149,6 +151,34 @@ def test_keys_command_the_hand(fake: FakeDaemon) -> None:
         page.type(b" ")
         page.shows("✓ stop: ok")
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
+
+
+def test_named_client(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake, "--client", "bench")) as page:
+        page.shows("HOLDING")
+        page.type(b"g")
+        page.shows("✓ grasp: ok")
+        assert fake.requests == [{"command": "grasp", "client": "bench"}]
+
+
+def test_beside_another_commander_of_a_real_daemon(
+    start: Callable[..., Running], profile: Callable[[str], Path], addresses: tuple[str, str]
+) -> None:
+    stream, commands = addresses
+    daemon = start("--config", str(profile("commands.lease = 60.0\n")))
+    where = ["--state", stream, "--commands", commands]
+    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+        page.shows("DISARMED", "running, disarmed")  # told before the page was there
+        page.shows("p99", "25.0", "°C")
+        with Hand(stream, commands, client="notebook") as hand:
+            hand.arm()
+            page.shows("ARMED", "notebook commands the hand")
+            page.type(b"g")
+            page.shows("✗ grasp: notebook commands the hand (")
+            page.type(b" ")  # stop needs no lease
+            page.shows("✓ stop: ok", "DISARMED")
+        assert daemon.end() == 0
+        page.shows("○ lost")
 
 
 def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +15,8 @@ from rich.cells import cell_len
 from rich.segment import Segment
 
 from tests import fake_daemon
-from tools.feed import HISTORY_STEP, Feed, Reply
+from tools.feed import HISTORY_STEP, Feed
+from tools.feed_sockets import Reply
 from tools.monitor_page import Page
 from tools.terminal import Keys
 
@@ -153,6 +155,103 @@ def test_a_new_daemon_begins_a_new_story() -> None:
     assert feed.statistics(3.0).messages == 1.0
 
 
+STATS = {
+    "schema": 1,
+    **{part: {"p50": 12e-6, "p99": 34e-6, "p999": 40e-6, "max": 561e-6} for part in
+       ("wake", "compute", "bus", "publish")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6, math.inf])
+def test_quantiles_of_all_ticks_fit_beside_each_other(factor: float) -> None:
+    feed = fed()
+    slow = {
+        part: {share: factor * value for share, value in times.items()}
+        for part, times in STATS.items()
+        if isinstance(times, dict)
+    }
+    give(feed, b"hand/stats", STATS | slow)
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"overruns": 123456})
+    (line,) = [each for each in shown(feed).splitlines() if " tick " in each]
+    assert "overruns 123456" in line
+    if factor < 1e5:
+        assert {1.0: "late 12/34/561 µs", 1e3: "compute 12ms/34ms/561ms  late"}[factor] in line
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"overruns": 7})
+    if factor == 1.0:
+        assert "  p50/p99/max  compute 12/34/561  late 12/34/561 µs" in shown(feed)
+        assert "compute 12 µs p99 34 max 561  late 12 µs p99 34 max" in shown(feed, width=90)
+
+
+def test_temperature_of_a_servo() -> None:
+    feed = fed()
+    state = fake_daemon.state(1.0, 99)
+    state["left"]["temperature"], state["right"]["temperature"] = 0.0, 71.5
+    give(feed, b"hand/state", state)
+    (line,) = [each for each in shown(feed).splitlines() if "servo" in each]
+    assert line.split()[line.split().index("servo") :][:4] == ["servo", "—", "71.5", "°C"]
+    warned = json.dumps({"safety": {"temperature_warn": 70.0}, "commands": {"lease": 5.0}})
+
+    def style_of_the_hot_one() -> object:
+        lines = Page(feed, "").lines(80, 24, 0.0, None)
+        return next(part.style for each in lines for part in each if "71.5" in part.text)
+
+    before = style_of_the_hot_one()
+    give(feed, b"hand/settings", {"settings": warned})
+    assert style_of_the_hot_one() != before
+
+
+def told(seq: int, when: float, text: str, again: bool = False) -> dict[str, Any]:
+    return fake_daemon.event(seq, "mode", text) | {"timestamp": when, "again": again}
+
+
+TEXTS = ["first", "second", "third"]
+
+
+def test_events_told_again_are_shown_once_and_in_their_order() -> None:
+    feed = Feed()
+    give(feed, b"hand/event", told(3, 103.0, "third"))  # between subscription and telling again
+    for seq in (1, 2, 3):
+        give(
+            feed, b"hand/event", told(seq, 100.0 + seq, ("first", "second", "third")[seq - 1], True)
+        )
+    assert [event.text for event in feed.events] == TEXTS
+    assert [event.text for event in feed.news()] == ["third", "first", "second"]
+    assert feed.news() == []
+    for seq in (1, 2):  # a daemon that was started anew counts from 1 again
+        give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
+        give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
+    assert [event.text for event in feed.events][3:] == ["anew 1", "anew 2"]
+
+
+def test_who_commands_is_told_while_the_lease_lasts() -> None:
+    feed = fed()
+    give(feed, b"hand/settings", {"settings": json.dumps({"commands": {"lease": 5.0}})})
+    carried_out = {"command": "grasp", "client": "note\x1bbook", "ok": True, "error": ""}
+    give(feed, b"hand/command", carried_out, 0.0)
+    assert "note book commands the hand" in shown(feed, 4.9)
+    assert "commands the hand" not in shown(feed, 5.1)
+    give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)  # needs none, takes none
+    assert "commands the hand" not in shown(feed, 6.1)
+    give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
+    assert "commands the hand" not in shown(feed, 7.1)  # that may be this page itself
+    refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
+    give(feed, b"hand/command", refused, 8.0)
+    assert "refused   grasp: arm first (to note book)" in shown(feed, 8.0)
+
+
+@pytest.mark.parametrize("keys", [True, False])
+def test_long_reasons_are_shown_in_full_at_the_least_size(keys: bool) -> None:
+    feed = fed()
+    fault = "left: no sound tactile frame for 0.31 s while gripping, more than 0.3 s: torque is off"
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"mode": "fault", "fault": fault})
+    why = "clear: left: no sound tactile frame for 12.42 s while gripping, more than 0.3 s allowed"
+    text = shown(feed, reply=Reply(0.0, False, why), keys=keys)
+    flat = " ".join(text.split())
+    assert fault in flat
+    assert ("c clears it" if keys else "softfinger send clear") in flat
+    assert f"✗ {why[:60]}" in flat
+
+
 VALUES = st.recursive(
     st.none()
     | st.booleans()
@@ -167,13 +266,19 @@ VALUES = st.recursive(
 )
 FIELDS = ["schema", "seq", "mode", "fault", "tick_s", "left", "right", "object", "level", "text"]
 FIELDS += ["timestamp", "mono_ns", "finger", "rows", "cols", "scale", "data", "kind"]
+FIELDS += ["settings", "command", "client", "ok", "error", "again", "wake", "compute"]
 
 
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from([b"hand/state", b"hand/tactile", b"hand/event", b"else"]),
+            st.sampled_from(
+                [
+                    *(b"hand/state", b"hand/tactile", b"hand/event", b"else"),
+                    *(b"hand/stats", b"hand/command", b"hand/settings"),
+                ]
+            ),
             st.dictionaries(st.sampled_from(FIELDS), VALUES, max_size=8) | VALUES,
         ),
         max_size=4,

@@ -1,34 +1,35 @@
 """What the public wire says, kept for one who looks at it: the newest state and frames, the last
 events, statistics over the last second, a short history.
 
-Holds the subscriber's side of the stream and the commands a person sends, and nothing that
+Holds the subscriber's side of the stream, without its sockets (`feed_sockets`), and nothing that
 draws. Every message is taken as data of unknown origin: a missing or wrong-typed field is a
 NaN or an empty text, a message that can't be read is counted and skipped.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import statistics
 import time
+from bisect import insort
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
 import msgpack
 import numpy as np
-import zmq
 from numpy.typing import NDArray
+
+from daemon.modes import Lease
 
 FINGERS = ("left", "right")
 SCHEMA = 1  # of hand/state, the newest this module knows
-TOPICS = (b"hand/state", b"hand/tactile", b"hand/event")
 
 HISTORY_STEP = 0.2  # s in one column of the trends
 HISTORY_LENGTH = 600
 WINDOW = 1.0  # s of statistics
-_DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
-_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+EVENTS = 200  # kept
 
 
 def field(record: object, *path: str) -> Any:
@@ -108,16 +109,40 @@ class TickStatistics:
     late_max: float = math.nan
 
 
+@dataclass(frozen=True, slots=True)
+class LoopTimes:
+    """What ``hand/stats`` tells of all ticks so far [s]; NaN where it doesn't."""
+
+    compute: tuple[float, ...]  # median, p99, largest
+    late: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Commanding:
+    """Who has the commander's lease, and until when."""
+
+    client: str  # empty: the clients that give no name
+    until: float  # monotonic s
+
+
 class Feed:
-    """Takes messages, remembers what a page shows. ``now`` is monotonic seconds throughout."""
+    """Takes messages, remembers what a page shows. ``now`` is monotonic seconds throughout.
+
+    ``events`` are in the order in which they happened, which after a late subscription is not the
+    order in which they came; ``news`` hands them over as they came.
+    """
 
     def __init__(self) -> None:
         self.state: dict[str, Any] | None = None
         self.state_at = -math.inf
         self.frames: dict[str, TactileFrame] = {}
-        self.events: deque[Event] = deque(maxlen=200)
-        self.event_count = 0
-        self._event_seq = -math.inf
+        self.events: list[Event] = []
+        self._news: deque[Event] = deque(maxlen=EVENTS)
+        self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
+        self.times: LoopTimes | None = None
+        self.warm = math.inf  # °C from which a servo's temperature is warned about
+        self.commanding: Commanding | None = None
+        self._lease = math.nan  # s
         self.skipped = 0
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
         self._bin: list[tuple[float, float]] = []
@@ -139,6 +164,12 @@ class Feed:
                 self._take_frame(record, now)
             elif topic == b"hand/event":
                 self._take_event(record)
+            elif topic == b"hand/stats":
+                self._take_stats(record)
+            elif topic == b"hand/command":
+                self._take_command(record, now)
+            elif topic == b"hand/settings":
+                self._take_settings(record)
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
             self.skipped += 1
 
@@ -150,6 +181,7 @@ class Feed:
             self.frames.clear()
             self._bin.clear()
             self._period = 0.0
+            self.times = self.commanding = None
         elif 0.0 < mono - self._mono < 60.0:
             step = mono - self._mono
             self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
@@ -193,12 +225,13 @@ class Feed:
         )
 
     def _take_event(self, record: dict[str, Any]) -> None:
-        seq = number(record, "seq")
-        if record.get("again") is True and seq <= self._event_seq:
-            return  # told again for somebody who came later
-        self._event_seq = seq
-        self.event_count += 1
-        self.events.append(
+        # Told again for somebody who came later, it has its first seq and times; another daemon's
+        # has other times.
+        name = number(record, "seq"), number(record, "timestamp")
+        if record.get("again") is True and name in self._heard:
+            return
+        self._heard.append(name)
+        self._happened(
             Event(
                 number(record, "timestamp"),
                 text(record, "level"),
@@ -206,6 +239,52 @@ class Feed:
                 text(record, "text"),
             )
         )
+
+    def _happened(self, event: Event) -> None:
+        self._news.append(event)
+        if math.isnan(event.timestamp):
+            self.events.append(event)
+        else:
+            insort(self.events, event, key=lambda each: each.timestamp)
+        del self.events[:-EVENTS]
+
+    def _take_stats(self, record: dict[str, Any]) -> None:
+        compute, late = (
+            tuple(number(record, part, share) for share in ("p50", "p99", "max"))
+            for part in ("compute", "wake")
+        )
+        self.times = LoopTimes(compute, late)
+
+    def _take_command(self, record: dict[str, Any], now: float) -> None:
+        """Who commands; a refusal is an event of its own, for those who didn't send it."""
+        name, client = text(record, "command"), text(record, "client")
+        if record.get("again") is True:
+            return
+        if record.get("ok") is not True:
+            said = text(record, "error")
+            by = f" (to {client})" if client else ""
+            when = number(record, "timestamp")
+            self._happened(Event(when, "warning", "refused", f"{said}{by}"))
+        elif name not in Lease.FREE and self._lease > 0.0:
+            self.commanding = Commanding(client, now + self._lease)
+
+    def _take_settings(self, record: dict[str, Any]) -> None:
+        settings = json.loads(text(record, "settings") or "{}")
+        self._lease = number(settings, "commands", "lease")
+        warm = number(settings, "safety", "temperature_warn")
+        self.warm = math.inf if math.isnan(warm) else warm
+
+    def news(self) -> list[Event]:
+        """The events that have come since the last call."""
+        fresh = list(self._news)
+        self._news.clear()
+        return fresh
+
+    def commander(self, now: float) -> str | None:
+        """The client that has the commander's lease, "" for one without a name; None: nobody."""
+        if self.commanding is None or now >= self.commanding.until:
+            return None
+        return self.commanding.client
 
     def age(self, now: float) -> float:
         """Seconds since the last state, infinite before the first."""
@@ -249,108 +328,3 @@ def _median(values: tuple[float, ...]) -> float:
 
 def _greatest(values: tuple[float, ...]) -> float:
     return max(_finite(values), default=math.nan)
-
-
-class Subscriber:
-    """The stream's socket: everything that waits is taken into a feed."""
-
-    def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
-        self.feed = feed
-        self._socket = context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, _DRAIN_LIMIT)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
-        for topic in TOPICS:
-            self._socket.setsockopt(zmq.SUBSCRIBE, topic)
-        self._socket.connect(address)
-
-    def drain(self, now: float) -> int:
-        """Take what waits; how many messages that was."""
-        for count in range(_DRAIN_LIMIT):
-            try:
-                message = self._socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                return count
-            self.feed.take(message, now)
-        return _DRAIN_LIMIT
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """What came of a command, for the page."""
-
-    at: float
-    ok: bool
-    text: str
-
-
-class Commander:
-    """Sends commands without ever waiting. The newest reply is kept in ``reply``.
-
-    Each command has a request socket of its own: an answer that never comes holds nothing up,
-    a stop least of all.
-    """
-
-    PATIENCE = 1.0  # s for an answer
-    OPEN_LIMIT = 8  # commands under way; further ones are dropped, except stop
-
-    def __init__(self, context: zmq.Context[Any], address: str) -> None:
-        self._context = context
-        self._address = address
-        self._pending: list[tuple[str, zmq.Socket[bytes], float]] = []
-        self.reply: Reply | None = None
-
-    def send(self, now: float, label: str, command: str, **fields: float) -> None:
-        """Send ``command`` with ``fields``; the reply is shown under ``label``."""
-        if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
-            self.reply = Reply(now, False, f"{label}: dropped, the daemon doesn't answer")
-            return
-        request = self._context.socket(zmq.REQ)
-        request.setsockopt(zmq.LINGER, 0)
-        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
-        request.connect(self._address)
-        request.send(msgpack.packb({"command": command, **fields}), zmq.NOBLOCK)
-        self._pending.append((label, request, now + self.PATIENCE))
-
-    def refuse(self, now: float, why: str) -> None:
-        """Say that a key was not turned into a command."""
-        self.reply = Reply(now, False, why)
-
-    def collect(self, now: float) -> None:
-        """Take the replies that came, give up on those that are overdue."""
-        waiting = []
-        for label, request, deadline in self._pending:
-            try:
-                payload = request.recv(zmq.NOBLOCK)
-            except zmq.Again:
-                if now < deadline:
-                    waiting.append((label, request, deadline))
-                    continue
-                self.reply = Reply(now, False, f"{label}: no answer from {self._address}")
-            else:
-                self.reply = self._read(now, label, payload)
-            request.close()
-        self._pending = waiting
-
-    @staticmethod
-    def _read(now: float, label: str, payload: bytes) -> Reply:
-        try:
-            record = msgpack.unpackb(payload)
-        except (ValueError, RecursionError, msgpack.UnpackException):
-            record = None
-        if field(record, "ok") is True:
-            return Reply(now, True, f"{label}: ok")
-        why = text(record, "error") or "an answer that can't be read"
-        said = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
-        return Reply(now, False, why if said else f"{label}: {why}")
-
-    def close(self) -> None:
-        """Close what is open; commands that were not taken yet are dropped."""
-        for _, request, _ in self._pending:
-            request.close()
-        self._pending = []

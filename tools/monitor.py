@@ -22,7 +22,8 @@ import zmq
 
 from daemon.keys import KeyFileError, load_client
 from tools.arguments import add_keys
-from tools.feed import FINGERS, Commander, Feed, Subscriber, field, number, text
+from tools.feed import FINGERS, Feed, field, number, text
+from tools.feed_sockets import Commander, Subscriber
 from tools.monitor_page import Page
 from tools.terminal import Keys, Terminal, TerminalGone
 
@@ -38,12 +39,13 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this command's arguments to ``parser``."""
     parser.description = (
-        "Show the hand on a live terminal page; keys arm, grasp, rotate, open and stop it. "
+        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it. "
         "Prints a plain line a second when the output is not a terminal."
     )
     parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
     parser.add_argument("--commands", metavar="ADDRESS", help="where commands are taken")
     add_keys(parser)
+    parser.add_argument("--client", default="", help="name that owns the commander's lease")
     parser.add_argument(
         "--no-wait", action="store_true", help="end when no daemon is running, or when it ends"
     )
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         if args.keys is not None:
             load_client(args.keys).guard(context)
         subscriber = Subscriber(context, state, feed)
-        commander = Commander(context, commands)
+        commander = Commander(context, commands, args.client)
         try:
             with _Ending(args) as ending:
                 if _is_page(args):
@@ -254,7 +256,8 @@ class _HandKeys:
         simple = {
             "a": ("arm", "arm"),
             "g": ("grasp", "grasp"),
-            "o": ("open", "release"),
+            "r": ("release", "release"),
+            "o": ("release", "release"),
             " ": ("stop", "stop"),
             "c": ("clear", "clear"),
             "d": ("disarm", "disarm"),
@@ -285,7 +288,7 @@ class _HandKeys:
 def _run_plain(address: str, subscriber: Subscriber, ending: _Ending) -> None:
     feed = subscriber.feed
     with contextlib.suppress(BrokenPipeError):
-        said_status, shown, due = "live", 0, 0.0
+        said_status, due = "live", 0.0
         while not ending.over:
             ending.wait(PLAIN_STEP)
             now = time.monotonic()
@@ -295,10 +298,8 @@ def _run_plain(address: str, subscriber: Subscriber, ending: _Ending) -> None:
             if status != said_status:
                 said_status = status
                 _say(f"{_clock()} stream {status}: {address}")
-            fresh = feed.event_count - shown
-            for event in list(feed.events)[-fresh:] if fresh else ():
+            for event in feed.news():
                 _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
-            shown = feed.event_count
             if status in ("live", "stale") and now >= due:
                 due = now + PLAIN_LINE
                 _say(plain_line(feed, now))

@@ -12,12 +12,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from rich.cells import cell_len
 from rich.segment import Segment
 from rich.style import Style
 
 from tools import heatmap
-from tools.feed import FINGERS, SCHEMA, Feed, Reply, TickStatistics, number, text
+from tools.feed import FINGERS, SCHEMA, Feed, TickStatistics, number, text
 from tools.feed import field as value_at
+from tools.feed_sockets import Reply
 from tools.typeset import (
     DIM,
     PLAIN,
@@ -30,9 +32,11 @@ from tools.typeset import (
     exactly,
     faded,
     length,
+    micro,
     narrow,
     rule,
     short,
+    wrapped,
 )
 
 WIDTH, HEIGHT = 80, 24  # the least that everything fits into
@@ -58,19 +62,19 @@ _BADGES = {
 _BUSY = Style(color="#201800", bgcolor="#e6a817", bold=True)
 _LEVELS = {"info": DIM, "warning": WARN, "error": BAD}
 
-# (label, field, factor, decimals, unit, field of the standard deviation); "" leaves a line
+# (label, field, factor, decimals, unit, field of the standard deviation)
 _ROWS = (
     ("d", "d", 1e3, 2, "mm", "d_std"),
     ("θ", "theta", math.degrees(1.0), 1, "°", "theta_std"),
     ("force", "force", 1.0, 2, "N", "force_std"),
     ("energy", "energy", 1e3, 2, "mJ", "energy_std"),
     ("map age", "frame_age_s", 1e3, 1, "ms", ""),
-    ("", "", 0.0, 0, "", ""),
     ("joint", "q", math.degrees(1.0), 2, "°", ""),
     ("goal", "goal_q", math.degrees(1.0), 2, "°", ""),
     ("velocity", "dq", math.degrees(1.0), 1, "°/s", ""),
     ("current", "current", 1.0, 3, "A", ""),
     ("bound", "goal_current", 1.0, 3, "A", ""),
+    ("servo", "temperature", 1.0, 1, "°C", ""),
 )
 
 
@@ -104,7 +108,7 @@ class Page:
             *self._body(width, maps, now),
             rule(width),
             *self._trends(width, trend),
-            self._ticks(),
+            self._ticks(width),
         ]
         if status in ("stale", "lost"):
             numbers = [faded(line) for line in numbers]
@@ -112,8 +116,7 @@ class Page:
             self._header(width, now, status),
             self._notice(width, status),
             *numbers,
-            rule(width, "events", _reply(reply, now)),
-            *self._events(width, events),
+            *self._messages(width, events, now, reply),
             self._footer(width),
         ]
         return [exactly(line, width) for line in page]
@@ -149,10 +152,8 @@ class Page:
             return [Segment(" nothing comes any more; what stands below is old", BAD)]
         fault = text(self.feed.state, "fault")
         if fault:
-            way = "c clears it " if self.keys else "softfinger send clear "
-            room = width - len(way) - 8
-            line = [Segment(f" FAULT {cut(fault, room)}", ALARM)]
-            return apart(line, [Segment(way, ALARM)], width, ALARM)
+            line = [Segment(f" FAULT {cut(fault, width - len(self._way_out) - 8)}", ALARM)]
+            return apart(line, [Segment(self._way_out, ALARM)], width, ALARM)
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
             return [Segment(cut(what, width), WARN)]
@@ -232,16 +233,20 @@ class Page:
         return [Segment(" " * 8), *heads]
 
     def _row(self, label: str, key: str, factor: float, decimals: int, unit: str, std: str) -> Line:
-        if not label:
-            return []
         line = [Segment(f"{label:<8}", DIM)]
         for name in FINGERS:
             finger = value_at(self.feed.state, name)
             here = value_at(finger, "valid") is not False
-            shown = aligned(factor * number(finger, key), decimals)
+            value = number(finger, key)
+            if key == "temperature" and value == 0.0:
+                value = math.nan  # not known yet
+            shown = aligned(factor * value, decimals)
             spread = number(finger, std) if std else math.nan
             beside = "" if math.isnan(spread) else "±" + narrow(factor * spread)
-            line.append(Segment(f"{shown:<6}", PLAIN if here else DIM))
+            style = PLAIN if here else DIM
+            if key == "temperature" and value >= self.feed.warm:
+                style = BAD
+            line.append(Segment(f"{shown:<6}", style))
             line.append(Segment(f"{beside:<{11 - max(6, len(shown))}}", DIM))
         line.append(Segment(f" {unit}", DIM))
         return line
@@ -279,27 +284,62 @@ class Page:
             result[-lines].append(Segment(f"{full:g} N", DIM))
         return result
 
-    def _ticks(self) -> Line:
-        now = self._statistics
+    def _ticks(self, width: int) -> Line:
+        """Rate and overruns, then median, tail and worst of all ticks; of the last second until
+        the daemon has told them. Shorter words where there is less room."""
+        now, told = self._statistics, self.feed.times
         overruns = number(self.feed.state, "overruns")
-        line = [Segment(" tick ", DIM), Segment(f"{short(now.rate, 0)} Hz")]
-        for label, median, worst in (
-            ("compute", now.compute, now.compute_max),
-            ("late", now.late, now.late_max),
-        ):
-            line += [
-                Segment(f"   {label} ", DIM),
-                Segment(f"{short(1e6 * median, 0)} µs"),
-                Segment(f" max {short(1e6 * worst, 0)}", DIM),
-            ]
-        line += [
-            Segment("   overruns ", DIM),
+        head = [
+            Segment(f" tick {short(now.rate, 0)} Hz"),
+            Segment("  overruns ", DIM),
             Segment(short(overruns, 0), WARN if overruns > 0 else PLAIN),
         ]
-        return line
+        times: tuple[tuple[str, tuple[float, ...]], ...]
+        words: tuple[str, ...]
+        if told is None:
+            times = (
+                ("compute", (now.compute, now.compute_max)),
+                ("late", (now.late, now.late_max)),
+            )
+            words = ("µs", "max")
+        else:
+            times = (("compute", told.compute), ("late", told.late))
+            words = ("µs", "p99", "max")
+        full, slim = [*head], [*head]
+        for label, values in times:
+            said = [micro(value) for value in values]
+            tail = "".join(
+                f" {word} {value}" for word, value in zip(words[1:], said[1:], strict=True)
+            )
+            full += [Segment(f"  {label} ", DIM), Segment(f"{said[0]} µs"), Segment(tail, DIM)]
+            slim += [Segment(f"  {label} ", DIM), Segment("/".join(said))]
+        slim.append(Segment(" µs", DIM))
+        named = [*slim[:3], Segment(f"  p50/{'/'.join(words[1:])}", DIM), *slim[3:]]
+        return next((line for line in (full, named) if length(line) <= width), slim)
+
+    def _messages(self, width: int, count: int, now: float, reply: Reply | None) -> list[Line]:
+        """A rule with who commands and the last reply, what had no room so far, then events."""
+        who = self.feed.commander(now)
+        title = "events" if not who else f"events ─ {cut(who, 16)} commands the hand"
+        said = _reply(reply, now)
+        full: list[Line] = []
+        fault = text(self.feed.state, "fault")
+        if cell_len(fault) > width - len(self._way_out) - 8:
+            full += [[Segment(f" {part}", BAD)] for part in wrapped(fault, width - 2)[:2]]
+        if length(said) > width - len(title) - 9:
+            parts = wrapped(said[0].text, width - 2)
+            full += [[Segment(f" {part}", said[0].style)] for part in parts[:2]]
+            said = []
+        full = full[:count]
+        return [rule(width, title, said), *full, *self._events(width, count - len(full))]
+
+    @property
+    def _way_out(self) -> str:
+        """What clears a fault."""
+        return "c clears it " if self.keys else "softfinger send clear "
 
     def _events(self, width: int, count: int) -> list[Line]:
-        recent = list(self.feed.events)[-count:]
+        recent = self.feed.events[-count:] if count else []
         result: list[Line] = []
         for event in recent:
             style = _LEVELS.get(event.level, PLAIN)
@@ -318,7 +358,7 @@ class Page:
             ("a", "arm"),
             ("g", "grasp"),
             ("←→", "rotate 5°"),
-            ("o", "open"),
+            ("r", "release"),
             ("space", "stop"),
             ("c", "clear"),
             ("d", "disarm"),

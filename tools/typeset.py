@@ -54,11 +54,30 @@ def short(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
 
 
+def micro(seconds: float) -> str:
+    """A time in µs, in at most 4 columns; from 10 ms on in ms, with its unit."""
+    if not math.isfinite(seconds):
+        return "—"
+    return f"{1e6 * seconds:.0f}" if seconds < 9.9995e-3 else f"{1e3 * seconds:.0f}ms"
+
+
 def cut(said: str, room: int) -> str:
     """``said`` in at most ``room`` columns, with an ellipsis where it was cut."""
     if cell_len(said) <= room:
         return said
     return set_cell_size(said, max(0, room - 1)) + ("…" if room > 0 else "")
+
+
+def wrapped(said: str, room: int) -> list[str]:
+    """``said`` in lines of at most ``room`` columns."""
+    lines = [""]
+    for word in said.split(" "):
+        longer = f"{lines[-1]} {word}" if lines[-1] else word
+        if cell_len(longer) <= room:
+            lines[-1] = longer
+        else:
+            lines.append(cut(word, room))
+    return [line for line in lines if line]
 
 
 def length(line: Iterable[Segment]) -> int:
