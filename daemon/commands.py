@@ -5,7 +5,8 @@ nobody speaks, and needs no lock. A plain REQ socket is enough for a client.
 
 One command is carried out a tick. What has come beside it is looked through as far as a tick
 allows: a ``stop`` goes first whoever else speaks, and a client that sends more than it may a second
-is refused, so that a flood costs the tick a bounded time and no one else's command its turn.
+is refused, or in a flood not even answered, so that a flood costs the tick a bounded time and no
+one else's command its turn.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
 _QUEUE = 64  # commands that wait, of one client in its socket and of all of them here
 _LOOK = 8  # messages that are taken in at a tick
+_REFUSALS = 2  # answers at a tick to who sends too much
 _CLIENTS = 256  # whose pace is remembered
 _STOP = b"stop"
 
@@ -59,11 +61,13 @@ class CommandServer:
         self._now = now
         self._paces: dict[bytes, tuple[float, float]] = {}  # of a client: may send, at time
         self._waiting: deque[tuple[list[bytes], bytes]] = deque()
+        self._refusals = _REFUSALS  # that may still be answered at this tick
         self.refused_by_pace = 0
 
     def serve(self, handler: Handler) -> bool:
         """Answer one waiting command through ``handler``; False when there was nothing at all."""
         came = False
+        self._refusals = _REFUSALS
         for _ in range(_LOOK):
             if not self._bound.readable():
                 break
@@ -84,10 +88,8 @@ class CommandServer:
         if _is_stop(payload, self._max_bytes):
             self._send(envelope, self._answer(payload, handler))
         elif not self._in_pace(envelope[0], self._now()):
-            self.refused_by_pace += 1
             self._refuse(envelope, f"too many commands: at most {self._per_second:g} a second")
         elif len(self._waiting) >= _QUEUE:
-            self.refused_by_pace += 1
             self._refuse(envelope, "too many commands wait already")
         else:
             self._waiting.append((envelope, payload))
@@ -102,6 +104,10 @@ class CommandServer:
         return left >= 1.0
 
     def _refuse(self, envelope: list[bytes], error: str) -> None:
+        self.refused_by_pace += 1
+        if self._refusals <= 0:
+            return
+        self._refusals -= 1
         self._send(envelope, {"ok": False, "error": error})
 
     def _send(self, envelope: list[bytes], reply: dict[str, Any]) -> None:
