@@ -46,6 +46,7 @@ class Broadcast:
         self._period = 1.0 / settings.loop.rate
         self._scene = Parts.of(settings)
         self.truth: Truth | None = None  # a simulated hand's
+        self._numbers = [0, 0]  # frames of each finger that went out
         self._published = [-1, -1]  # of which n frames one went out, for each finger
         self._states = self._maps = 0  # messages that went out
         self._told = _Counts()  # when the rates were last told
@@ -80,10 +81,14 @@ class Broadcast:
         if frame is None or frame.seq // every == self._published[perception.finger]:
             return
         self._published[perception.finger] = frame.seq // every
+        self._numbers[perception.finger] += 1
         self._maps += 1
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.shown(frame)
-        self._publisher.tactile(frame, data, perception.finger, perception.facts, wall, every)
+        number = self._numbers[perception.finger]
+        self._publisher.tactile(
+            frame, data, perception.finger, perception.facts, wall, every, number
+        )
 
     def _rates(self, state: State) -> Rates:
         """Rates [Hz] since they were last asked for."""

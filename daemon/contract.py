@@ -31,7 +31,7 @@ _ALL = (
     Field("timestamp", "float", "s", "Unix time"),
 )
 
-_STEP = Field("seq_step", "int", "", "one of so many is sent; ⌊seq / seq_step⌋ has no gaps")
+_STEP = Field("seq_step", "int", "", "one of so many is sent")
 _SENT = (*_ALL[:2], _STEP, *_ALL[2:])
 
 _FINGER = (
@@ -83,7 +83,9 @@ _STATE = (
 )
 
 _TACTILE = (
-    *_SENT,
+    *_SENT[:3],
+    Field("number", "int", "", "counts this sensor's messages: a gap is a loss on the way"),
+    *_SENT[3:],
     Field("mono_ns", "int", "ns", "the daemon's monotonic clock at the board's scan"),
     Field("delay_s", "float", "s", "from the scan until the frame had come"),
     Field("valid", "bool", "", "false: the board is gone, this is its last frame again"),

@@ -234,17 +234,19 @@ def tactile_message(
     facts: SensorFacts,
     wall: float,
     step: int = 1,
+    number: int = 0,
 ) -> dict[str, Any]:
     """The ``hand/tactile`` map of one finger's frame; ``wall`` is the Unix time it was sampled.
 
     ``data`` [rows, cols] is the frame's, in steps as ``facts`` tells; one of ``step`` frames is
-    sent.
+    sent, and this is the ``number``-th of the sensor.
     """
     rows, cols = data.shape
     return {
         "schema": SCHEMA,
         "seq": frame.seq,
         "seq_step": step,
+        "number": number,
         "timestamp": wall,
         "mono_ns": int(frame.t_sample * 1e9),
         "delay_s": frame.t_arrival - frame.t_sample,

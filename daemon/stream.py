@@ -88,9 +88,10 @@ class Publisher:
         facts: messages.SensorFacts,
         wall: float,
         step: int = 1,
+        number: int = 0,
     ) -> None:
         """Publish one finger's frame on ``hand/tactile``, see `daemon.messages.tactile_message`."""
-        message = messages.tactile_message(frame, data, finger, facts, wall, step)
+        message = messages.tactile_message(frame, data, finger, facts, wall, step, number)
         self._send(messages.TACTILE, message)
 
     def stats(

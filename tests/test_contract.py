@@ -66,7 +66,7 @@ def sample(topic: bytes) -> dict[str, Any]:
             calibrated=False,
             calibration="",
         )
-        return messages.tactile_message(frame, counts, 1, facts, 1.7e9 + 0.23, 4)
+        return messages.tactile_message(frame, counts, 1, facts, 1.7e9 + 0.23, 4, 19)
     if topic == messages.STATS:
         statistics = Statistics()
         for k in range(1, 100):

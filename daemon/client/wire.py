@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ from daemon import messages
 from daemon.client.records import read_event, read_frame, read_state
 
 _QUEUE = 100_000  # messages kept for a program that is slow for a while
+_AGAIN = 1000  # messages that are known again
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 READERS: dict[bytes, Callable[[dict[str, Any]], Any]] = {
@@ -39,26 +41,39 @@ def nothing_from(address: str, topic: bytes, seconds: float) -> str:
 
 
 class Gaps:
-    """Counts what was lost between two messages of one topic, by ``seq`` and its step.
+    """Counts what was lost between two messages of one topic.
 
-    A ``seq`` that goes back is another daemon, or the same one started again: no loss. What is told
-    ``again`` is no news where it was heard before, and a gap that it fills is none.
+    By their ``number`` where they have one, else by ``seq``, of which one in ``seq_step`` is sent.
+    One that goes back is another daemon's, or the same one's started again: no loss. What is told
+    ``again`` is news where it was not heard before, and may fill a gap.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self._last: dict[str, int] = {}
+        self._heard: deque[int] = deque(maxlen=_AGAIN)  # of what may be told again
 
     def take(self, message: dict[str, Any]) -> bool:
-        """Look at one more message; of ``seq_step`` (1 if untold) one is sent. False: no news."""
-        seq, step, source = message.get("seq"), message.get("seq_step", 1), message.get("finger")
-        if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
-            return True
+        """Look at one more message. False: it was heard before."""
+        place = message.get("number")
+        if not isinstance(place, int):
+            seq, step = message.get("seq"), message.get("seq_step", 1)
+            if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
+                return True
+            place = seq // step
+        source, again = message.get("finger"), message.get("again")
         key = source if isinstance(source, str) else ""
-        place = seq // step
         last = self._last.get(key)
-        if message.get("again") is True and last is not None and place <= last:
-            return False
+        if again is True and last is not None and place <= last:
+            if place in self._heard:
+                return False
+            self._heard.append(place)
+            self.lost = max(self.lost - 1, 0)
+            return True
+        if again is not None:
+            if last is not None and place <= last:
+                self._heard.clear()  # another daemon's
+            self._heard.append(place)
         if last is not None and place > last:
             self.lost += place - last - 1
         self._last[key] = place
