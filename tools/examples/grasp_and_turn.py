@@ -1,0 +1,103 @@
+"""Grasp an object, turn it to both sides, and draw what happened. A script of notebook cells.
+
+Start a daemon with ``softfinger run``, then run this file as a whole,
+
+    python -m tools.examples.grasp_and_turn --picture grasp_and_turn.png
+
+or cell by cell where ``# %%`` is understood. Needs matplotlib, the extra ``plot``.
+"""
+
+# %% Which hand, and what to ask of it
+from __future__ import annotations
+
+import argparse
+import math
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from daemon.client import Hand, HandState, to_columns
+from daemon.client.hand import COMMANDS, STREAM
+from kinematics import ContactTable, Fingertip, Material
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--stream", default=STREAM)
+parser.add_argument("--commands", default=COMMANDS)
+parser.add_argument("--picture", default="grasp_and_turn.png")
+where = parser.parse_known_args()[0]  # a notebook has arguments of its own
+
+FORCE = 8.0  # N on each tip
+ANGLES = (12.0, -12.0, 0.0)  # degrees, one after the other
+DEGREES = math.degrees(1.0)
+
+
+# %% Grasp, turn, release, and keep every state on the way
+def settled(state: HandState) -> bool:
+    return state.mode == "holding"
+
+
+recorded: list[HandState] = []
+with Hand(where.stream, where.commands, client="grasp_and_turn") as hand:
+    with hand.stream(timeout=3.0) as states:
+        recorded.append(next(states))  # the stream is there before anything moves
+        try:
+            hand.arm()
+            hand.grasp(force=FORCE)
+            hand.wait_for(settled)
+            for angle in ANGLES:
+                hand.rotate(math.radians(angle))
+                hand.wait_for(settled)
+            hand.release()
+            end = hand.wait_for(lambda state: state.mode == "armed")
+        finally:
+            hand.stop()  # torque off, whatever went wrong
+        for state in states:  # all that has come meanwhile
+            recorded.append(state)
+            if state.seq >= end.seq:
+                break
+    print(f"{len(recorded)} states, {states.lost} lost")
+
+# %% As columns: `pandas.DataFrame(columns)` takes them, too
+columns = to_columns(recorded)
+t = (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9
+touching = {name: columns[f"{name}.contact"] for name in ("left", "right")}
+held = columns["mode"] == "holding"
+print(f"force while holding: {columns['left.force'][held].mean():.2f} N, asked for {FORCE:g} N")
+
+# %% The energy landscape of the built-in hand's fingertip, and where its minimum over θ is
+tip, material = Fingertip(radius=0.020), Material.table_i()
+table = ContactTable.build(tip, material)
+deepest = 1.25 * max(columns[f"{name}.d"][touching[name]].max() for name in touching)
+d = np.linspace(0.0, deepest, 200)[1:]
+theta = np.radians(np.linspace(-35.0, 35.0, 281))
+energy = table(d[:, None], theta[None, :]).energy
+minimum = theta[np.argmin(energy, axis=1)]
+
+# %% The picture
+LOOKS = {"left": ("#0072B2", "-"), "right": ("#D55E00", "--")}
+figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+panels = figure.subplot_mosaic([["force", "map"], ["angle", "map"]], width_ratios=[1.0, 1.15])
+levels = 1e3 * energy.max() * np.linspace(0.0, 1.0, 11) ** 2  # U goes as d³: closer at its foot
+shown = panels["map"].contourf(
+    theta * DEGREES, d * 1e3, energy * 1e3, levels, cmap="Greys", vmax=1.8 * levels[-1]
+)
+figure.colorbar(shown, ax=panels["map"], label="energy U [mJ]", format="%.1f")
+panels["map"].plot(minimum * DEGREES, d * 1e3, "k:", label="local minimum")
+for name, (colour, line) in LOOKS.items():
+    touched = touching[name]
+    force = np.where(touched, columns[f"{name}.force"], np.nan)
+    panels["force"].plot(t, force, line, color=colour, label=name)
+    path = columns[f"{name}.theta"][touched], columns[f"{name}.d"][touched]
+    panels["map"].plot(path[0] * DEGREES, path[1] * 1e3, line, color=colour, label=name)
+panels["force"].axhline(FORCE, color="k", linestyle=":", linewidth=1.0, label="asked for")
+known = np.where(columns["object.valid"], columns["object.angle"], np.nan)
+panels["angle"].plot(t, known * DEGREES, color="#009E73")
+for angle in ANGLES:
+    panels["angle"].axhline(angle, color="k", linestyle=":", linewidth=1.0)
+panels["force"].set(ylabel="force F [N]", ylim=(0.0, 1.45 * FORCE), xlim=(0.0, t[-1]))
+panels["angle"].set(ylabel="object's angle [°]", xlabel="time [s]", xlim=(0.0, t[-1]))
+panels["map"].set(xlabel="θ [°]", ylabel="displacement d [mm]", ylim=(0.0, deepest * 1e3))
+panels["force"].legend(ncols=3, loc="upper center", fontsize="small", frameon=False)
+panels["map"].legend(ncols=3, loc="upper center", fontsize="small", framealpha=1.0)
+figure.savefig(where.picture, dpi=120)
+print(where.picture)
