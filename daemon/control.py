@@ -29,6 +29,7 @@ _SETTLED_FOR = 0.2  # s
 _TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
 _RAISED = 1.02  # of the force asked for: told as raised
 _LOST_AFTER = 0.1  # s without contact in a grip
+_EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
 
 
 class Control:
@@ -59,6 +60,8 @@ class Control:
         self._rest_current = settings.safety.current_move  # A, with which the joints hold a goal
         self._waiting = 0.0  # s since the ramps ended, or the grip has been settled
         self._lost = 0.0  # s without contact in a grip
+        self._empty = 0.0  # s in which a grip has been too narrow to hold anything
+        self._turn_ended = False  # before its target, since the tips would slip
 
     # Commands
 
@@ -154,6 +157,7 @@ class Control:
                 f"expected {low:.2f} to {high:.2f} in this grip"
             )
         self._grip.steer(self._pose.angle, angle)
+        self._turn_ended = False
         self._enter(Mode.ROTATING)
 
     def _set(self, numbers: dict[str, float]) -> None:
@@ -201,7 +205,7 @@ class Control:
             text = f"rotate: dropped, since the grasp ended in {mode.value}"
             self.events.append(("warning", "rotate", text))
         self._rest_current = self._settings.safety.current_move
-        self._waiting = self._lost = 0.0
+        self._waiting = self._lost = self._empty = 0.0
         if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
             self._gripping = False
 
@@ -270,6 +274,8 @@ class Control:
             if not touches:
                 self._ways[index].target = self._settings.hand.q_max[index]
         if all(self._touching[index] for index in self._fingers):
+            if self._is_empty(dt):
+                return
             felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
             self._gripping = True
             self._grip.start(self._held, felt, self._force)
@@ -294,6 +300,7 @@ class Control:
         grip.holding = self.mode is Mode.HOLDING
         if self._loses(dt, contacts, goal):
             return
+        self._is_empty(dt)
         if self._by_position:
             goal.q[:] = grip.angles(self._contacts, self._pose, self._held)
             goal.current[0] = goal.current[1] = self._settings.safety.current_max
@@ -330,6 +337,26 @@ class Control:
             self._rest_current = rest
         return True
 
+    def _is_empty(self, dt: float) -> bool:
+        """Whether there seems to be nothing between the tips; when that stays, the hand opens.
+
+        Tips that press each other would roll off to one side. Their contacts are one, so that the
+        object's width by joints and sensors is 0 up to their errors.
+        """
+        least = self._settings.object.width_min
+        if not self._pose.valid or self._pose.width >= least:
+            self._empty = 0.0
+            return False
+        self._empty += dt
+        if self._empty > _EMPTY_AFTER:
+            text = (
+                f"nothing between the tips: {self._pose.width * 1e3:.1f} mm, "
+                f"less than object.width_min {least * 1e3:g} mm; opening"
+            )
+            self.events.append(("warning", "grasp", text))
+            self._release({})
+        return True
+
     def _watch_slip(self) -> None:
         """Tell when the grip is raised by itself. Turning ends where the tips would slip."""
         law = self._settings.control
@@ -345,8 +372,11 @@ class Control:
         elif given <= asked:
             self._raised = False
         if self.mode is Mode.ROTATING and self._held.shear * grip.turning_on > most:
-            text = f"turning ended at {math.degrees(self._pose.angle):.1f}°: the tips would slip"
-            self.events.append(("warning", "slip", text))
+            if not self._turn_ended:
+                angle = math.degrees(self._pose.angle)
+                text = f"turning ended at {angle:.1f}°: the tips would slip"
+                self.events.append(("warning", "slip", text))
+            self._turn_ended = True
             grip.steer(self._pose.angle, self._pose.angle)
 
     def _watch_settling(self, dt: float, contacts: list[Contact]) -> None:

@@ -254,6 +254,7 @@ class ObjectSettings(Section):
     taper: Annotated[float, Field(ge=-1.5, le=1.5)] = (
         0.0  # rad between its faces; above 0 it is wider at the palm
     )
+    width_min: NonNegative = 0.002  # m; tips nearer to each other hold nothing: the hand opens
 
 
 class Simulation(Section):

@@ -26,6 +26,8 @@ Holds the judgement alone; the grip law raises the force, within ``control.grip_
 
 from __future__ import annotations
 
+import math
+
 from daemon.prediction import Held
 from daemon.records import Contact
 from daemon.settings import Settings
@@ -75,7 +77,9 @@ class SlipWatch:
 
     def begin(self, held: Held) -> None:
         """Holding begins, or begins again after a command: learn what is no load."""
-        lever = 0.5 * self._width * (held.turn[0] + held.turn[1])
+        # Where the faces lean towards each other, the object going out takes part of the turning.
+        lean = math.tan(0.5 * held.taper)
+        lever = self._width * _mean(held.turn) - lean * _mean(held.arm)
         if lever <= 0.0:
             self._known = False
             return

@@ -55,8 +55,9 @@ def load_by_torques(
     d2: float,
     theta1: float,
     theta2: float,
+    taper: float,
     motion: tuple[float, float, float, float, float, float, float],
-    rolled: float,
+    rolled: tuple[float, float],
     torque1: float,
     torque2: float,
 ) -> tuple[float, float]:
@@ -64,19 +65,25 @@ def load_by_torques(
 
     Solves for L, in the least squares of both joints' torques, that
 
-        τ1 = N1 arm1 + ∂U1/∂θ1 + T1 W turn1      T1 = T + L
-        τ2 = N2 arm2 − ∂U2/∂θ2 − T2 W turn2      T2 = T − L
+        τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
+        τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
-    with T = ``rolled`` [N], the shear that rolling and the turning moments cause without a load
-    (:func:`kinematics.held.holding_levers`), and N and ∂U/∂θ as the shears bend them. ``motion`` is
-    what :func:`kinematics.held.held_motion` gives. An error of both torques by e makes one of
-    e/lever in L [m]. Zeros without two contacts.
+    with n_i, t_i of each tip's face, ``rolled`` [N] the shears that rolling, the turning moments
+    and the ``taper`` [rad] cause without a load (:func:`kinematics.held.holding_levers`), and N and
+    ∂U/∂θ as the shears bend them. Between parallel faces ±v_i·n is arm_i and lever_i is W turn_i;
+    ``motion`` is what :func:`kinematics.held.held_motion` gives. An error of both torques by e
+    makes one of e/lever in L [m]. Zeros without two contacts.
     """
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0
-    arm1, arm2, turn1, turn2, _, width, _ = motion
-    lever1 = width * turn1
-    lever2 = width * turn2
+    arm1, arm2, turn1, turn2, _, width, across = motion
+    # What rolls the object out along its bisector is no lever of each force: taken back here.
+    lean = math.tan(0.5 * taper)
+    share = 1.0 / (1.0 + lean * lean)
+    lever1 = share * (across * turn1 - lean * arm1)
+    lever2 = share * (across * turn2 - lean * arm2)
+    arm1 = share * (arm1 + lean * across * turn1)
+    arm2 = share * (arm2 + lean * across * turn2)
     least = _LEAST_SLOPE * (lever1 * lever1 + lever2 * lever2)
     if least <= 0.0:
         return 0.0, 0.0
@@ -84,8 +91,12 @@ def load_by_torques(
     most = 0.5 * (lookup(data1, d1, theta1)[0] + lookup(data2, d2, theta2)[0])
     load = slope = 0.0
     for _ in range(_STEPS):
-        left1, slope1 = _unexplained(data1, d1, theta1, 1.0, rolled + load, torque1, arm1, lever1)
-        left2, slope2 = _unexplained(data2, d2, theta2, -1.0, rolled - load, torque2, arm2, lever2)
+        left1, slope1 = _unexplained(
+            data1, d1, theta1, 1.0, rolled[0] + load, torque1, arm1, lever1
+        )
+        left2, slope2 = _unexplained(
+            data2, d2, theta2, -1.0, rolled[1] - load, torque2, arm2, lever2
+        )
         over = lever1 * left1 - lever2 * left2
         slope = max(lever1 * slope1 + lever2 * slope2, least)
         load = min(max(load + over / slope, -most), most)

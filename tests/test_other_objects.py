@@ -1,0 +1,136 @@
+"""The daemon on what is no block of parallel faces: wedges, discs, a sheet, nothing at all."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.settings import Settings
+from daemon.simulation import layout
+from kinematics.fingers import HandGeometry
+
+HAND = HandGeometry()
+SLOW: dict[str, Any] = {"rate": 25.0}
+
+
+class Rig:
+    """A daemon on virtual time and what it told."""
+
+    def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
+        settings = Settings.model_validate({"loop": {"clock": "virtual"}} | sections)
+        self.events: list[tuple[str, str, str]] = []
+        self.daemon = Daemon(settings, wire=False, on_event=self.hear)
+        self.loop, self.state = self.daemon.loop, self.daemon.loop.state
+        assert self.daemon.hand is not None
+        self.plant = self.daemon.hand
+        self.loop.advance(0.3)
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.daemon.close()
+
+    def hear(self, *event: str) -> None:
+        self.events.append(event)  # type: ignore[arg-type]
+
+    def command(self, name: str, seconds: float, **numbers: float) -> None:
+        self.loop.command({"command": name, **numbers})
+        self.loop.advance(seconds)
+
+    def grasp(self, force: float, seconds: float = 2.5) -> None:
+        self.command("arm", 0.2)
+        self.command("grasp", seconds, force=force)
+
+    def warnings(self) -> list[str]:
+        return [kind for level, kind, _ in self.events if level in ("warning", "error")]
+
+
+def width_at_the_contacts(plant: Any) -> float:
+    """Distance of both contacts along the object's n, by the plant's outline."""
+    memory, found = plant.memory, []
+    n = np.array([math.cos(plant.object_pose[2]), math.sin(plant.object_pose[2])])
+    for finger, side in ((0, 1.0), (1, -1.0)):
+        q = memory[layout.POSITION + finger]
+        along = np.array([side * math.cos(q), -math.sin(q)])
+        turned = plant.theta[finger]
+        c, s = math.cos(turned), math.sin(turned)
+        to = np.array([c * along[0] - s * along[1], s * along[0] + c * along[1]])
+        found.append(HAND.tips(plant.q)[finger] + (HAND.tip_radius - plant.d[finger]) * to)
+    return float((found[1] - found[0]) @ n)
+
+
+@pytest.mark.parametrize("frames", [{}, SLOW], ids=["100 Hz", "25 Hz"])
+@pytest.mark.parametrize(("taper", "told"), [(0.2, 0.2), (-0.2, -0.2), (0.2, 0.13), (-0.3, -0.3)])
+def test_a_wedge_is_felt_and_turned_as_it_is(
+    taper: float, told: float, frames: dict[str, Any]
+) -> None:
+    sections = {
+        "simulation": {"object_shape": "wedge", "object_taper": taper},
+        "object": {"taper": told},
+        "tactile": frames,
+    }
+    with Rig(sections) as rig:
+        rig.grasp(8.0)
+        for angle in (0.0, 0.05, -0.05):
+            rig.command("rotate", 1.5, angle=angle)
+            off = []
+            for _ in range(50):
+                rig.loop.advance(0.002)
+                rig.plant.advance(rig.state.reading.t)
+                theta = [contact.theta for contact in rig.state.contacts]
+                off.append(
+                    [*(theta - rig.plant.theta), rig.state.object.angle - rig.plant.object_pose[2]]
+                )
+            assert rig.state.mode == "holding"
+            assert np.abs(np.mean(off, axis=0)).max() < 0.003
+            assert rig.plant.object_pose[2] == pytest.approx(angle, abs=math.radians(0.2))
+            assert rig.state.object.width == pytest.approx(
+                width_at_the_contacts(rig.plant), abs=2e-4
+            )
+            held = rig.daemon.loop._held
+            used = np.abs(rig.plant.tangential / rig.plant.normal).max()
+            assert held.shear == pytest.approx(used, abs=0.03)
+            assert held.taper == pytest.approx(taper, abs=0.005)
+        assert rig.warnings() == []
+
+
+def test_a_taper_that_was_not_told_is_felt_as_it_is_but_told_of() -> None:
+    with Rig({"simulation": {"object_shape": "wedge", "object_taper": 0.17}}) as rig:
+        rig.grasp(5.0)
+        rig.plant.advance(rig.state.reading.t)
+        found = [*(contact.theta for contact in rig.state.contacts), rig.state.object.angle]
+        true = [*rig.plant.theta, rig.plant.object_pose[2]]
+        assert found == pytest.approx(true, abs=0.004)
+        assert rig.warnings() == ["hand.angle"]
+
+
+@pytest.mark.parametrize("frames", [{}, SLOW], ids=["100 Hz", "25 Hz"])
+@pytest.mark.parametrize("force", [1.0, 25.0])
+def test_with_nothing_between_the_tips_the_hand_opens(force: float, frames: dict[str, Any]) -> None:
+    with Rig({"simulation": {"object_shape": "none"}, "tactile": frames}) as rig:
+        rig.grasp(force, 1.0)
+        worst = 0.0
+        for _ in range(600):
+            rig.loop.advance(0.002)
+            worst = max(worst, float(rig.plant.force.max()))
+        rig.loop.advance(1.0)
+        assert rig.state.mode == "armed"
+        assert rig.state.reading.q == pytest.approx(rig.daemon.settings.hand.open_angle, abs=0.03)
+        assert rig.warnings() == ["grasp"]
+        assert 0.5 < worst < 4.0
+        assert "nothing between the tips" in next(
+            text for *_, text in rig.events if "between" in text
+        )
+
+
+def test_a_sheet_that_is_told_to_be_one_is_not_nothing() -> None:
+    sheet = {"simulation": {"object_width": 0.001}, "object": {"width_min": 0.0005}}
+    with Rig(sheet) as rig:
+        rig.grasp(1.0, 1.6)
+        assert not any("between" in text for *_, text in rig.events)
+        assert rig.loop._control._gripping or rig.state.mode == "fault"
