@@ -91,11 +91,19 @@ class Browser:
         answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True)
         return answer["result"].get("value")
 
-    def picture(self) -> NDArray[np.uint8]:
-        """What the page looks like, [height, width, 3]."""
+    def picture(self, patience: float = 60.0) -> NDArray[np.uint8]:
+        """What the page looks like, [height, width, 3]. A page that is just opening has no look."""
         from PIL import Image
 
-        data = self.ask("Page.captureScreenshot", format="png")["data"]
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                data = self.ask("Page.captureScreenshot", format="png")["data"]
+                break
+            except RuntimeError:
+                if time.monotonic() > deadline:
+                    raise
+                select.select([], [], [], 0.1)
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
     def ask(self, method: str, timeout: float = 60.0, **parameters: Any) -> Any:

@@ -33,7 +33,6 @@ From another machine: ssh -L 9090:127.0.0.1:9090 -L PORT:127.0.0.1:PORT, with th
 Exit status: 0, or 1 with the reason when nothing could be shown."""
 
 _PORT = 9090  # of the page, when it is free
-_PERIOD = 0.05  # s between two drawings
 _WAIT = 2.0  # s without a message until the waiting is told, or --no-wait gives up
 _LOOK = 0.2  # s between two looks at the viewer
 _NICE = 5  # the viewer stands back behind everything that is in a hurry
@@ -57,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--memory", type=megabytes, default=500.0, metavar="MB", help="most that is kept; 500"
     )
+    parser.add_argument(
+        "--rate", type=_rate, default=20.0, metavar="HZ", help="pictures a second at most; 20"
+    )
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--from", type=moment, default=0.0, metavar="S", dest="start", help="of a recording"
@@ -71,6 +73,16 @@ def _port(text: str) -> int:
     if not text.isdecimal() or not 0 < int(text) < 65536:
         raise argparse.ArgumentTypeError(f"expected a port, found {text!r}")
     return int(text)
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.1 <= value <= 100.0:
+        raise argparse.ArgumentTypeError(f"expected 0.1 to 100 Hz, found {text!r}")
+    return value
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -167,6 +179,7 @@ class _View:
         bridge, ending = self._bridge, self._ending
         heard = time.monotonic()
         silent = ever = False
+        period = 1.0 / self._arguments.rate
         with LiveStream(self._arguments.address, self._arguments.keys) as stream:
             due = heard
             while not ending.over():
@@ -186,11 +199,11 @@ class _View:
                 self._tell_notes()
                 after = time.monotonic()
                 # Never busy for more than half of its time, however slow the machine is.
-                due = after + max(_PERIOD - (after - now), after - now)
+                due = after + max(period - (after - now), after - now)
                 if not self._shows(viewer):
                     return
             stream.drain(bridge, 0.0)
-            bridge.draw()
+            bridge.draw(last=True)
 
     def _show_recording(self, recording: Recording, viewer: Viewer | None) -> None:
         from tools.progress import Progress
@@ -199,12 +212,12 @@ class _View:
         arguments, bridge = self._arguments, self._bridge
         if recording.damage:
             self._say(f"{recording.path}: cut short ({recording.damage}); what is sound is shown")
-        drawn = math.nan
+        drawn, period = math.nan, 1.0 / arguments.rate
         with Progress("view", recording.size) as progress:
             end = math.inf if arguments.end is None else arguments.end
             for topic, message in recording.messages(TOPICS, arguments.start, end, progress):
                 bridge.take(topic, message)
-                if not abs(bridge.time - drawn) < _PERIOD:
+                if not abs(bridge.time - drawn) < period:
                     bridge.draw()
                     drawn = bridge.time
                     if self._ending.over() or not self._shows(viewer):
@@ -233,7 +246,8 @@ class _View:
 
     def _account(self) -> None:
         bridge = self._bridge
-        parts = [f"{bridge.shown} states shown", f"{bridge.lost} messages lost on the way"]
+        lost = ", ".join(f"{count} of {topic}" for topic, count in bridge.lost.items())
+        parts = [f"{bridge.shown} states shown", f"lost on the way: {lost or 'none'}"]
         if bridge.dropped:
             parts.append(f"{bridge.dropped} states passed over")
         if bridge.unreadable:

@@ -34,7 +34,8 @@ TOPICS = (
     messages.STATS,
 )
 _EVENTS = 500  # events that wait to be drawn
-_PATIENCE = 20  # drawings that the layout waits for the settings
+_PATIENCE = 100  # states that the layout waits for the settings
+_PLOTTED = 0.2  # s of the stream that go into the plots at once: fewer, larger pieces
 
 
 class Bridge:
@@ -58,7 +59,9 @@ class Bridge:
         self._wanted = Wanted()
         self._drawing: Drawing | None = None
         self._waited = 0
-        self._state: dict[str, Any] | None = None
+        self._newest: dict[str, Any] | None = None  # to be drawn
+        self._state: dict[str, Any] | None = None  # the last that was
+        self._plotted = math.nan
         self._mode = ""
         self._time = math.nan
         self._schema_told = False
@@ -69,9 +72,9 @@ class Bridge:
         self.notes: list[str] = []
 
     @property
-    def lost(self) -> int:
-        """Messages that were published and never came."""
-        return sum(gaps.lost for gaps in self._gaps.values())
+    def lost(self) -> dict[str, int]:
+        """Messages that were published and never came, by topic; none for topics without loss."""
+        return {topic.decode(): gaps.lost for topic, gaps in self._gaps.items() if gaps.lost}
 
     @property
     def time(self) -> float:
@@ -107,12 +110,14 @@ class Bridge:
             self._take_settings(message)
 
     def _take_state(self, message: dict[str, Any], when: float) -> None:
-        newest = self._states[-1][0] if self._states else self._state
+        newest = self._newest or self._state
         if newest is not None and number(message, "seq") < number(newest, "seq"):
             self._forget()
         mode = text(message, "mode")
         self.dropped += len(self._states) == self._states.maxlen
         self._states.append((message, self._wanted.force(mode), self._wanted.angle(mode)))
+        self._newest = message
+        self._waited += 1
         self._time = when
 
     def _forget(self) -> None:
@@ -153,18 +158,19 @@ class Bridge:
         if self._drawing is None:
             if not (self._states or self._frames or self._known):
                 return
-            self._waited += 1
             if not self._known and self._waited < _PATIENCE and not last:
                 return
             self._begin()
         drawing = self._drawing
         assert drawing is not None
-        if self._states:
-            self._plot()
-            self._state = self._states[-1][0]
-            self._states.clear()
+        if self._newest is not None:
             self._recording.set_time(layout.TIME, timestamp=self._time)
-            drawing.state(self._state)
+            drawing.state(self._newest)
+            self._state, self._newest = self._newest, None
+        if self._states and (last or not abs(self._time - self._plotted) < _PLOTTED):
+            self._plot()
+            self._states.clear()
+            self._plotted = self._time
         if self._truth is not None:
             self._at(self._truth)
             drawing.truth(self._truth)

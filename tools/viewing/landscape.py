@@ -81,8 +81,13 @@ class Landscape:
         theta = np.linspace(-THETA_END, THETA_END, 121)
         depth, angle = np.meshgrid(self._d, theta, indexing="ij")
         energy = np.asarray(self._table(depth, angle).energy)
-        contours = []
+        contours: list[Contour] = []
+        last = 0.0
         for level in _LEVELS[self._energy[-1] > _LEVELS]:
+            upright = float(np.interp(level, self._energy, self._d))
+            if upright - last < _APART * self.d_end:
+                continue
+            last = upright
             # U grows with d: one depth for each angle.
             d = np.array([np.interp(level, energy[:, k], self._d) for k in range(len(theta))])
             inside = np.abs(theta) <= theta_limits(self._radius, d)

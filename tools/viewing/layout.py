@@ -57,7 +57,7 @@ class Plot:
         return rrb.TimeSeriesView(
             origin=self.entity,
             name=self.title,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftBottom),
             time_ranges=_past(SECONDS),
         )
 
@@ -72,9 +72,10 @@ def plots(hand: Hand) -> dict[str, Plot]:
         "energy": Plot("energy", "Energy [mJ]", fingers + wanted),
         "d": Plot("d", "Displacement d [mm]", fingers),
         "theta": Plot("theta", "Tilt θ [°]", fingers),
-        "object": Plot("object", "Object's angle [°]", [("object", OBJECT, 2.0), *wanted]),
         "tick": Plot("tick", "Tick [µs]", [("work", OBJECT, 1.5), ("late", LATE, 1.5)]),
     }
+    if len(hand.fingers) == 2:
+        shown["object"] = Plot("object", "Object's angle [°]", [("object", OBJECT, 2.0), *wanted])
     if hand.servos:
         shown["q"] = Plot("q", "Joints [°]", fingers + goals)
         shown["current"] = Plot("current", "Currents [A]", fingers + goals)
@@ -94,7 +95,7 @@ def blueprint(hand: Hand) -> rrb.Blueprint:
     more: list[Any] = [rrb.Vertical(shown["d"].view(), shown["theta"].view(), name="d and θ")]
     if hand.servos:
         more.append(rrb.Vertical(shown["q"].view(), shown["current"].view(), name="Joints"))
-    if len(hand.fingers) == 2:
+    if "object" in shown:
         more.append(shown["object"].view())
     return rrb.Blueprint(
         rrb.Vertical(
@@ -115,7 +116,7 @@ def blueprint(hand: Hand) -> rrb.Blueprint:
                     ),
                     rrb.StateTimelineView(origin="mode", name="Mode", time_ranges=_past(SECONDS)),
                     rrb.TextLogView(origin="events", name="Events", columns=_event_columns()),
-                    row_shares=[1.3, 0.55, 1.2],
+                    row_shares=[1.3, 0.8, 1.2],
                 ),
                 column_shares=[1.15, 1.3, 1.25],
             ),

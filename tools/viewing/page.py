@@ -17,7 +17,7 @@ from urllib.parse import quote, urlsplit
 from tools.viewing.errors import ViewError
 
 _LOOPBACK = "127.0.0.1"
-_FILE = re.compile(r"/[\w.-]*")
+_FILE = re.compile(r"/([\w-]+(\.[\w-]+)*)?")
 _PASSED_ON = ("Content-Type", "Content-Length", "rerun-final-length")
 _HOSTS = ("127.0.0.1", "localhost")
 

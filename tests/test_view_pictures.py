@@ -1,0 +1,258 @@
+"""What the viewer draws: footprints on frames, the planar hand, the landscape, by the model."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.settings import Settings
+from kinematics.contact import Fingertip
+from kinematics.fingers import HandGeometry
+from kinematics.material import Material
+from kinematics.pressure import SensorGrid
+from kinematics.table import ContactTable
+from tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
+from tools.viewing.known import Hand, Wanted, read_settings
+from tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
+from tools.viewing.planar import Contact, HeldObject, finger_lines, tip_axes
+from tools.viewing.statistics import table
+
+TIP = Fingertip(radius=0.020)
+GRIDS = (
+    SensorGrid(44, 44, 0.058 / 44),
+    SensorGrid(30, 50, (0.0012, 0.0019), (0.002, -0.001), 0.4),
+)
+
+
+def area(outline: NDArray[np.float64]) -> float:
+    x, y = outline.T
+    return 0.5 * abs(float(x[:-1] @ y[1:] - x[1:] @ y[:-1]))
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("contact", [(0.004, 0.3, 0.0), (0.002, -0.2, 0.35), (0.006, 0.0, 0.0)])
+def test_the_footprint_is_where_the_forward_model_presses(
+    grid: SensorGrid, contact: tuple[float, float, float]
+) -> None:
+    pressure = grid.pressure(TIP, Material.constant(0.304e6), *contact)
+    shown = footprint(grid, TIP.radius, *contact)
+    assert shown is not None
+    rows, cols = np.indices(grid.shape) + 0.5
+    centroid = (pressure * cols).sum(), (pressure * rows).sum()
+    assert shown.centroid == pytest.approx(np.array(centroid) / pressure.sum(), abs=0.05)
+    # Every pressed cell has a corner in the outline, and the outline's ends are pressed.
+    pressed = np.column_stack((cols[pressure > 0.0], rows[pressure > 0.0]))
+    low, high = shown.outline.min(axis=0), shown.outline.max(axis=0)
+    assert (pressed >= low - 0.5).all()
+    assert (pressed <= high + 0.5).all()
+    assert pressed.min(axis=0) == pytest.approx(low, abs=0.51)
+    assert pressed.max(axis=0) == pytest.approx(high, abs=0.51)
+    d, tilt_x, tilt_y = contact
+    cosine = math.sqrt(1.0 - math.sin(tilt_x) ** 2 - math.sin(tilt_y) ** 2)
+    cell = grid.pitches[0] * grid.pitches[1]
+    expected = math.pi * (2.0 * TIP.radius * d - d * d) * cosine
+    assert area(shown.outline) * cell == pytest.approx(expected, rel=0.003)
+
+
+@pytest.mark.parametrize(
+    "contact", [(0.0, 0.1, 0.0), (0.02, 0.1, 0.0), (math.nan, 0.1, 0.0), (0.004, math.nan, 0.0)]
+)
+def test_no_footprint_without_a_contact(contact: tuple[float, float, float]) -> None:
+    assert footprint(GRIDS[0], TIP.radius, *contact) is None
+
+
+def test_the_grid_is_read_from_the_frame() -> None:
+    told = {"rows": 30, "cols": 50, "pitch": 0.0012, "pitch_y": 0.0019}
+    told |= {"centre_x": 0.002, "centre_y": -0.001, "rotation": 0.4}
+    assert grid_of(told) == GRIDS[1]
+    square = grid_of({"rows": 44, "cols": 44, "pitch": 0.058 / 44})
+    assert square is not None
+    assert square.pitches == GRIDS[0].pitches
+    assert grid_of({"rows": 44, "cols": 44}) is None
+    assert grid_of({"rows": "44", "cols": 44, "pitch": 0.001}) is None
+    rim = tip_circle(GRIDS[0], TIP.radius)
+    assert rim.max(axis=0) == pytest.approx([22.0 + 0.020 / GRIDS[0].pitches[0]] * 2)
+    assert on_picture(GRIDS[1], np.zeros((1, 2)))[0] == pytest.approx(
+        [25 + 0.002 / 0.0012, 15 - 0.001 / 0.0019]
+    )
+
+
+# The hand in its plane
+
+HAND = HandGeometry(0.1, 0.08, 0.005, 0.02)
+POSE = np.array([0.003, 0.081, 0.12])
+WIDTH_M = 0.043
+Q = (0.14, 0.10)
+
+
+def held() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    contacts = HAND.contacts(Q, POSE, WIDTH_M)
+    assert (contacts.d > 0.0).all()
+    return contacts.d, contacts.theta
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_a_pressed_tip_ends_at_the_objects_face(finger: int) -> None:
+    d, theta = held()
+    lines = finger_lines(HAND, finger, Q[finger], Contact(d[finger], theta[finger], 8.0))
+    n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
+    outwards = -n if finger == 0 else n  # of the object, through this face
+
+    def beyond(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        distance: NDArray[np.float64] = (points - POSE[:2]) @ outwards - 0.5 * WIDTH_M
+        return distance
+
+    assert lines.face is not None
+    assert lines.normal is not None
+    assert lines.push is not None
+    assert beyond(lines.face) == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert beyond(lines.push[:1]) == pytest.approx([0.0], abs=1e-12)
+    assert np.diff(beyond(lines.normal)) == pytest.approx([0.6 * 0.02])
+    assert beyond(lines.skin).min() == pytest.approx(0.0, abs=1e-6)
+    assert beyond(lines.springs[:, 1]).min() == pytest.approx(0.0, abs=1e-12)
+    assert lines.strain.max() > 0.1
+    assert lines.strain.min() == 0.0
+    along, out = tip_axes(finger, Q[finger])
+    assert -outwards @ along == pytest.approx(math.sin(theta[finger]))
+    assert -outwards @ out == pytest.approx(math.cos(theta[finger]))
+    # The force stands where the axis through the centroid of pressure meets the face.
+    foot = (lines.push[0] - HAND.tips(Q)[finger]) @ along
+    assert foot == pytest.approx((0.02 - d[finger] / 3.0) * math.sin(theta[finger]))
+
+
+def test_a_free_tip_is_a_half_circle_on_its_link() -> None:
+    lines = finger_lines(HAND, 1, 0.3)
+    centre = HAND.tips((0.3, 0.3))[1]
+    assert np.linalg.norm(lines.skin - centre, axis=1) == pytest.approx(0.02)
+    assert lines.link[0] == pytest.approx([0.05, 0.0])
+    assert np.linalg.norm(lines.link[1] - lines.link[0]) == pytest.approx(0.08)
+    assert np.linalg.norm(lines.link[2] - lines.link[1]) == pytest.approx(0.005)
+    assert lines.link[2] == pytest.approx(centre)
+    assert (lines.face, lines.push, lines.strain.max()) == (None, None, 0.0)
+
+
+def test_the_held_object_stands_between_its_faces() -> None:
+    d, theta = held()
+    outline = HeldObject(HAND).outline(Q, d, theta, WIDTH_M, 0.06)
+    n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
+    across = (outline - POSE[:2]) @ n
+    assert [across.min(), across.max()] == pytest.approx([-0.5 * WIDTH_M, 0.5 * WIDTH_M])
+    assert np.ptp(outline @ np.array([-n[1], n[0]])) == pytest.approx(0.06)
+
+
+def test_the_held_object_rolls_without_slip() -> None:
+    """Its centre stays the object's along a motion that rolls by the kinematics' constraint."""
+    coordinates = np.array([*Q, *POSE])
+    held_object = HeldObject(HAND)
+    offsets = []
+    for _ in range(200):
+        contacts = HAND.contacts(coordinates[:2], coordinates[2:], WIDTH_M)
+        outline = held_object.outline(
+            (coordinates[0], coordinates[1]), contacts.d, contacts.theta, WIDTH_M, 0.06
+        )
+        offsets.append(outline[:4].mean(axis=0) - coordinates[2:4])
+        # A step in which both d stay and neither tip shears: 4 equations, the joints' antisymmetry.
+        rows = np.vstack(
+            (
+                HAND.jacobian(coordinates[:2], coordinates[2:])[:2],
+                HAND.rolling(coordinates[:2], coordinates[2:], WIDTH_M),
+                [1.0, -1.0, 0.0, 0.0, 0.0],
+            )
+        )
+        coordinates = coordinates + np.linalg.solve(rows, [0.0, 0.0, 0.0, 0.0, 5e-4])
+    angle = coordinates[4]
+    assert abs(angle - POSE[2]) > 0.05
+    along = [offset @ (-math.sin(angle), math.cos(angle)) for offset in offsets]
+    assert np.ptp(along) < 0.3e-3  # while the tips have rolled by
+    assert abs(angle - POSE[2]) * 0.016 > 0.8e-3
+
+
+# The landscape
+
+
+@pytest.fixture(scope="module")
+def landscape() -> Landscape:
+    return Landscape(ContactTable.build(TIP, Material.table_i(), tolerance=1e-6), 0.02, 0.012)
+
+
+def test_contours_are_lines_of_equal_energy(landscape: Landscape) -> None:
+    exact = ContactTable.build(TIP, Material.table_i(), tolerance=1e-9)
+    contours = landscape.contours()
+    assert len(contours) >= 4
+    for contour in contours:
+        theta = (contour.line[:, 0] / WIDTH * 2.0 - 1.0) * THETA_END
+        d = (1.0 - contour.line[:, 1] / HEIGHT) * landscape.d_end
+        assert exact(d, theta).energy == pytest.approx(contour.energy, rel=0.01)
+
+
+def test_colours_grow_lighter_with_the_energy(landscape: Landscape) -> None:
+    picture = landscape.picture().astype(float) @ [0.2126, 0.7152, 0.0722]
+    assert picture.shape == (HEIGHT, WIDTH)
+    upright = picture[::-1, WIDTH // 2]  # with growing d
+    assert (np.diff(upright) >= -1.0).all()
+    assert upright[-1] > 150.0 > 60.0 > upright[0]
+    corner = landscape.picture()[0, 0]
+    assert np.ptp(corner.astype(int)) < 8  # grey: 12 mm deep, no tip tilts by 45°
+
+
+def test_the_wanted_forces_energy_is_the_tables(landscape: Landscape) -> None:
+    upright = ContactTable.build(TIP, Material.table_i())(np.array([0.003, 0.008]), np.zeros(2))
+    assert landscape.energy_of(upright.force) == pytest.approx(upright.energy, rel=1e-4)
+    assert np.isnan(landscape.energy_of(np.array([math.nan, -1.0, 1e6]))).all()
+
+
+def test_the_axes_fit_the_picture(landscape: Landscape) -> None:
+    names = [name for _, name in landscape.ticks()]
+    assert {"θ = 0°", "+20°", "d = 0", "4 mm", "12 mm"} <= set(names)
+    assert landscape.place(0.0, 0.0) == pytest.approx([WIDTH / 2, HEIGHT])
+    assert landscape.place(0.012, THETA_END) == pytest.approx([WIDTH, 0.0])
+
+
+# What is known of the hand
+
+
+def test_settings_of_another_version_keep_what_is_known() -> None:
+    sections = json.loads(Settings().model_dump_json())
+    sections["tip"]["radius"] = 0.015
+    sections["tip"]["wear"] = 0.1
+    sections["servos"]["model"] = 7
+    sections["aura"] = {"colour": "green"}
+    settings, passed = read_settings({"settings": json.dumps(sections)})
+    assert sorted(passed) == ["aura", "servos.model", "tip.wear"]
+    assert settings.tip.radius == 0.015
+    assert settings.servos == Settings().servos
+    for text in ("", "{", "[]", "null", 3, None):
+        assert read_settings({"settings": text})[0] == Settings()
+
+
+def test_what_is_wanted_follows_the_commands() -> None:
+    wanted, hand = Wanted(), Hand()
+
+    def told(command: str, ok: bool = True, **numbers: float) -> tuple[float, float]:
+        request = json.dumps({"command": command, **numbers})
+        wanted.take({"command": command, "request": request, "ok": ok, "error": ""}, hand)
+        return wanted.force("holding"), wanted.angle("rotating")
+
+    assert np.isnan(told("arm")).all()
+    assert told("grasp") == (
+        hand.settings.control.force_default,
+        pytest.approx(math.nan, nan_ok=True),
+    )
+    assert told("grasp", force=8.0)[0] == 8.0
+    assert told("rotate", angle=0.1) == (8.0, 0.1)
+    assert told("grasp", ok=False, force=2.0) == (8.0, 0.1)
+    assert told("set", compliance=0.1) == (8.0, 0.1)
+    assert math.isnan(wanted.force("disarmed"))
+    assert np.isnan(told("release")).all()
+    wanted.take({"command": "grasp", "request": "{", "ok": True}, hand)
+    assert math.isnan(wanted.force("holding"))
+
+
+def test_statistics_as_a_table() -> None:
+    page = table({"ticks": 1000, "overruns": 2, "period_s": 0.002, "compute": {"p50": 1.234e-5}})
+    assert "**1000 ticks** of 2.000 ms, **2 overruns**" in page
+    assert "| work | 12.3 | — | — | — |" in page
