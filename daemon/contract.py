@@ -78,7 +78,13 @@ _STATE = (
         for part in _FINGER
     ),
     Field("object.valid", "bool", "", "both contacts tell the object's pose"),
-    Field("object.angle", "float", "rad", "the object's angle in the hand's frame"),
+    Field(
+        "object.angle",
+        "float",
+        "rad",
+        "the object's angle in the hand's frame: of its faces' bisector; "
+        "of a disc that of the line between the contacts",
+    ),
     Field("object.width", "float", "m", "the object's width between the tips"),
 )
 

@@ -12,8 +12,13 @@ velocity and is held inside that count, so that it is exact at each count's edge
 taper α, is found from the frames of both tips, beginning with ``object.taper``. So each tip's θ is
 what its own sensor says, whatever is held. A shifted sensor looks the same, and is not judged here:
 the safety limit ``hand.angle`` compares the frames with ``object.taper`` alone. A disc has no faces
-and no angle: φ is the direction of the line from contact to contact, and it turns by less than is
-predicted here, so that the frames have more to correct.
+and no angle: φ is the direction of the line from contact to contact, not how the disc is turned,
+and ``rotate`` goes by it. That line goes with the tips: it turns by 2 L sin q/(2R + 2a − d1 − d2)
+of what the joints lean, 0.4 instead of the predicted 1.5 for R = 20 mm and the default hand. So the
+frames have more to correct, turning takes longer, and the disc rolls further than is asked; since
+its curved contact looks less tilted than it is, φ comes out a fifth too small. Where the fingers
+stand straight or lean outwards the line does not follow the joints: a disc of R ≥ 30 mm is held,
+but turning it ends at the tips' limits.
 """
 
 from __future__ import annotations

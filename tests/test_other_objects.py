@@ -134,3 +134,21 @@ def test_a_sheet_that_is_told_to_be_one_is_not_nothing() -> None:
         rig.grasp(1.0, 1.6)
         assert not any("between" in text for *_, text in rig.events)
         assert rig.loop._control._gripping or rig.state.mode == "fault"
+
+
+def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:
+    with Rig({"simulation": {"object_shape": "disc"}}) as rig:
+        rig.grasp(8.0)
+        assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.04)
+        assert rig.state.contacts[0].d / rig.plant.d[0] == pytest.approx(0.72, abs=0.03)
+        rig.command("rotate", 2.0, angle=0.08)
+        assert rig.state.mode == "holding"
+        assert rig.state.fault == ""
+        tips = HAND.tips(rig.plant.q)
+        line = math.atan2(*(tips[1] - tips[0])[::-1])
+        angle, _, _ = HAND.object_from_contacts(rig.plant.q, rig.plant.d, rig.plant.theta)
+        assert angle == pytest.approx(line, abs=0.005)
+        # The estimator takes the contacts for less tilted than they are.
+        assert rig.state.object.angle == pytest.approx(0.8 * line, abs=0.01)
+        # The disc itself has rolled on between the tips.
+        assert rig.plant.object_pose[2] > 2.0 * line

@@ -51,7 +51,7 @@ class ObjectState:
     """The object in ``hand/state``, from the two contacts."""
 
     valid: bool
-    angle: float  # [rad]
+    angle: float  # of its faces' bisector; of a disc, of the line between the contacts [rad]
     width: float  # [m]
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from daemon.settings import Simulation
 from daemon.simulation import sensor_effects
+from daemon.simulation.curved_face import render_curved
 from daemon.simulation.sensor_effects import PLAYS, Blur
 from kinematics.contact import Fingertip
 from kinematics.material import Material
@@ -135,23 +136,40 @@ class SensorModel:
         return self._flaws.hysteresis > 0.0 or self._flaws.creep > 0.0
 
     def frame(
-        self, d: float, tilt_x: float, tilt_y: float, out: NDArray[np.uint16], t: float = 0.0
+        self,
+        d: float,
+        tilt_x: float,
+        tilt_y: float,
+        out: NDArray[np.uint16],
+        t: float = 0.0,
+        bend: float = 0.0,
     ) -> None:
         """Write the next frame's counts into ``out``, uint16 [rows, cols] contiguous.
 
         ``d`` [m] ≤ 0 is no contact; tilts [rad] as for :meth:`SensorGrid.pressure`; ``t`` [s], for
-        creep and drift, is the frame's time.
+        creep and drift, is the frame's time; ``bend`` as for :meth:`press`.
         """
-        self.press(d, tilt_x, tilt_y, t)
+        self.press(d, tilt_x, tilt_y, t, bend)
         self.read(out)
 
-    def press(self, d: float, tilt_x: float, tilt_y: float, t: float = 0.0) -> None:
-        """Let the cells feel the contact of time ``t`` without reading them."""
+    def press(
+        self, d: float, tilt_x: float, tilt_y: float, t: float = 0.0, bend: float = 0.0
+    ) -> None:
+        """Let the cells feel the contact of time ``t`` without reading them.
+
+        ``bend`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face: that
+        of a cylinder whose axis is along the finger's y.
+        """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
         elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
         self._t = t
-        render(self._geometry, self._law, 1.0, float(d), n_x, n_y, self._scratch, self._target)
+        geometry, law, target = self._geometry, self._law, self._target
+        if bend > 0.0:
+            across = self.grid.to_sensor(1.0, 0.0)
+            render_curved(geometry, law, float(d), n_x, n_y, *across, float(bend), target)
+        else:
+            render(geometry, law, 1.0, float(d), n_x, n_y, self._scratch, target)
         if self._blur is not None:
             self._blur.apply(pressure)
         if flaws.hysteresis > 0.0:

@@ -17,8 +17,9 @@ disc stands upright on the hand's plane, so that its face is curved about one ax
 Against the springs of the tip it takes the place of its tangent plane with two changes to leading
 order in d: the footprint is narrower along the tilt by κ² = R/(R + a), the curvatures adding to
 1/a + 1/R, and force and energy are κ times those of the plane, whatever θ. Integrals over the very
-springs, for a = 20 mm and d up to 8 mm, are within 1 % of that upright and within 4 % at 30° for
-R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm.
+springs, for a constant modulus, a = 20 mm and d up to 8 mm, are within 1.6 % of that upright and
+within 4.5 % at 30° for R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm. The sensor's frame is
+rendered from those springs (`daemon.simulation.curved_face`), so its sum differs by as much.
 
 Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
 ratio |T|/N can't reach μ (with a constant E it can't exceed 1 at θ = 0), the tip slips at its

@@ -53,6 +53,10 @@ class SimulatedTactile:
             dead=tactile.dead[finger],
             threshold=tactile.threshold,
         )
+        self._radius = settings.tip.radius
+        if simulation.object_shape == "disc":
+            # So that no kernel has to be loaded when the disc is touched.
+            self._model.press(0.0, 0.0, 0.0, 0.0, 1.0 / simulation.object_radius)
         self._pressed = -1  # number of the newest sample that the cells have felt
         self._frame: Frame | None = None
         self._lost = 0
@@ -117,7 +121,10 @@ class SimulatedTactile:
         d = float(sample[layout.SAMPLE_D + self._finger])
         theta = float(sample[layout.SAMPLE_THETA + self._finger])
         share = float(sample[layout.SAMPLE_GAIN + self._finger])
+        bend = float(sample[layout.SAMPLE_BEND + self._finger])
+        # What is left without the curvature's own share, which the cells are to show themselves.
+        share *= math.sqrt(1.0 + bend * self._radius)
         # Force goes with d²: half a tip on the face's edge presses with half the force.
         d = d * math.sqrt(share) if abs(theta) < 0.5 * math.pi else 0.0
-        self._model.press(d, theta, 0.0, number * self._period)
+        self._model.press(d, theta, 0.0, number * self._period, bend)
         return True
