@@ -246,8 +246,8 @@ class Page:
             style = PLAIN if here else DIM
             if key == "temperature" and value >= self.feed.warm:
                 style = BAD
-            line.append(Segment(f"{shown:<6}", style))
-            line.append(Segment(f"{beside:<{11 - max(6, len(shown))}}", DIM))
+            line.append(Segment(shown, style))
+            line.append(Segment(f"{beside:<{11 - len(shown)}}", DIM))
         line.append(Segment(f" {unit}", DIM))
         return line
 
