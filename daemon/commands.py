@@ -12,7 +12,7 @@ one else's command its turn.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -29,6 +29,7 @@ _QUEUE = 64  # commands that wait, of one client in its socket and of all of the
 _LOOK = 8  # messages that are taken in at a tick
 _REFUSALS = 2  # answers at a tick to who sends too much
 _CLIENTS = 256  # whose pace is remembered
+_FULL = "too many commands wait already"
 _STOP = b"stop"
 
 
@@ -89,10 +90,22 @@ class CommandServer:
             self._send(envelope, self._answer(payload, handler))
         elif not self._in_pace(envelope[0], self._now()):
             self._refuse(envelope, f"too many commands: at most {self._per_second:g} a second")
-        elif len(self._waiting) >= _QUEUE:
-            self._refuse(envelope, "too many commands wait already")
+        elif len(self._waiting) >= _QUEUE and not self._make_room(envelope[0]):
+            self._refuse(envelope, _FULL)
         else:
             self._waiting.append((envelope, payload))
+
+    def _make_room(self, client: bytes) -> bool:
+        """Refuse the last command of whoever has most waiting, unless that is this client."""
+        counts = Counter([envelope[0] for envelope, _ in self._waiting])
+        greedy, most = counts.most_common(1)[0]
+        if counts[client] + 1 >= most:
+            return False
+        at = max(i for i, (envelope, _) in enumerate(self._waiting) if envelope[0] == greedy)
+        envelope, _ = self._waiting[at]
+        del self._waiting[at]
+        self._refuse(envelope, _FULL)
+        return True
 
     def _in_pace(self, client: bytes, now: float) -> bool:
         most = self._per_second

@@ -238,6 +238,28 @@ def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
     server.close()
 
 
+def test_clients_that_flood_leave_others_a_place(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    server = CommandServer(context, addresses[1], max_bytes=200, per_second=200.0)
+    flood = Flood(context, addresses[1], clients=4, each=60)
+    heard = []
+
+    def note(request: dict[str, Any]) -> dict[str, Any]:
+        heard.append(request["command"])
+        return {}
+
+    until(lambda: server.serve(note) and server.refused_by_pace > 10)  # no place is left
+    other = context.socket(zmq.REQ)
+    other.connect(addresses[1])
+    other.send(msgpack.packb({"command": "grasp"}))
+    until(lambda: [server.serve(note), other.poll(0)][1])
+    assert msgpack.unpackb(other.recv())["ok"]
+    assert len(heard) < 160, "it waited for more than those that were before it"
+    other.close()
+    server.close()
+
+
 def test_what_many_clients_are_remembered_by_is_bounded(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:

@@ -455,6 +455,31 @@ def test_unruly_replies_give_right_numbers_or_none(
     backend.close()
 
 
+@pytest.mark.parametrize("firmware", [44, 48])
+def test_a_late_reply_is_not_taken_for_the_next_questions(
+    running: Callable[..., RunningBus], firmware: int
+) -> None:
+    bus = running(make_bus("XM430-W350", firmware=firmware, prepared=True, t=time.monotonic()))
+    backend = connected(bus, reply_timeout=0.004)  # a late one comes after 0.01
+    reading = Reading()
+    backend.read(reading)
+    bus.fault("late=1")
+    backend.read(reading)
+    for _ in range(60):
+        backend.read(reading)
+        assert not reading.valid
+    counters = backend.counters()
+    assert counters["late"] > 10
+    bus.fault("late=0")
+
+    def well() -> bool:
+        backend.read(reading)
+        return reading.valid
+
+    eventually(well)
+    backend.close()
+
+
 def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus: RunningBus) -> None:
     backend = connected(bus, watchdog=0.04)
     backend.set_torque(True)

@@ -41,6 +41,11 @@ _SPAN = reg.PRESENT_POSITION + 4 - reg.PRESENT_CURRENT
 _HEALTH = struct.Struct("<hii8xHB")  # the same, supply voltage, temperature
 _HEALTH_SPAN = reg.PRESENT_TEMPERATURE + 1 - reg.PRESENT_CURRENT
 _HEALTH_EVERY = 0.25  # s
+# A reply may come after its deadline, and be taken for the next question's. So after a question
+# without an answer the next ones ask for spans of different lengths, which tell their replies apart.
+_MARKS = range(1, _HEALTH_SPAN - _SPAN)  # bytes more than are needed
+_DOUBTFUL = 32  # questions
+_PATIENCE = 0.02  # s that a reply may take while the servos are checked: nothing hurries there
 
 
 class DynamixelServos:
@@ -60,6 +65,9 @@ class DynamixelServos:
         self._line: ServoLine | None = None
         self._present: GroupRead | None = None
         self._health: GroupRead | None = None
+        self._marked: list[GroupRead] = []
+        self._turn = 0
+        self._doubtful = 0  # questions to come whose replies may be mistaken for each other's
         self._next_health = -math.inf  # time.monotonic() at which it is read in present's place
         self._torque: Torque | None = None
         self._fast = False
@@ -97,6 +105,11 @@ class DynamixelServos:
         ids = [joint.id for joint in self._joints]
         self._present = GroupRead(port, self._handler, reg.PRESENT_CURRENT, _SPAN, ids)
         self._health = GroupRead(port, self._handler, reg.PRESENT_CURRENT, _HEALTH_SPAN, ids)
+        self._marked = [
+            GroupRead(port, self._handler, reg.PRESENT_CURRENT, _SPAN + more, ids)
+            for more in _MARKS
+        ]
+        self._doubtful = 0
         self._next_health = -math.inf
         self._torque = torque
         self._line = line
@@ -105,7 +118,11 @@ class DynamixelServos:
         port = line.port
         latency = check_latency(port.port_name, port.latency_timer(), port.reply_timeout)
         errors, notices = list(latency.errors), list(latency.notices)
-        found = examine(line, self._profile, model)
+        allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
+        try:
+            found = examine(line, self._profile, model)
+        finally:
+            port.reply_timeout = allowed
         silent = []
         self._fast = True
         for joint, each in zip(self._joints, found, strict=True):
@@ -154,6 +171,10 @@ class DynamixelServos:
         if healthy and self._health is not None:
             self._next_health = begin + _HEALTH_EVERY
             present = self._health
+        elif self._doubtful:
+            self._doubtful -= 1
+            self._turn = (self._turn + 1) % len(self._marked)
+            present = self._marked[self._turn]
         result = present.exchange(self._fast)
         if result == COMM_RX_CORRUPT:
             # Once more, with what is left of the first exchange's deadline.
@@ -165,6 +186,7 @@ class DynamixelServos:
             port.not_after = math.inf
         reading.valid = result == COMM_SUCCESS
         if not reading.valid:
+            self._doubtful = _DOUBTFUL
             return
         reading.t = self._clock.now()
         torque.heard(begin)
@@ -176,7 +198,7 @@ class DynamixelServos:
                 reading.voltage[finger] = voltage * reg.VOLTAGE_UNIT
                 reading.temperature[finger] = float(temperature)
             else:
-                current, velocity, position = _PRESENT.unpack(data)
+                current, velocity, position = _PRESENT.unpack_from(data)
             reading.q[finger] = joint.q = scale.angle(position)
             reading.dq[finger] = joint.dq = scale.rate(velocity)
             reading.current[finger] = scale.amperes(current)
@@ -237,6 +259,7 @@ class DynamixelServos:
             "torn": handler.torn,
             "retries": self._retries,
             "skipped_bytes": handler.skipped_bytes,
+            "late": handler.late,
             "alerts": self._alerts,
         }
 

@@ -74,10 +74,12 @@ class GroupRead(GroupSyncRead):  # type: ignore[misc]
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:
                     return int(result)
-                if packet[4] == servo_id:
+                if len(packet) == SMALLEST:
+                    return int(COMM_RX_CORRUPT)  # an error and no data
+                if len(packet) != SMALLEST + length:
+                    handler.late += 1
+                elif packet[4] == servo_id:
                     break
-            if len(packet) != SMALLEST + length:
-                return int(COMM_RX_CORRUPT)  # an error and no data
             self.errors[servo_id] = packet[8]
             self.data_dict[servo_id] = packet[9:-2]
         self.last_result = True
@@ -87,11 +89,13 @@ class GroupRead(GroupSyncRead):  # type: ignore[misc]
         """Take the one reply of a fast sync read apart; its last CRC covers every byte of it."""
         self.last_result = False
         length = self.data_length
-        packet, result = self.ph.rxPacket(self.port, True)
-        if result != COMM_SUCCESS:
-            return int(result)
-        if len(packet) != 8 + len(self.data_dict) * (length + 4):
-            return int(COMM_RX_CORRUPT)
+        while True:
+            packet, result = self.ph.rxPacket(self.port, True)
+            if result != COMM_SUCCESS:
+                return int(result)
+            if len(packet) == 8 + len(self.data_dict) * (length + 4):
+                break
+            self.ph.late += 1
         at = 8
         for servo_id in self.data_dict:
             if packet[at + 1] != servo_id:
