@@ -42,7 +42,7 @@ _HEALTH = struct.Struct("<hii8xHB")  # the same, supply voltage, temperature
 _HEALTH_SPAN = reg.PRESENT_TEMPERATURE + 1 - reg.PRESENT_CURRENT
 _HEALTH_EVERY = 0.25  # s
 # A reply may come after its deadline, and be taken for the next question's. So after a question
-# without an answer the next ones ask for spans of different lengths, which tell their replies apart.
+# without an answer the next ones ask for spans of different lengths, which tell replies apart.
 _MARKS = range(1, _HEALTH_SPAN - _SPAN)  # bytes more than are needed
 _DOUBTFUL = 32  # questions
 _PATIENCE = 0.02  # s that a reply may take while the servos are checked: nothing hurries there
