@@ -148,7 +148,7 @@ class Prediction:
         held.arm = out[19:21]
         held.turn = out[21:23]
         held.slide = out[23]
-        held.taper = float(self._m[tracking.TAPER])
+        held.taper = out[33]
         held.lever = out[24:26]
         held.q = out[27:29]
         held.stiffness = [out[4], out[12]]
@@ -156,11 +156,19 @@ class Prediction:
         held.normal = out[29:31]
         held.load = out[31]
         held.load_lever = out[32]
-        held.stray = float(self._m[tracking.STRAY])
+        held.stray = out[34]
         held.angle_std = angle_std
 
 
 def _fill_one(contact: Contact, told: list[float]) -> None:
-    contact.d, contact.theta, contact.force, contact.energy, _ = told[:5]
-    contact.d_std, contact.theta_std, inside = told[5:]
+    (
+        contact.d,
+        contact.theta,
+        contact.force,
+        contact.energy,
+        _,
+        contact.d_std,
+        contact.theta_std,
+        inside,
+    ) = told
     contact.inside = inside > 0.0

@@ -46,7 +46,7 @@ MEMORY = 39
 
 # Columns of the history, and of what a tick gives out.
 _H_T, _H_WAY, _H_Q, H_SIZE = 0, 1, 4, 6
-OUT = 33
+OUT = 35
 
 
 @kernel
@@ -297,6 +297,8 @@ def tell(m: FloatArray, table1: FloatArray, table2: FloatArray, out: FloatArray)
         out[at + 5] = math.sqrt(_variance(m, finger))
         out[at + 6] = math.sqrt(_side_variance(m, -1.0 if finger == 0 else 1.0))
         out[at + 7] = 1.0 if inside else 0.0
+    out[33] = taper
+    out[34] = m[STRAY]
     out[16] = math.sqrt(_variance(m, 2))
     out[17] = m[_ANGLE]
     out[18] = motion[5]
