@@ -28,6 +28,7 @@ ON_DEMAND = {
     "recording": "ten readers and a recorder at 1 kHz for ten minutes; recordings read again",
     "neighbours": "the tick beside busy processes, many subscribers and noisy sensors",
     "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, ten minutes",
+    "faults": "every fault on the stand-in hand and what comes of it, an hour for 100 trials each",
 }
 
 
@@ -40,6 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         nargs="*",
         help=f"what to measure: {known}; all of these if none is named; or {more}",
+    )
+    parser.add_argument(
+        "--trials", type=_count, default=100, metavar="N", help="of each fault, for faults"
+    )
+    parser.add_argument(
+        "--only", default="", metavar="PATTERN", help="faults whose name it is found in, for faults"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     parser.add_argument(
@@ -59,16 +66,21 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"bench: found {unknown[0]!r}, expected one of {known}", file=sys.stderr)
         return 2
     modules = {name: importlib.import_module(f"tools.benchmarks.{name}") for name in names}
+    if "faults" in modules and not modules["faults"].known(arguments.only):
+        print(f"bench: --only {arguments.only}: it is found in no fault's name", file=sys.stderr)
+        return 2
     if arguments.plot and (reason := _no_plot(modules)):
         print(f"bench: {reason}", file=sys.stderr)
         return 2
-    report, plain = [], []
+    report, plain, failed = [], [], False
     for name, module in modules.items():
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        rows = module.measure()
+        options = {key: getattr(arguments, key) for key in getattr(module, "OPTIONS", ())}
+        rows = module.measure(**options)
         report += [{"measurement": name, **each.as_dict()} for each in rows]
         plain += [each for each in rows if isinstance(each, Row)]
         own = [each for each in rows if not isinstance(each, Row)]
+        failed = failed or any(getattr(each, "failed", False) for each in own)
         if own:
             print(module.table(own), end="\n\n")
         if own and arguments.plot:
@@ -83,7 +95,14 @@ def run(arguments: argparse.Namespace) -> int:
             "rows": report,
         }
         arguments.json.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    return 0
+    return 1 if failed else 0
+
+
+def _count(text: str) -> int:
+    """A whole number above 0. Raises ArgumentTypeError with what was found."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, found {text!r}")
+    return int(text)
 
 
 def _no_plot(modules: dict[str, ModuleType]) -> str:

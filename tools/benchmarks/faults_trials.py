@@ -1,0 +1,209 @@
+"""One trial of the fault campaign: grip, inject, look, end it, and make the hand grip again.
+
+What was on the servos' wire is judged from the stand-in hand's record with arithmetic of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from daemon.commands import NoAnswer
+from tools.benchmarks.faults_cases import Case
+from tools.benchmarks.faults_rig import Rig, RigError, stopped
+
+_SLACK = 0.05  # s that a look may come after what it sees, and a process be late
+_ASIDE = 0.015  # s between two looks that others took: what is late then is theirs
+_RESOLUTION = 0.0016  # rad, a count of the servo's
+_CURRENT_UNIT = 0.0027  # A
+_READY_WITHIN = 15.0  # s
+_GRIPPING = ("grasping", "holding", "rotating")
+_TURN = 0.08  # rad
+
+
+@dataclass
+class Trial:
+    """What came of one injection."""
+
+    seed: int
+    phase: str = ""
+    fault: str = ""  # its name
+    fault_s: float = math.nan  # until the daemon said so
+    safe_s: float = math.nan  # until no motor was driven any more
+    aside_s: float = 0.0  # longest between two looks that others had the processor
+    wrong: str = ""  # what must never be
+    missed: str = ""  # what was not as expected, and may be the busy machine's doing
+
+    @property
+    def disturbed(self) -> bool:
+        """Not as expected, while other processes held this one up: no measurement."""
+        return bool(self.missed) and not self.wrong and self.aside_s > _ASIDE
+
+    @property
+    def ok(self) -> bool:
+        """All as it must be."""
+        return not self.wrong and not self.missed
+
+
+def trial(rig: Rig, case: Case, seed: int) -> Trial:
+    """Inject once. Raises RigError when the set-up itself fails."""
+    chance = random.Random(f"{case.name} {seed}")
+    found = Trial(seed)
+    rig.start()
+    if not ready(rig, chance):
+        _start_anew(rig)
+        if not ready(rig, chance):
+            raise RigError(f"the hand does not grip: {rig.status()}")
+    found.phase = _phase(rig, case, chance)
+    time.sleep(chance.uniform(0.0, 0.02))
+    rig.states(0.0)
+    rig.put_aside()
+    rig.report(forget=True)
+    with case.inject(rig, chance):
+        _look(rig, case, found)
+    judge_wire(rig, found)
+    _judge_daemon(rig, case, found)
+    _judge(case, found)
+    stays = case.expect == "works" and found.ok
+    if not stays and not ready(rig, chance):
+        found.wrong = found.wrong or f"no working hand afterwards: {rig.status()}"
+        _start_anew(rig)
+    return found
+
+
+# --- before and after --------------------------------------------------------------------------
+
+
+def ready(rig: Rig, chance: random.Random) -> bool:
+    """Clear, arm and grasp until the hand holds; False when it does not."""
+    end = time.monotonic() + _READY_WITHIN
+    force = chance.uniform(4.0, 9.0)
+    while time.monotonic() < end:
+        if not rig.alive:
+            return False
+        status = rig.status(2.0)
+        mode = "" if status is None else status["mode"]
+        try:
+            if mode == "holding":
+                return True
+            if mode == "fault":
+                rig.ask({"command": "clear"}, 5.0)
+            elif mode == "disarmed":
+                rig.ask({"command": "arm"})
+            elif mode == "armed":
+                rig.ask({"command": "grasp", "force": force})
+        except NoAnswer:
+            pass
+        time.sleep(0.01)
+    return False
+
+
+def _start_anew(rig: Rig) -> None:
+    rig.end_daemon()
+    if rig.hand is not None:
+        rig.hand.terminate()
+        rig.hand.wait()
+    rig.start()
+
+
+def _phase(rig: Rig, case: Case, chance: random.Random) -> str:
+    """Bring the hand into one of the states in which it grips."""
+    phase = "holding" if case.held_only else chance.choice(("holding", "grasping", "rotating"))
+    if phase == "grasping":
+        rig.ask({"command": "grasp", "force": chance.uniform(4.0, 9.0)})
+    elif phase == "rotating":
+        rig.ask({"command": "rotate", "angle": chance.uniform(-_TURN, _TURN)})
+    return phase
+
+
+# --- looking -----------------------------------------------------------------------------------
+
+
+def _look(rig: Rig, case: Case, found: Trial) -> None:
+    begin = now = time.monotonic()
+    modes = set()
+    while now < begin + case.lasts:
+        for state in rig.states():
+            t = state["mono_ns"] * 1e-9
+            if state["fault"] and not found.fault and t > begin - 0.1:
+                found.fault, found.fault_s = state["fault_name"], t - begin
+            modes.add(state["mode"])
+            _judge_age(rig, state, found)
+        report = rig.report()
+        if stopped(report) and math.isnan(found.safe_s):
+            found.safe_s = report["monotonic"] - begin
+        found.aside_s = max(found.aside_s, rig.put_aside())
+        safe = not math.isnan(found.safe_s)
+        if safe and (found.fault or case.expect == "dies"):
+            return
+        if case.expect == "lets go" and "armed" in modes:
+            return
+        now = time.monotonic()
+    if case.expect == "lets go":
+        found.missed = f"the joints did not stay where they were: {', '.join(sorted(modes))}"
+
+
+def _judge_age(rig: Rig, state: dict[str, Any], found: Trial) -> None:
+    """Torque never on in a grip on frames older than their limit."""
+    if not state["torque"] or state["fault"] or state["mode"] not in _GRIPPING:
+        return
+    settings = rig.settings
+    most = settings.safety.frame_age_fault / settings.tactile.rate
+    most += settings.simulation.tactile_delay + settings.tactile.latency + 0.01
+    for side in ("left", "right"):
+        age = state[side]["frame_age_s"]
+        if age > most:
+            found.wrong = f"{state['mode']} on a frame {age:.3f} s old"
+
+
+def judge_wire(rig: Rig, found: Trial) -> None:
+    """No goal outside its limits, no torque without packets, none switched on far from its goal."""
+    settings = rig.settings
+    hand, most = settings.hand, settings.safety.current_max + _CURRENT_UNIT
+    for i, servo in enumerate(rig.report()["servos"]):
+        q, current = servo["goal_q"], servo["goal_current"]
+        low, high = hand.q_min[i] - _RESOLUTION, hand.q_max[i] + _RESOLUTION
+        if q is not None and not (low <= q[0] and q[-1] <= high):
+            found.wrong = f"goal angles {q} rad on the wire"
+        if current is not None and not all(abs(each) <= most for each in current):
+            found.wrong = f"goal currents {current} A on the wire"
+        if servo["torque_on"]["far"]:
+            found.wrong = f"torque on {servo['torque_on']['farthest']:.3f} rad off its goal"
+        quiet, limit = servo["longest_quiet"], settings.servos.watchdog + 0.02
+        if quiet > limit + _SLACK and not servo["watchdog_fired"]["count"]:
+            found.wrong = f"torque on for {quiet:.3f} s without a packet"
+        if servo["goals_refused"] and not servo["watchdog_fired"]["count"]:
+            found.wrong = f"{servo['goals_refused']} goals that the servo refused"
+
+
+def _judge_daemon(rig: Rig, case: Case, found: Trial) -> None:
+    """No crash, no hang."""
+    if not rig.alive:
+        status = None if rig.daemon is None else rig.daemon.returncode
+        found.wrong = f"the daemon ended with {status}: {' | '.join(rig.log()[-2:])}"
+    elif rig.status(2.0) is None:
+        found.wrong = "the daemon does not answer"
+
+
+def _judge(case: Case, found: Trial) -> None:
+    """What was expected, and in time."""
+    safe = not math.isnan(found.safe_s)
+    if case.expect in ("works", "lets go"):
+        if found.fault:
+            found.missed = f"{found.fault} after {found.fault_s:.3f} s"
+        elif safe:
+            found.missed = f"no motor was driven after {found.safe_s:.3f} s"
+        return
+    if case.expect == "either" and not found.fault:
+        return
+    if not found.fault and case.expect == "fault":
+        found.missed = "no fault"
+    elif found.fault and found.fault not in case.names:
+        found.missed = f"{found.fault} instead of {' or '.join(case.names)}"
+    elif not safe:
+        found.missed = "motors were driven on"
+    elif not found.safe_s <= case.within + _SLACK:
+        found.missed = f"motors driven for {found.safe_s:.3f} s, {case.within:.3f} s allowed"
