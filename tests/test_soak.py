@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from daemon.records import Goal
+from tests import soak_hil
 from tests.soak import Soak
 
 
@@ -64,3 +65,13 @@ def test_an_old_reading_or_frame_ends_it(soak: Soak) -> None:
     with pytest.raises(AssertionError, match="torque is on"):
         soak._judge_torque(state, "disarmed", 3)
     servos.set_torque(False)
+
+
+def test_the_soak_in_real_time_judges_wire_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soak_hil, "_LOOK", 0.5)
+    account = soak_hil.soak(2.0)
+    assert account.wrong == []
+    assert account.ticks > 300
+    assert account.memory
+    assert account.done["arm"] >= 1
+    assert "wrong: nothing" in str(account)
