@@ -20,14 +20,14 @@ def soak() -> Iterator[Soak]:
 
 
 def test_random_commands_and_faults_break_nothing(soak: Soak) -> None:
-    account = soak.run(40_000)
-    assert account.ticks == 40_000
-    assert account.written > 10_000
+    account = soak.run(25_000)
+    assert account.ticks == 25_000
+    assert account.written > 5_000
     assert len(account.modes) >= 7
-    assert sum(account.injected.values()) > 10
-    assert len(account.faults) >= 4
+    assert sum(account.injected.values()) > 6
+    assert len(account.faults) >= 3
     assert account.growth < 0.02
-    assert "40000 ticks" in account.lines()[0]
+    assert "25000 ticks" in account.lines()[0]
 
 
 @pytest.mark.parametrize(
