@@ -51,9 +51,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shown(recorded: Path) -> Shown:
     """What of it goes to the viewer."""
     file = recorded.with_suffix(".rrd")
-    done = softfinger("view", str(recorded), "--save", str(file))
-    assert done.returncode == 0, done.stderr
-    assert "lost on the way: none" in done.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "nice", lambda _: 0)  # the tests' own priority stays
+        assert cli.main(["view", str(recorded), "--save", str(file)]) == 0
     return Shown(file)
 
 
@@ -288,28 +288,33 @@ def test_another_schema_is_told_once_and_what_is_known_is_shown(tmp_path: Path) 
         fake.changes = {"schema": 2, "news": 1.5}
         fake.send(b"hand/state", b"\xc1")
         done = softfinger(
-            *("view", "--address", fake.state_address, "--duration", "4"),
+            *("view", "--address", fake.state_address, "--duration", "3"),
             *("--save", str(tmp_path / "a.rrd")),
         )
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("the stream is of schema 2, this viewer knows 1") == 1
     shown = Shown(tmp_path / "a.rrd")
     forces = [row[0] for _, row in shown.rows["/plots/force", "scalars"]]
-    assert len(forces) > 100
+    assert len(forces) > 50
     assert 8.0 < np.mean(forces) < 12.0
     assert "/pressure/left/footprint" in shown.entities()
 
 
 def test_waiting_is_told_and_a_signal_ends_it(tmp_path: Path) -> None:
-    words = ["view", "--address", "tcp://127.0.0.1:9", "--save", str(tmp_path / "a.rrd")]
-    process = subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    assert "waiting for a stream: tcp://127.0.0.1:9" in process.stderr.readline()
-    process.send_signal(signal.SIGTERM)
-    said = process.stderr.read()
-    assert process.wait(20) == 1
+    with FakeDaemon() as fake:
+        fake.silent.set()
+        words = ["view", "--address", fake.state_address, "--save", str(tmp_path / "a.rrd")]
+        process = subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
+        assert f"waiting for a stream: {fake.state_address}" in process.stderr.readline()
+        fake.silent.clear()
+        assert "the stream is here" in process.stderr.readline()
+        until(lambda: fake.published > 150)
+        process.send_signal(signal.SIGTERM)
+        said = process.stderr.read()
+    assert process.wait(20) == 0
     process.stderr.close()
-    assert "nothing came that can be shown" in said
+    assert "states shown" in said
 
 
 def test_without_the_extra_it_names_what_to_install() -> None:
@@ -334,6 +339,11 @@ def test_without_the_extra_it_names_what_to_install() -> None:
         (("--save", "none/a.rrd"), "No such file"),
         (("--no-wait",), "no display for a window"),
         (("--address", "tcp://nowhere", "--save", "b.rrd"), "tcp://nowhere"),
+        (
+            ("--address", "tcp://127.0.0.1:9", "--duration", "0.1", "--save", "d.rrd"),
+            "nothing came",
+        ),
+        (("--rate", "fast"), "expected 0.1 to 100 Hz"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait", "--save", "c.rrd"), "nothing from tcp"),
     ],
 )
@@ -359,13 +369,18 @@ def test_bad_input_is_one_clear_line(
 
 
 def test_a_recording_that_was_cut_short_is_shown_as_far_as_it_goes(
-    recorded: Path, tmp_path: Path
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     data = recorded.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
-    done = softfinger("view", str(tmp_path / "cut.mcap"), "--save", str(tmp_path / "a.rrd"))
-    assert done.returncode == 0, done.stderr
-    assert "cut short" in done.stderr
+    monkeypatch.setattr(os, "nice", lambda _: 0)
+    assert cli.main(["view", str(tmp_path / "cut.mcap"), "--save", str(tmp_path / "a.rrd")]) == 0
+    said = capsys.readouterr().err
+    assert "cut short" in said
+    assert "lost on the way: none" in said
     assert len(Shown(tmp_path / "a.rrd").rows["/plots/force", "scalars"]) > 20
 
 

@@ -34,6 +34,10 @@ Exit status: 0, or 1 with the reason when nothing could be shown."""
 
 _PORT = 9090  # of the page, when it is free
 _WAIT = 2.0  # s without a message until the waiting is told, or --no-wait gives up
+_SLOW_LOOK = 1.0  # s between two looks at this process's memory
+_BREATH = 50.0  # MB that it may grow by itself
+_AHEAD = 200  # pictures of a recording that are sent before the viewer is waited for
+_PATIENCE = 60.0  # s for that
 _LOOK = 0.2  # s between two looks at the viewer
 _NICE = 5  # the viewer stands back behind everything that is in a hurry
 
@@ -54,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="must not be there yet")
     parser.add_argument(
-        "--memory", type=megabytes, default=500.0, metavar="MB", help="most that is kept; 500"
+        "--memory", type=megabytes, default=500.0, metavar="MB", help="kept, the newest of it; 500"
     )
     parser.add_argument(
         "--rate", type=_rate, default=20.0, metavar="HZ", help="pictures a second at most; 20"
@@ -101,6 +105,8 @@ class _View:
     """One call of ``view``: viewer, bridge, and where the messages come from."""
 
     def __init__(self, arguments: argparse.Namespace, ending: _Ending) -> None:
+        # What goes wrong there is told here, in one line.
+        os.environ.setdefault("RUST_LOG", "off")
         try:
             import rerun
         except ImportError:
@@ -110,6 +116,8 @@ class _View:
         self._arguments = arguments
         self._ending = ending
         self._notes_told = 0
+        self._looked = -math.inf
+        self._resident = math.inf  # MB, the least since something is shown
         self._rerun = rerun
         self._recording: Any = rerun.RecordingStream("softfinger")
         self._recording.set_log_tick_enabled(False)
@@ -135,9 +143,9 @@ class _View:
             else:
                 self._show_recording(recording, viewer)
         finally:
-            self._recording.disconnect()
-            if viewer is not None:
+            if viewer is not None:  # first: one that hangs would hold up what follows
                 viewer.close()
+            self._recording.disconnect()
         self._account()
         if self._bridge.shown == 0:
             where = arguments.address if recording is None else arguments.file
@@ -170,7 +178,9 @@ class _View:
                 raise ViewError(f"{save}: is there already") from None
             except OSError as error:
                 raise ViewError(f"{save}: {error.strerror}") from None
-            sinks.append(self._rerun.FileSink(save))
+            # A footer makes large files open faster; it would pile up for as long as a stream goes.
+            footer = self._arguments.file is not None
+            sinks.append(self._rerun.FileSink(save, write_footer=footer))
         self._recording.set_sinks(*sinks)
 
     def _show_stream(self, viewer: Viewer | None) -> None:
@@ -212,7 +222,7 @@ class _View:
         arguments, bridge = self._arguments, self._bridge
         if recording.damage:
             self._say(f"{recording.path}: cut short ({recording.damage}); what is sound is shown")
-        drawn, period = math.nan, 1.0 / arguments.rate
+        drawn, period, pictures = math.nan, 1.0 / arguments.rate, 0
         with Progress("view", recording.size) as progress:
             end = math.inf if arguments.end is None else arguments.end
             for topic, message in recording.messages(TOPICS, arguments.start, end, progress):
@@ -220,24 +230,50 @@ class _View:
                 if not abs(bridge.time - drawn) < period:
                     bridge.draw()
                     drawn = bridge.time
+                    pictures += 1
+                    if pictures % _AHEAD == 0:
+                        self._flush()
                     if self._ending.over() or not self._shows(viewer):
                         return
         bridge.draw(last=True)
         self._tell_notes()
-        self._recording.flush()
+        self._flush()
         if viewer is not None:
             self._say("all is shown; Ctrl-C ends")
             while not self._ending.wait(_LOOK) and self._shows(viewer):
                 pass
 
     def _shows(self, viewer: Viewer | None) -> bool:
-        """False once the window was closed. Raises ViewError when the viewer has died."""
+        """False once the window was closed. Raises ViewError when the viewer has died or hangs."""
         if viewer is None or viewer.running():
+            self._watch_memory()
             return True
         failure = viewer.failure()
         if failure:
             raise ViewError(failure)
         return False
+
+    def _flush(self) -> None:
+        """Wait until the viewer has what it was sent. Raises ViewError when it does not take it."""
+        try:
+            self._recording.flush(timeout_sec=_PATIENCE)
+        except Exception as error:  # of whatever kind Rerun's is
+            raise ViewError(f"the viewer takes nothing more: {error}") from None
+
+    def _watch_memory(self) -> None:
+        """Raise ViewError when what a viewer doesn't take has piled up to the bound."""
+        from tools.viewing.viewer import resident
+
+        now = time.monotonic()
+        if self._bridge.shown == 0 or now - self._looked < _SLOW_LOOK:
+            return
+        self._looked = now
+        memory = resident()
+        self._resident = min(self._resident, memory)
+        if memory - self._resident > self._arguments.memory + _BREATH:
+            raise ViewError(
+                f"the viewer falls behind by {memory - self._resident:.0f} MB: see --memory"
+            )
 
     def _tell_notes(self) -> None:
         for note in self._bridge.notes[self._notes_told :]:
