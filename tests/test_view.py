@@ -283,6 +283,7 @@ def test_messages_of_any_kind_are_survived() -> None:
     assert bridge.unreadable > 10
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # what is saved from a stream
 def test_another_schema_is_told_once_and_what_is_known_is_shown(tmp_path: Path) -> None:
     with FakeDaemon() as fake:
         fake.changes = {"schema": 2, "news": 1.5}
