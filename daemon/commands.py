@@ -4,9 +4,9 @@ The server lives in the loop's own thread: it is asked once a tick, costs one sy
 nobody speaks, and needs no lock. A plain REQ socket is enough for a client.
 
 One command is carried out a tick. What has come beside it is looked through as far as a tick
-allows: a ``stop`` goes first whoever else speaks, and a client that sends more than it may a second
-is refused, or in a flood not even answered, so that a flood costs the tick a bounded time and no
-one else's command its turn.
+allows: a ``stop`` goes first whoever else speaks, and whatever waits then is refused, since it may
+have been sent before; a client that sends more than it may a second is refused, or in a flood not
+even answered, so that a flood costs the tick a bounded time and no one else's command its turn.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ _LOOK = 8  # messages that are taken in at a tick
 _REFUSALS = 2  # answers at a tick to who sends too much
 _CLIENTS = 256  # whose pace is remembered
 _FULL = "too many commands wait already"
+_STOPPED = "a stop came before its turn; send it again"
 _STOP = b"stop"
+_VALUES = (str, int, float)  # and bool, which is an int
 
 
 class Refused(Exception):
@@ -67,33 +69,44 @@ class CommandServer:
 
     def serve(self, handler: Handler) -> bool:
         """Answer one waiting command through ``handler``; False when there was nothing at all."""
-        came = False
+        came = stopped = False
         self._refusals = _REFUSALS
         for _ in range(_LOOK):
             if not self._bound.readable():
                 break
             came = True
-            self._take_in(self._socket.recv_multipart(zmq.NOBLOCK), handler)
+            frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            stopped = self._take_in(frames, handler) or stopped
+        if stopped:
+            self._refuse_waiting()
         if not self._waiting:
             return came
         envelope, payload = self._waiting.popleft()
         self._send(envelope, self._answer(payload, handler))
         return True
 
-    def _take_in(self, frames: list[bytes], handler: Handler) -> None:
+    def _take_in(self, frames: list[bytes], handler: Handler) -> bool:
+        """Sort one message in; True when it was a stop, which has been carried out."""
         # A REQ socket sends [identity, empty, payload]. Without the empty frame, as from a DEALER,
         # the reply goes back in the same form.
         envelope, payload = frames[:-1], frames[-1]
         if not 0 < len(envelope) <= 2:
-            return  # not the form of any client; an answer would only send its frames back
+            return False  # no client's form; an answer would only send its frames back
         if _is_stop(payload, self._max_bytes):
             self._send(envelope, self._answer(payload, handler))
-        elif not self._in_pace(envelope[0], self._now()):
+            return True
+        if not self._in_pace(envelope[0], self._now()):
             self._refuse(envelope, f"too many commands: at most {self._per_second:g} a second")
         elif len(self._waiting) >= _QUEUE and not self._make_room(envelope[0]):
             self._refuse(envelope, _FULL)
         else:
             self._waiting.append((envelope, payload))
+        return False
+
+    def _refuse_waiting(self) -> None:
+        while self._waiting:
+            envelope, _ = self._waiting.popleft()
+            self._send(envelope, {"ok": False, "error": _STOPPED})
 
     def _make_room(self, client: bytes) -> bool:
         """Refuse the last command of whoever has most waiting, unless that is this client."""
@@ -158,7 +171,10 @@ def _is_stop(payload: bytes, max_bytes: int) -> bool:
 
 
 def decode(payload: bytes) -> dict[str, Any]:
-    """Unpack a command. Raises Refused unless it is a map with a text under ``command``."""
+    """Unpack a command, a map of plain numbers and texts with a text under ``command``.
+
+    Raises Refused for all else.
+    """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
     except Exception as error:  # msgpack raises many kinds, ValueError and its own among them
@@ -169,6 +185,9 @@ def decode(payload: bytes) -> dict[str, Any]:
         raise Refused('expected a text under "command"')
     if not all(isinstance(key, str) for key in request):
         raise Refused("expected texts as keys")
+    # Nothing nested: what comes from outside is told to subscribers as it came.
+    if not all(value is None or isinstance(value, _VALUES) for value in request.values()):
+        raise Refused("expected numbers and texts as values")
     return request
 
 

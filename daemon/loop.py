@@ -160,11 +160,14 @@ class Loop:
         clock.sleep_until(deadline)
 
     def _refuse_old(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Its sender has given up waiting: no old command may move the hand, but stop stops."""
+        """No command from before a stop or a stall may move the hand, but stop stops."""
         if request["command"] == "stop":
             return self._by_person(request)
         name = request["command"][:40]
-        raise Refused(f"{name}: came while the daemon stood still or was starting; send it again")
+        raise Refused(
+            f"{name}: came while the daemon stood still or was starting, or before a stop; "
+            "send it again"
+        )
 
     # The tick
 
@@ -224,11 +227,11 @@ class Loop:
     def _decide(self) -> None:
         state, control = self.state, self._control
         control.observe(state.reading, state.contacts, state.object, self._held)
-        if self._stopping:
-            self._stopping = False
+        stopped, self._stopping = self._stopping, False
+        if stopped:
             self._by_person({"command": "stop"})
         if self._server is not None:
-            if state.t < self._deaf_until:
+            if stopped or state.t < self._deaf_until:
                 self._server.drain(self._refuse_old)
             else:
                 self._server.serve(self._by_person)

@@ -75,6 +75,8 @@ def test_a_plain_req_socket_gets_its_answer(
         (msgpack.packb({"command": 7}), 'expected a text under "command"'),
         (msgpack.packb({"command": "arm", 3: 4}), "not msgpack"),
         (msgpack.packb({"command": "x" * 300}), "bytes; at most 200"),
+        (msgpack.packb({"command": "arm", "x": {b"k": 1}}), "numbers and texts as values"),
+        (msgpack.packb({"command": "arm", "client": [[[]]]}), "numbers and texts as values"),
     ],
 )
 def test_malformed_commands_are_refused_and_the_server_lives_on(
@@ -202,8 +204,35 @@ def test_a_stop_goes_before_all_that_waits(
     until(stopped)
     assert "stop" in order
     assert order.index("stop") < 160, "not behind all of the flood"
-    assert len(server._waiting) > 0, "others wait still"
+    assert not server._waiting, "nothing of before is carried out later"
     del flood
+    server.close()
+
+
+def test_what_was_sent_before_a_stop_is_refused_and_what_comes_after_is_not(
+    context: zmq.Context[Any],
+) -> None:
+    server = CommandServer(context, "inproc://commands", max_bytes=200)  # all is there at once
+    client = context.socket(zmq.DEALER)
+    client.connect("inproc://commands")
+    heard: list[str] = []
+
+    def note(request: dict[str, Any]) -> dict[str, Any]:
+        heard.append(request["command"])
+        return {}
+
+    for name in ("arm", "move", "stop"):
+        client.send(msgpack.packb({"command": name}))
+    while server.serve(note):
+        pass
+    assert heard == ["stop"]
+    replies = [msgpack.unpackb(client.recv()) for _ in range(3)]
+    assert [reply["ok"] for reply in replies] == [True, False, False]
+    assert "a stop came before its turn" in replies[1]["error"]
+    client.send(msgpack.packb({"command": "arm"}))
+    assert server.serve(note)
+    assert heard == ["stop", "arm"]
+    client.close()
     server.close()
 
 

@@ -7,10 +7,12 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import msgpack
 import pytest
+import zmq
 
 from daemon.assembly import Daemon
-from daemon.commands import Refused
+from daemon.commands import CommandServer, Refused
 from daemon.messages import Parts, pack, state_message
 from daemon.records import Frame
 from daemon.servos.base import ServoError
@@ -289,6 +291,26 @@ def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> 
         assert daemon.hand is not None
         assert not torque_of(daemon).any()
         assert not daemon.loop.state.torque
+
+
+def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
+    make: Make, context: zmq.Context[Any]
+) -> None:
+    daemon = make()
+    server = CommandServer(context, "inproc://commands", 200)
+    daemon.loop._server = server
+    client = context.socket(zmq.DEALER)
+    client.connect("inproc://commands")
+    client.send(msgpack.packb({"command": "arm"}))
+    daemon.loop.stop()
+    daemon.loop.advance(5 * daemon.loop.period)
+    assert daemon.loop.state.mode == "disarmed"
+    assert "before a stop" in msgpack.unpackb(client.recv(zmq.NOBLOCK))["error"]
+    client.send(msgpack.packb({"command": "arm"}))
+    daemon.loop.advance(daemon.loop.period)
+    assert daemon.loop.state.mode == "armed"
+    client.close()
+    server.close()
 
 
 def test_arm_waits_until_a_failing_torque_off_has_worked(make: Make) -> None:
