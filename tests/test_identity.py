@@ -68,6 +68,15 @@ def test_a_single_servo_is_the_single_missing_one() -> None:
     assert planned(servo(1, 57600), **only_left) == ["0: ID 1 → 11, 57600 → 2000000 baud"]
 
 
+def test_the_servo_of_a_finger_that_the_scene_leaves_out_is_not_the_missing_one() -> None:
+    only_left = {"scene": {"fingers": ("left",)}}
+    assert planned(servo(2), **only_left) == ["missing 0", "stranger 2@2000000"]
+    only_right = {"scene": {"fingers": ("right",)}}
+    assert planned(servo(1), **only_right) == ["missing 1", "stranger 1@2000000"]
+    # From the factory, at another rate, it is nobody's.
+    assert planned(servo(1, 57600), **only_right) == ["1: ID 1 → 2, 57600 → 2000000 baud"]
+
+
 @pytest.mark.parametrize(
     ("found", "told"),
     [

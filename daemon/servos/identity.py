@@ -63,7 +63,9 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    fit = [each for each in strangers if each.number == model.number]
+    # At the settings' rate an ID of theirs is that finger's, although the scene leaves it out.
+    others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
+    fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
     changes = []
     for servo_id in list(missing):
