@@ -57,7 +57,7 @@ class Publisher:
             if change[:1] == b"\x01":
                 self._subscriptions.add(change[1:])
                 self._owe(change[1:])
-            else:
+            elif change[:1] == b"\x00":  # else no subscription at all: not every socket is a SUB
                 self._subscriptions.discard(change[1:])
         self.wants_state = self._wanted(messages.STATE)
         self.wants_tactile = self._wanted(messages.TACTILE)

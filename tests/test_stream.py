@@ -142,6 +142,22 @@ def test_topics_nobody_subscribes_to_are_not_wanted(
     publisher.close()
 
 
+def test_what_is_no_subscription_takes_none_from_others(context: zmq.Context[Any]) -> None:
+    publisher = Publisher(context, "inproc://stream", queue=10)
+    listener = subscribe(context, "inproc://stream")
+    other = context.socket(zmq.XSUB)
+    other.connect("inproc://stream")
+    for message in (b"", b"\x05", b"\x05hand/state", b"\x01hand/input"):
+        other.send(message)
+    publisher.refresh()
+    assert publisher.wants_input, "all has come"
+    assert publisher.wants_state
+    assert publisher._subscriptions == {b"", b"hand/input"}
+    listener.close()
+    other.close()
+    publisher.close()
+
+
 def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
