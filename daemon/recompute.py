@@ -7,7 +7,6 @@ code and settings, gets the same states to the last bit.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from daemon.prediction import Prediction
 from daemon.records import FINGERS, Frame, Goal, Reading, State
 from daemon.servos.base import ServoError
 from daemon.settings import Settings, Task
+from daemon.tactile.given import GivenFrames
 
 
 class Recomputation:
@@ -38,11 +38,11 @@ class Recomputation:
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
-        self._sensors: dict[int, _Sensor] = {}
+        self._sensors: dict[int, GivenFrames] = {}
         perceptions = []
         if settings.tactile.backend != "none":
             for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
-                sensor = self._sensors[finger] = _Sensor()
+                sensor = self._sensors[finger] = GivenFrames()
                 perceptions.append(FingerPerception(sensor, models[finger], settings))
         prediction = None
         if perceptions and self._servos is not None:
@@ -150,25 +150,6 @@ class _Servos:
     def _fail_as_recorded(self) -> None:
         if self.taken["write_error"]:
             raise ServoError(self.taken["write_error"])
-
-    def counters(self) -> dict[str, int]:
-        return {}
-
-    def close(self) -> None:
-        pass
-
-
-@dataclasses.dataclass(slots=True)
-class _Sensor:
-    """The newest recorded frame."""
-
-    frame: Frame | None = None
-
-    def open(self) -> None:
-        pass
-
-    def latest(self) -> Frame | None:
-        return self.frame
 
     def counters(self) -> dict[str, int]:
         return {}

@@ -1,8 +1,9 @@
-"""Recordings of the simulated hand at work, made on the virtual clock in a second or two."""
+"""The simulated hand at work on the virtual clock: what it publishes, and recordings of that."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgpack
@@ -13,6 +14,8 @@ from daemon.commands import Handler, Refused
 from daemon.profiles import load
 from tools.recordings.writer import RecordingWriter
 
+Messages = list[tuple[bytes, dict[str, Any]]]
+
 
 class Script:
     """Commands at their ticks, in the place of the command server."""
@@ -22,6 +25,7 @@ class Script:
     def __init__(self, due: dict[int, dict[str, Any]]) -> None:
         self._due = due
         self._tick = 0
+        self.refused = 0
 
     def serve(self, handler: Handler) -> bool:
         self._tick += 1
@@ -30,11 +34,41 @@ class Script:
             try:
                 handler(request)
             except Refused:
-                pass
+                self.refused += 1
         return request is not None
 
     def drain(self, handler: Handler) -> None:
         pass
+
+
+def published(
+    folder: Path, script: Script, seconds: float, changes: tuple[str, ...] = ()
+) -> Messages:
+    """All that the hand publishes under ``script``; ``folder`` is for its sockets."""
+    settings = load(
+        changes=[
+            "loop.clock=virtual",
+            "stream.state_rate=100",
+            f"stream.address=ipc://{folder}/stream",
+            f"commands.address=ipc://{folder}/commands",
+            *changes,
+        ]
+    )
+    taken: Messages = []
+
+    def take(topic: bytes, message: dict[str, Any]) -> None:
+        taken.append((topic, msgpack.unpackb(messages.pack(message))))
+
+    with Daemon(settings) as daemon:
+        publisher = daemon.publisher
+        assert publisher is not None
+        publisher._send = take  # type: ignore[method-assign]
+        publisher._subscriptions.add(b"hand/")
+        publisher.refresh()
+        publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
+        daemon.loop._server = script
+        daemon.loop.advance(seconds)
+    return taken
 
 
 def record_hand(
@@ -45,28 +79,9 @@ def record_hand(
     without: tuple[bytes, ...] = (),
 ) -> None:
     """The commands in ``due`` at their ticks (500 a second); topics ``without`` are left out."""
-    settings = load(
-        changes=[
-            "loop.clock=virtual",
-            "stream.state_rate=100",
-            f"stream.address=ipc://{path}.stream",
-            f"commands.address=ipc://{path}.commands",
-            *changes,
-        ]
-    )
     writer = RecordingWriter(path)
-
-    def take(topic: bytes, message: dict[str, Any]) -> None:
-        if topic not in without:
-            writer.add(topic, msgpack.unpackb(messages.pack(message)))
-
-    with Daemon(settings) as daemon:
-        publisher = daemon.publisher
-        assert publisher is not None
-        publisher._send = take  # type: ignore[method-assign]
-        publisher._subscriptions.add(b"hand/")
-        publisher.refresh()
-        publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
-        daemon.loop._server = Script(due)
-        daemon.loop.advance(seconds)
+    with TemporaryDirectory() as folder:
+        for topic, message in published(Path(folder), Script(due), seconds, changes):
+            if topic not in without:
+                writer.add(topic, message)
     writer.close()

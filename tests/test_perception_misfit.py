@@ -10,30 +10,13 @@ from daemon.perception import FingerPerception
 from daemon.records import Contact, Frame, State
 from daemon.safety import Safety
 from daemon.settings import Settings
+from daemon.tactile.given import GivenFrames
 from kinematics import Fingertip, Material, SensorGrid
-
-
-class Given:
-    """A sensor whose newest frame is chosen by the test."""
-
-    frame: Frame | None = None
-
-    def open(self) -> None:
-        pass
-
-    def latest(self) -> Frame | None:
-        return self.frame
-
-    def counters(self) -> dict[str, int]:
-        return {}
-
-    def close(self) -> None:
-        pass
 
 
 def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:
     settings = Settings()
-    sensor = Given()
+    sensor = GivenFrames()
     perception = FingerPerception(sensor, make_models(settings, None)[0], settings)
     grid = SensorGrid(rows=44, cols=44, pitch=0.058 / 44)
     pressure = grid.pressure(Fingertip(0.020), Material.table_i(), 0.005, 0.1, 0.0)

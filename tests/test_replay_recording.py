@@ -14,12 +14,11 @@ import pytest
 import zmq
 
 from daemon import messages
-from daemon.assembly import Daemon, facts
-from daemon.commands import Handler, Refused
 from daemon.profiles import load
 from daemon.records import Frame
 from tests.conftest import until
 from tests.daemon_process import SOFTFINGER, softfinger
+from tests.recorded_hand import Messages, Script, published
 from tests.test_contract import sample
 from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
@@ -27,56 +26,11 @@ from tools.recordings.recomputed import Comparison, recompute
 from tools.recordings.writer import RecordingWriter
 
 Profile = Callable[[str], Path]
-Messages = list[tuple[bytes, dict[str, Any]]]
-
-
-class Script:
-    """Commands at their ticks, in the place of the command server."""
-
-    refused_by_pace = 0
-
-    def __init__(self, due: dict[int, dict[str, Any]]) -> None:
-        self._due = due
-        self._tick = 0
-        self.refused = 0
-
-    def serve(self, handler: Handler) -> bool:
-        self._tick += 1
-        request = self._due.get(self._tick)
-        if request is not None:
-            try:
-                handler(request)
-            except Refused:
-                self.refused += 1
-        return request is not None
-
-    def drain(self, handler: Handler) -> None:
-        pass
-
-
-class Tap:
-    """Takes what a loop publishes, without a socket."""
-
-    def __init__(self) -> None:
-        self.taken: Messages = []
-
-    def __call__(self, topic: bytes, message: dict[str, Any]) -> None:
-        self.taken.append((topic, msgpack.unpackb(messages.pack(message))))
 
 
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
-    """All that a grasp, a turn, a refused command and a stop publish, on the virtual clock."""
-    folder = tmp_path_factory.mktemp("ipc")
-    settings = load(
-        changes=[
-            "loop.clock=virtual",
-            "stream.state_rate=500",
-            f"stream.address=ipc://{folder}/stream",
-            f"commands.address=ipc://{folder}/commands",
-        ]
-    )
-    tap = Tap()
+    """All that a grasp, a turn, a refused command and a stop publish."""
     script = Script(
         {
             50: {"command": "arm"},
@@ -86,18 +40,12 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
             1100: {"command": "stop"},
         }
     )
-    with Daemon(settings) as daemon:
-        publisher = daemon.publisher
-        assert publisher is not None
-        publisher._send = tap  # type: ignore[method-assign]
-        publisher._subscriptions.add(b"hand/")
-        publisher.refresh()
-        publisher.settings(0.0, 0.0, facts(settings, daemon.models))
-        daemon.loop._server = script
-        daemon.loop.advance(2.3)
-        assert daemon.loop.state.mode == "disarmed"
+    folder = tmp_path_factory.mktemp("sockets")
+    sent = published(folder, script, 2.3, ("stream.state_rate=500",))
+    states = [message for topic, message in sent if topic == messages.STATE]
+    assert states[-1]["mode"] == "disarmed"
     assert script.refused == 1
-    return tap.taken
+    return sent
 
 
 def record(path: Path, taken: Messages) -> Recording:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from daemon.perception import FingerPerception
 from daemon.records import FINGERS, Contact, Frame
+from daemon.tactile.given import GivenFrames
 from tools.analysis.sources import Progress, Source
 from tools.recordings.errors import RecordingError
 
@@ -41,31 +42,11 @@ class Contacts:
     truths: dict[str, FloatArray]
 
 
-class _Fed:
-    """A sensor that hands over what it is given."""
-
-    def __init__(self, live: NDArray[np.bool_] | None) -> None:
-        self.frame: Frame | None = None
-        self.live = live
-
-    def open(self) -> None:
-        pass
-
-    def latest(self) -> Frame | None:
-        return self.frame
-
-    def counters(self) -> dict[str, int]:
-        return {}
-
-    def close(self) -> None:
-        pass
-
-
 class _Pass:
     """One sensor's perception and the rows it has given."""
 
     def __init__(self, source: Source, finger: int) -> None:
-        self._sensor = _Fed(source.live)
+        self._sensor = GivenFrames(source.live)
         self._perception = FingerPerception(self._sensor, source.models[finger], source.settings)
         self._contact = Contact()
         self._rows: list[tuple[float, ...]] = []
