@@ -27,6 +27,7 @@ _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
 _TABLE_STEPS = 8192  # of a curve's table: 64 KB
+_FAULTY = 0.2  # of the usual end: a cell whose range is less rests all but full
 
 
 class CalibrationFileError(TactileError):
@@ -252,9 +253,9 @@ class Converter:
 
     @property
     def saturation(self) -> float:
-        """The least pressure [Pa] at which a live cell is full."""
+        """The least pressure [Pa] at which a live cell is full, see :func:`least_end`."""
         pressure = self.at(self._full)[self.live]
-        return float(pressure.min()) if pressure.size else np.inf
+        return least_end(pressure) if pressure.size else np.inf
 
     @property
     def largest(self) -> float:
@@ -265,6 +266,14 @@ class Converter:
     def quantum(self) -> float:
         """A count's typical width [Pa]: the mean slope of the curve."""
         return self.saturation / self._full
+
+
+def least_end(ends: FloatArray) -> float:
+    """The least of the readings at which cells are full, each over its own zero.
+
+    But for a cell that reads all but full where nothing presses: it would make all others full.
+    """
+    return float(ends[ends >= _FAULTY * np.median(ends)].min())
 
 
 def _contradiction(calibration: Calibration) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.calibration import Converter
+from daemon.calibration import Converter, least_end
 from daemon.messages import SensorFacts
 from daemon.model import FingerModel, make_estimator
 from daemon.records import Contact, Frame
@@ -35,6 +35,7 @@ class FingerPerception:
         self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
         self._table = model.table.data
         self._scale = tactile.pascal_per_count
+        self._full = float(tactile.full_count)
         self._converter: Converter | None = None
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count)
@@ -131,7 +132,9 @@ class FingerPerception:
             return frame.data if zero is None else np.maximum(frame.data, zero) - zero
         if self._pressure is None or self._converted is not frame:
             self._pressure, self._converted = self._converter(frame.data), frame
-        return np.rint(self._pressure * (1.0 / self.facts.scale)).astype(np.uint16)
+        # A zero below the calibration's lets a cell read more than the scale was made for.
+        steps = np.minimum(self._pressure * (1.0 / self.facts.scale), _STEPS)
+        return np.rint(steps).astype(np.uint16)
 
     def _facts(self, settings: Settings, model: FingerModel) -> SensorFacts:
         scale = settings.tactile.pascal_per_count
@@ -152,7 +155,9 @@ class FingerPerception:
 
     def _learn_zero(self, counts: NDArray[np.uint16]) -> None:
         if self._tare_sum is None:
-            self._zero = None
+            if self._converter is None:
+                self._zero = None
+                self._estimator.saturation = self._full
             self._tare_sum = np.zeros(counts.shape, np.uint32)
         self._tare_sum += counts
         self._tare_left -= 1
@@ -161,5 +166,7 @@ class FingerPerception:
         mean = self._tare_sum / _TARE_FRAMES
         if self._converter is not None:
             self._converter.zero[:] = mean
+            self._estimator.saturation = self._converter.saturation
         else:
             self._zero = np.round(mean).astype(np.uint16)
+            self._estimator.saturation = least_end(self._full - self._zero.astype(np.float64))

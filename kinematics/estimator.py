@@ -21,7 +21,7 @@ from kinematics.contact import Fingertip
 from kinematics.footprint import FloatArray, IntArray
 from kinematics.likelihood import fit_law
 from kinematics.material import Material
-from kinematics.middles import cell_middles
+from kinematics.middles import HEIGHT, cell_middles
 from kinematics.moments import moment_ratios
 from kinematics.pressure import SensorGrid
 
@@ -134,8 +134,6 @@ class ContactEstimator:
             raise ValueError(f"method must be 'ml' or 'moments', got {method!r}")
         if not (math.isfinite(gain) and gain > 0.0):
             raise ValueError(f"gain must be positive, got {gain}")
-        if saturation is not None and not saturation > 0.0:
-            raise ValueError(f"saturation must be positive, got {saturation}")
         if not 0.0 <= threshold < math.inf:
             raise ValueError(f"threshold must not be negative, got {threshold}")
         if not 0.0 <= quantum < math.inf:
@@ -145,13 +143,14 @@ class ContactEstimator:
         self.grid = grid
         geometry = grid.geometry(tip)
         rows, cols = grid.shape
-        self._saturation = saturation
+        self.saturation = saturation
         self._quantum = quantum
         self._cells = np.zeros((rows, CELL_PLANES, cols))
         face_integrals(geometry, self._cells)
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
-        self._cells[:, LIVE] = alive
         middles, bounds = cell_middles(geometry, alive, tip.radius + 3.0 * grid.blur)
+        # A blur reaches cells that no contact is looked for in; whatever they read, it's not used.
+        self._cells[:, LIVE] = (middles[HEIGHT] >= 0.0).reshape(grid.shape)
         self._tables = np.concatenate(
             [moment_ratios(tip, material).ravel(), fit_law(material.law).ravel()]
         )
@@ -180,6 +179,21 @@ class ContactEstimator:
         self._frame = np.zeros((rows, cols))
         self._seq: int | None = None
         self._last = ContactEstimate(covariance=self._state[ladder.COVARIANCE :].reshape(4, 4))
+
+    @property
+    def saturation(self) -> float | None:
+        """The reading at which a cell is full; None for an integer type's largest value.
+
+        Set it anew where another zero is taken off the readings. Raises ValueError for one that is
+        not positive.
+        """
+        return self._saturation
+
+    @saturation.setter
+    def saturation(self, reading: float | None) -> None:
+        if reading is not None and not reading > 0.0:
+            raise ValueError(f"saturation must be positive, got {reading}")
+        self._saturation = reading
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """Estimate from this frame alone: a new result, whatever frames came before.

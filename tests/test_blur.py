@@ -264,3 +264,18 @@ def test_the_settings_blur_goes_into_the_fingers_estimator():
     few = Settings.model_validate({"tactile": {"rows": 4, "cols": 4, "blur": 0.005}})
     with pytest.raises(SettingsError, match=r"tactile\.blur"):
         make_grid(few)
+
+
+@pytest.mark.parametrize("reading", [math.nan, math.inf, 1e9])
+def test_cells_out_of_the_tips_reach_are_not_used_however_far_the_blur_goes(reading):
+    grid = SensorGrid(44, 44, PITCH, blur=0.001)
+    noise = 0.002 * LINEAR.reference_modulus
+    frame = grid.pressure(TIP, LINEAR, 0.012, 0.25, 0.25)
+    estimator = ContactEstimator(TIP, LINEAR, grid, noise)
+    usual = estimator(frame)
+    # Beyond the rim by more than three standard deviations, but in the footprint's box.
+    frame[39, 39] = reading
+    found = estimator(frame)
+    assert usual.valid
+    assert found.valid
+    assert found.d == usual.d
