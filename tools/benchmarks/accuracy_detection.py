@@ -120,7 +120,6 @@ def _trial(
     clean = place.grid.pressure(TIP, LINEAR, *place.truth[:3])
     parts = []
     for first in range(0, frames, _BATCH):
-        # Beyond the contact's surroundings noise makes no difference to whether it is seen.
         bank = random.standard_normal((min(_BATCH, frames - first), SIZE, SIZE))
         parts.append(trials.run(made, clean, FAINT_NOISE, bank, board))
     return np.concatenate(parts)
