@@ -28,7 +28,8 @@ _EXPONENTS = (0.3, 3.0)
 _RESTLESS = 8.0  # times the usual noise
 _FEW_CELLS = 4  # may be faulty
 _BINS = 24  # of strain
-_LEAST_TILT = math.radians(3.0)  # below it a tilt tells no direction
+_LEAST_TILT = math.radians(3.0)  # tilts that differ by less tell no direction
+_UPRIGHT = math.radians(0.5)
 
 
 class CalibrationError(ValueError):
@@ -215,13 +216,19 @@ def fit_centre(
 
     ``frames`` [n, rows, cols] Pa. The pressure's centroid stands at centre + (a − d/3)·n, so both
     follow linearly from the estimated centroids; the estimate's own centre is brought along.
-    Raises CalibrationError when a frame shows no contact.
+    Raises CalibrationError when a frame shows no contact, and for tilts that are all alike but not
+    upright.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
     if s.shape != (len(stack),):
         raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
     tilted = float(np.ptp(s)) > math.sin(_LEAST_TILT)
+    if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT):
+        raise CalibrationError(
+            f"centre: the tilts differ by less than {math.degrees(_LEAST_TILT):g}°, so that tilt "
+            "can't be told from place; press upright alone, or upright and tilted further"
+        )
     centre, rotation, scale, residual = grid.centre, None, 1.0, 0.0
     for _ in range(4):
         at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)

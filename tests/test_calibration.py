@@ -139,6 +139,13 @@ def test_upright_presses_tell_the_centre_and_no_rotation():
     assert found.rotation is None
 
 
+@pytest.mark.parametrize("tilts", [[0.2, 0.2], [0.1, 0.12], [-0.3]])
+def test_presses_tilted_alike_are_not_taken_for_upright_ones(tilts):
+    frames = [GRID.pressure(TIP, LINEAR, 0.004, t) for t in tilts]
+    with pytest.raises(CalibrationError, match="tilt can't be told from place"):
+        fit_centre(frames, tilts, TIP, LINEAR, GRID, 600.0)
+
+
 def test_the_modulus_of_a_compression_run_with_an_unknown_zero():
     d = np.linspace(0.001, 0.008, 15)
     theta = np.where(np.arange(15) % 2, 0.3, 0.0)
