@@ -245,6 +245,14 @@ class Control:
                 goal.q[index] = self._ways[index].value
                 goal.current[index] = bound
 
+    def coast(self, goal: Goal) -> None:
+        """In the place of `step` while frames are late: goals stay as they are.
+
+        Those that stand for torques do not: a grip goes on to damp its joints, and a turn rests.
+        """
+        if goal.valid and self._gripping and self._lost == 0.0 and not self._by_position:
+            self._pull(self._grip.coast(self._reading, self._held), goal)
+
     def _travel(self, dt: float) -> None:
         if self._ramp(self._settings.control.move_speed):
             return
@@ -306,12 +314,15 @@ class Control:
             goal.current[0] = goal.current[1] = self._settings.safety.current_max
         else:
             torques = grip.torques(self._reading, self._contacts, self._pose, self._held)
-            for index in self._fingers:
-                current = torques[index] / self._settings.control.torque_constant
-                goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
-                goal.current[index] = abs(current)
+            self._pull(torques, goal)
         self._watch_slip()
         self._watch_settling(dt, contacts)
+
+    def _pull(self, torques: list[float], goal: Goal) -> None:
+        for index in self._fingers:
+            current = torques[index] / self._settings.control.torque_constant
+            goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
+            goal.current[index] = abs(current)
 
     def _loses(self, dt: float, contacts: list[Contact], goal: Goal) -> bool:
         """Without a contact the joints hold where they are; when it stays away the grip ends."""

@@ -57,6 +57,11 @@ class Grip:
         self._force_rate = 0.0  # N/s
         self.force_target = 0.0  # N that was asked for
         self._integral = 0.0  # N
+        self._push = 0.0  # N that the joints give, both laws' parts together
+        self._lean = 0.0  # rad/s of the offset that turns the object
+        self._rest = math.exp(
+            -2.0 * self._dt / law.smooth_time
+        )  # of it, a tick later without frames
         self._closed = 0.0  # goal of (q1 + q2)/2 in pure position control [rad]
         self._offset = 0.0  # goal of (q1 − q2)/2 [rad]
         self._torques = [0.0, 0.0]
@@ -102,15 +107,31 @@ class Grip:
         self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: Held
     ) -> list[float]:
         """Joint torques [N·m], positive closing; pairs, of which the fingers' places are filled."""
-        torques = self._torques
         wanted = self._wanted(contacts, held)
-        push = wanted + self._correction(wanted, contacts)
+        self._push = wanted + self._correction(wanted, contacts)
         if len(self._fingers) == 1:
-            return self._press(push, reading, held)
-        lean = self._steer(pose, held) if self.steering else 0.0
+            return self._press(self.force.speed, reading, held)
+        self._lean = lean = self._steer(pose, held) if self.steering else 0.0
         self._share_out(held)
-        close = self._closing(lean, held)
+        close = self._closing(self.force.speed, lean, held)
         self._closing_friction = min(max(close / self._law.friction_speed, -1.0), 1.0)
+        return self._give(close, lean, reading, held)
+
+    def coast(self, reading: Reading, held: Held) -> list[float]:
+        """Joint torques [N·m] while frames are late: the push stays, and turning comes to rest.
+
+        Joints are read all the same. Torques that stayed as they are would turn the object on, to
+        the end of what damps and steers it.
+        """
+        if len(self._fingers) == 1:
+            return self._press(0.0, reading, held)
+        self._lean *= self._rest
+        self._offset += self._lean * self._dt
+        return self._give(self._closing(0.0, self._lean, held), self._lean, reading, held)
+
+    def _give(self, close: float, lean: float, reading: Reading, held: Held) -> list[float]:
+        """Torques of two fingers at rates [rad/s] of closing and leaning that are wanted."""
+        torques, push = self._torques, self._push
         dq1, dq2 = reading.dq
         arm = 0.5 * (held.arm[0] + held.arm[1])
         stiffness = _mean_stiffness(held)
@@ -134,7 +155,7 @@ class Grip:
         arm = 0.5 * (held.arm[0] + held.arm[1])
         lean = self._steer(pose, held) if self.steering else 0.0
         way = 2.0 * math.pi * law.force_bandwidth * error / (_mean_stiffness(held) * arm)
-        self._closed += (self._closing(lean, held) + way) * self._dt
+        self._closed += (self._closing(self.force.speed, lean, held) + way) * self._dt
         return [self._closed + self._offset, self._closed - self._offset]
 
     def _wanted(self, contacts: list[Contact], held: Held) -> float:
@@ -145,21 +166,21 @@ class Grip:
             )
         return self.force.step(self._force_rate)
 
-    def _closing(self, lean: float, held: Held) -> float:
-        """Closing [rad/s] that changes the force as wanted and keeps it while the object turns."""
+    def _closing(self, rate: float, lean: float, held: Held) -> float:
+        """Closing [rad/s] for a ``rate`` [N/s] of the force, what turning takes counted in."""
         arm1, arm2 = held.arm
-        way = 2.0 * self.force.speed / _mean_stiffness(held)
+        way = 2.0 * rate / _mean_stiffness(held)
         way -= (arm1 - arm2 + held.slide * (held.turn[0] + held.turn[1])) * lean
         return way / (arm1 + arm2)
 
-    def _press(self, push: float, reading: Reading, held: Held) -> list[float]:
-        """One finger on an object that stands by itself."""
+    def _press(self, rate: float, reading: Reading, held: Held) -> list[float]:
+        """One finger on an object that stands by itself, its force to change by ``rate`` [N/s]."""
         index = self._fingers[0]
         arm = held.arm[index]
         stiffness = max(held.stiffness[index], _STIFFNESS_MIN)
-        close = self.force.speed / (stiffness * arm)
+        close = rate / (stiffness * arm)
         calm = self._damping(stiffness * arm * arm) * (close - reading.dq[index])
-        self._torques[index] = arm * push + calm + self._friction(close)
+        self._torques[index] = arm * self._push + calm + self._friction(close)
         return self._torques
 
     def _correction(self, wanted: float, contacts: list[Contact]) -> float:

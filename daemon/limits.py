@@ -85,7 +85,7 @@ ROWS: tuple[Row, ...] = (
         by.tip_tilt, _T, True, share=_NEAR),
     Row("tip.tilt", "|θ| against asin(1 − d/a) less a margin", "fault", ("safety.theta_margin",),
         by.tip_tilt, _T, True),
-    Row("tactile.late", "age of the last sound frame: goals stay as they are", "limit",
+    Row("tactile.late", "age of the last sound frame: nothing is moved on", "limit",
         ("safety.frame_age_hold",), needs=_T, gripping=True),
     Row("tactile.silent", "age of the last sound frame", "fault",
         ("safety.frame_age_fault", "safety.frame_age_action"), by.frames_silent, _T, True,

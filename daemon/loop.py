@@ -239,7 +239,9 @@ class Loop:
             self._follow(self._task)
         state.mode = control.mode
         self._judge()
-        if not self._safety.must_hold(state):
+        if self._safety.must_hold(state):
+            control.coast(state.goal)
+        else:
             control.step(self.period, state.goal)
         for event in control.events:
             self.emit(*event)

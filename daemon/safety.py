@@ -207,7 +207,7 @@ class Safety:
         return ""
 
     def must_hold(self, state: State) -> bool:
-        """Frames are late: the goals stay as they are until one comes or a fault latches."""
+        """Frames are late: nothing is moved on until one comes or a fault latches."""
         if not self._has_sensors:
             return False
         oldest = state.t - self._hold_age

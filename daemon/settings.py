@@ -225,7 +225,7 @@ class Safety(Section):
     d_max: Length = 0.012  # m
     theta_margin: Annotated[float, Field(ge=0, le=1)] = 0.05  # rad kept from the domain's limit
     velocity_max: Positive = 6.0  # rad/s
-    frame_age_hold: Positive = 3.0  # frame periods: goals freeze
+    frame_age_hold: Positive = 3.0  # frame periods: nothing is moved on
     frame_age_fault: Positive = 10.0  # frame periods: fault
     frame_age_action: Literal["torque off", "open"] = "torque off"  # open: first, then the fault
     goal_reach: Positive = 0.5  # rad off the present angle within which a goal may jump

@@ -196,11 +196,34 @@ def test_frames_that_stop_coming_latch_a_fault(make: Make) -> None:
         daemon.loop.advance(daemon.loop.period)
         if daemon.clock.now() - perception.frame.t_arrival > 4.5 * 0.01:  # type: ignore[union-attr]
             held = list(daemon.loop.state.goal.current)
-            assert goal is None or held == goal, "goals moved on without frames"
-            goal = held
+            goal = held if goal is None else goal
+            # The grip damps its joints on: that is less than a count of current.
+            assert held == pytest.approx(goal, abs=2.5e-3), "goals moved on without frames"
     assert goal is not None
     assert daemon.loop.state.fault.startswith("tactile: no frame for 0.1")
     assert not daemon.loop.state.torque
+
+
+@pytest.mark.parametrize("rate", [25.0, 100.0])
+def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(
+    make: Make, rate: float
+) -> None:
+    daemon = grasped(make(tactile={"rate": rate}), 8.0)
+    command(daemon, "rotate", angle=0.26)
+    daemon.loop.advance(0.1)
+    assert daemon.hand is not None
+    for perception in daemon.loop.perceptions:
+        last = perception.sensor.latest()
+        perception.sensor.latest = lambda last=last: last  # type: ignore[method-assign]
+    until_held = (daemon.settings.safety.frame_age_hold + 1.0) / rate
+    daemon.loop.advance(until_held)
+    assert daemon.loop._safety.limited["tactile.late"]
+    begun = daemon.hand.object_pose[2]
+    daemon.loop.advance(1.0)
+    assert daemon.loop.state.fault_name == "tactile.silent", "and no tip went past its limits"
+    turned = daemon.hand.object_pose[2]
+    assert turned < 0.26 + 0.01
+    assert turned - begun < 0.1
 
 
 def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
