@@ -324,6 +324,8 @@ def fit_law(
     ):
         if depth <= 0.0:
             continue
+        if depth > tip.radius:
+            raise CalibrationError(f"modulus: d = {depth:g} m is more than the tip's radius")
         strain = grid.pressure(tip, unit, float(depth), float(tilt))
         inside = tells & (strain > 0.0)
         strains.append(strain[inside])

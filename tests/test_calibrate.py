@@ -297,3 +297,32 @@ def test_a_file_is_written_whole_or_not_at_all(bench, tmp_path):
     with pytest.raises(CalibrationFileError, match="can't be written"):
         save_calibration(tmp_path / "taken.json", calibration)
     assert not (tmp_path / "taken.json.new").exists()
+
+
+@pytest.mark.parametrize(
+    ("step", "known", "told"),
+    [
+        ("curve", {"d": [0.002, 0.03]}, "d: 30 mm is more than the tip's radius, 20 mm"),
+        ("modulus", {"d": [0.002, 0.03]}, "d: 30 mm is more than the tip's radius, 20 mm"),
+        ("modulus", {"d": [0.002, 0.004], "theta": [0.0, -1.6]}, "theta: 91.6732° is no tilt"),
+        ("modulus", {"d": [-0.001, 0.0]}, "no frame with d above 0"),
+        ("centre", {"words": ["--theta", "nan"]}, "theta: a value that is not finite"),
+        ("curve", {"words": ["--d", "inf"]}, "d: a value that is not finite"),
+    ],
+)
+def test_what_no_press_can_be_is_refused_in_a_line(step, known, told, tmp_path, capsys):
+    words = known.pop("words", [])
+    (tmp_path / "profile.toml").write_text(PROFILE)
+    path = tmp_path / "run.npz"
+    np.savez(path, frames=MadeUp().press(0.003, frames=2), **known)
+    file = tmp_path / "sensor.json"
+    given = ["--config", str(tmp_path / "profile.toml"), "--recording", str(path), *words]
+    assert main(["calibrate", step, str(file), *given, "--no-plot"]) == 1
+    assert told in capsys.readouterr().err
+    assert not file.exists()
+
+
+def test_no_frames_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["calibrate", "tare", str(tmp_path / "sensor.json"), "--frames", "0"])
+    assert "expected at least one frame" in capsys.readouterr().err

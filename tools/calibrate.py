@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recording", type=Path, nargs="+", default=[], metavar="R", help="instead of the sensor"
     )
-    parser.add_argument("--frames", type=int, default=64, help="live frames a load (default 64)")
+    parser.add_argument(
+        "--frames", type=_frames, default=64, help="live frames a load (default 64)"
+    )
     parser.add_argument(
         "--loads", type=int, default=0, help="equilibrate: how many pressures, live"
     )
@@ -89,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         draw = _drawer(arguments)
         calibration = _begin(arguments, settings)
         loads = gather(arguments, settings, calibration)
+        _check(loads, settings.tip.radius)
         calibration, line, picture = _STEP[arguments.step](arguments, settings, calibration, loads)
         save_calibration(arguments.file, calibration)
         print(f"{arguments.step}: {line}; written to {arguments.file}")
@@ -109,6 +112,35 @@ def _speed(text: str) -> float:
     if not 0.0 < value <= 1000.0:
         raise argparse.ArgumentTypeError(f"expected mm/s above 0, found {text}")
     return value
+
+
+def _frames(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected at least one frame, found {text}")
+    return value
+
+
+def _check(loads: Loads, radius: float) -> None:
+    """Raise CalibrationError for no loads, and for what is known of them and can't be."""
+    import math
+
+    import numpy as np
+
+    from kinematics.calibration import CalibrationError
+
+    truths = loads.truths
+    if not loads.frames:
+        raise CalibrationError("no frame with d above 0 in this run")
+    for name, values in truths.items():
+        if not np.isfinite(values).all():
+            raise CalibrationError(f"{name}: a value that is not finite")
+    if "d" in truths and (deepest := float(truths["d"].max())) > radius:
+        raise CalibrationError(
+            f"d: {deepest * 1e3:g} mm is more than the tip's radius, {radius * 1e3:g} mm"
+        )
+    if "theta" in truths and (most := float(np.abs(truths["theta"]).max())) >= 0.5 * math.pi:
+        raise CalibrationError(f"theta: {math.degrees(most):g}° is no tilt of a press")
 
 
 def _drawer(arguments: argparse.Namespace) -> Any:
