@@ -603,3 +603,10 @@ def test_an_adapters_latency_timer(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["emulate", "--dir", str(tmp_path), "--latency", "-1"])
     assert "expected 0 to 255 ms" in capsys.readouterr().err
+
+
+def test_an_object_that_slipped_away_is_put_back(tmp_path: Path) -> None:
+    with thread(tmp_path) as made:
+        made.hand.object_pose[:] = 0.07, 0.02, 1.2
+        assert made.tell("place report").startswith("{")
+        until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))

@@ -27,6 +27,8 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
 
 softfinger emulate --dir DIR --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
 
+the object, where it slipped away: --send place puts it back, at rest.
+
 what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
 begins the record anew, --send "report forget" does both without a gap:
   t, monotonic     the hand's time now [s], and time.monotonic() then

@@ -34,7 +34,7 @@ from daemon.simulation.tactile_board import BoardFault, TactileBoard
 from daemon.tactile.simulated import SimulatedTactile
 
 _STEP = 0.002  # s, longest that the physics lags behind
-_ASKS = ("report", "forget")  # words to the control socket that are no fault
+_ASKS = ("report", "forget", "place")  # words to the control socket that are no fault
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
 # The board that stands in where a profile names none: that of config/hil.toml.
 DEFAULT_BOARD = {
@@ -141,6 +141,7 @@ class Emulator:
         table_cache: Path | None,
     ) -> None:
         self.clock = EmulatorClock()
+        self._simulation = settings.simulation
         table = make_table(settings, make_material(settings.material), table_cache)
         self.hand = SimulatedHand(settings, 0.0, table)
         self._servos: PtyServoBus | None = None
@@ -261,7 +262,8 @@ class Emulator:
         """Take words from the control socket; ``ok``, or ``error: `` and why none of them counts.
 
         A time behind a word counts from now. With ``report`` among them the answer is
-        :meth:`report` as JSON; ``forget`` lets the record begin anew.
+        :meth:`report` as JSON; ``forget`` lets the record begin anew; ``place`` puts the object
+        back where it was at the start, at rest.
         """
         words = text.split()
         try:
@@ -272,10 +274,18 @@ class Emulator:
         reply = json.dumps(self.report(now)) if "report" in words else "ok"
         if "forget" in words and self._servos is not None:
             self._servos.bus.forget(now)
+        if "place" in words:
+            self._place()
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
         self._advance_due = now  # so that what starts now does
         return reply
+
+    def _place(self) -> None:
+        simulation = self._simulation
+        self.hand.object_pose[:] = *simulation.object_position, simulation.object_angle
+        self.hand.object_velocity[:] = 0.0
+        self.hand.refresh()
 
     def _told(self, text: str) -> str:
         """:meth:`tell`, with what starts now in force before the reply goes out."""

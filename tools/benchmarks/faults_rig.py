@@ -57,6 +57,7 @@ class Rig:
         self.hand: subprocess.Popen[str] | None = None
         self.daemon: subprocess.Popen[bytes] | None = None
         self.starts = 0  # of the daemon
+        self.placed = 0  # times that the object was put back
         self.start_seconds = 0.0  # that the last one took
         self._states: zmq.Socket[bytes] | None = None
         self._aside: dict[int, float] = {}

@@ -20,6 +20,9 @@ _ASIDE = 0.015  # s between two looks that others took: what is late then is the
 _RESOLUTION = 0.0016  # rad, a count of the servo's
 _CURRENT_UNIT = 0.0027  # A
 _READY_WITHIN = 15.0  # s
+_PLACE_AFTER = 5.0  # s without a grip: the object has slipped away, and is put back
+_TRIPPED = 0.7  # s in which the daemon finds that a servo was stopped
+_TRIES = 5
 _GRIPPING = ("grasping", "holding", "rotating")
 _TURN = 0.08  # rad
 
@@ -53,15 +56,7 @@ def trial(rig: Rig, case: Case, seed: int) -> Trial:
     chance = random.Random(f"{case.name} {seed}")
     found = Trial(seed)
     rig.start()
-    if not ready(rig, chance):
-        _start_anew(rig)
-        if not ready(rig, chance):
-            raise RigError(f"the hand does not grip: {rig.status()}")
-    found.phase = _phase(rig, case, chance)
-    time.sleep(chance.uniform(0.0, 0.02))
-    rig.states(0.0)
-    rig.put_aside()
-    rig.report(forget=True)
+    _grip(rig, case, chance, found)
     with case.inject(rig, chance):
         _look(rig, case, found)
     judge_wire(rig, found)
@@ -77,11 +72,35 @@ def trial(rig: Rig, case: Case, seed: int) -> Trial:
 # --- before and after --------------------------------------------------------------------------
 
 
+def _grip(rig: Rig, case: Case, chance: random.Random, found: Trial) -> None:
+    """A hand that grips, and an empty record. Raises RigError when that can't be had."""
+    for attempt in range(_TRIES):
+        if not ready(rig, chance):
+            if attempt:
+                raise RigError(f"the hand does not grip: {rig.status()}")
+            _start_anew(rig)
+            continue
+        found.phase = _phase(rig, case, chance)
+        time.sleep(chance.uniform(0.0, 0.02))
+        rig.states(0.0)
+        rig.put_aside()
+        # A busy machine may have let a servo's watchdog act already; then once more.
+        if not any(servo["stopped_by_watchdog"] for servo in rig.report(forget=True)["servos"]):
+            return
+        time.sleep(_TRIPPED)
+    raise RigError("the servos' watchdogs stop them again and again")
+
+
 def ready(rig: Rig, chance: random.Random) -> bool:
-    """Clear, arm and grasp until the hand holds; False when it does not."""
-    end = time.monotonic() + _READY_WITHIN
+    """Clear, arm and grasp until the hand holds; False when it does not.
+
+    An object that slipped out of the fingers, or turned over between them, is put back in between,
+    as a person would do.
+    """
+    begin = now = time.monotonic()
+    place = begin + _PLACE_AFTER
     force = chance.uniform(4.0, 9.0)
-    while time.monotonic() < end:
+    while now < begin + _READY_WITHIN:
         if not rig.alive:
             return False
         status = rig.status(2.0)
@@ -89,7 +108,10 @@ def ready(rig: Rig, chance: random.Random) -> bool:
         try:
             if mode == "holding":
                 return True
-            if mode == "fault":
+            if now > place:
+                place = now + _PLACE_AFTER
+                _place(rig)
+            elif mode == "fault":
                 rig.ask({"command": "clear"}, 5.0)
             elif mode == "disarmed":
                 rig.ask({"command": "arm"})
@@ -98,7 +120,20 @@ def ready(rig: Rig, chance: random.Random) -> bool:
         except NoAnswer:
             pass
         time.sleep(0.01)
+        now = time.monotonic()
     return False
+
+
+def _place(rig: Rig) -> None:
+    """Put the object back, between open fingers where they can be opened."""
+    end = time.monotonic() + 2.0
+    if rig.ask({"command": "release"})["ok"]:
+        while (status := rig.status()) and status["mode"] == "releasing":
+            if time.monotonic() > end:
+                break
+            time.sleep(0.01)
+    rig.tell("place")
+    rig.placed += 1
 
 
 def _start_anew(rig: Rig) -> None:
