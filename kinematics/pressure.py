@@ -170,7 +170,7 @@ class SensorGrid:
             <= self.blur
             <= 0.5 * min(self.rows * self.pitches[1], self.cols * self.pitches[0])
         ):
-            raise ValueError(f"blur must be at least 0 and less than the grid, got {self.blur}")
+            raise ValueError(f"blur must be 0 to half the grid's shorter side, got {self.blur}")
 
     @property
     def pitches(self) -> tuple[float, float]:
