@@ -516,6 +516,27 @@ def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(bus: Runnin
     backend.close()
 
 
+def test_a_servo_that_lost_its_power_for_a_moment_is_found(bus: RunningBus) -> None:
+    backend = connected(bus, watchdog=2.0)
+    backend.set_torque(True)
+    goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
+    backend.write(goal)
+    servo = bus.servo(1)
+    bus.call(lambda: servo.reboot(time.monotonic()))
+    begin = time.monotonic()
+
+    def go_on() -> None:
+        while time.monotonic() < begin + 5.0:
+            backend.read(reading)
+            backend.write(goal)
+
+    with pytest.raises(ServoError, match=r"right.*: its bus watchdog is off, as after a reboot"):
+        go_on()
+    backend.set_torque(False)
+    backend.set_torque(True)
+    backend.close()
+
+
 def test_a_port_that_goes_away(bus: RunningBus) -> None:
     backend = connected(bus)
     backend.set_torque(True)

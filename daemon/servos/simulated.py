@@ -115,7 +115,7 @@ class SimulatedServos:
         if self._tripped:
             raise ServoError(
                 "the bus watchdog stopped the simulated servos, since nothing came in time: "
-                "disarm, then arm"
+                "clear, then arm"
             )
         for joint in self._joints:
             scale = self._scales[joint]

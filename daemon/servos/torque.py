@@ -187,23 +187,32 @@ class Torque:
     def ask_watchdog_if_quiet(self, t: float) -> None:
         """Where the line was quiet for long, make sure that no servo's watchdog has stopped it.
 
-        It is asked now and then all the same: what was sent in time may have been held up below.
+        It is asked now and then all the same: what was sent in time may have been held up below,
+        and a servo may have lost its power for less time than silence is borne.
 
         Raises:
-            ServoError: one has.
+            ServoError: one has, or is no longer armed.
         """
         quiet = self._was_quiet or t - self._last_sent > self._quiet_limit
         if not quiet and t < self._next_ask:
             return
         self._next_ask = t + self._ask_every
+        unknown = False
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.BUS_WATCHDOG, 1)
-            if raw is not None and raw[0] == reg.WATCHDOG_ERROR:
+            if raw is None:
+                unknown = True
+            elif raw[0] == reg.WATCHDOG_ERROR:
                 raise ServoError(
                     f"{joint.name}: its bus watchdog stopped it, since no packet came in time: "
-                    "disarm, then arm"
+                    "clear, then arm"
                 )
-        self._was_quiet = False
+            elif raw[0] != self._ticks:
+                raise ServoError(
+                    f"{joint.name}: its bus watchdog is off, as after a reboot: check its supply, "
+                    "then clear and arm"
+                )
+        self._was_quiet = quiet and unknown
         self._last_sent = time.monotonic()
 
     # --- verified writes ---------------------------------------------------------------------
