@@ -241,7 +241,14 @@ class Converter:
             return None, 1.0
         step = max(self._full / _TABLE_STEPS, 1.0)
         x = step * np.arange(int(largest / step) + 2)
-        return np.asarray(factor * x**exponent, np.float64), 1.0 / step
+        with np.errstate(over="ignore", invalid="ignore"):
+            table = np.asarray(factor * x**exponent, np.float64)
+        if not np.isfinite(table).all():
+            raise CalibrationFileError(
+                f"calibration: its curve {factor:g}·x^{exponent:g} has no number of Pa for "
+                f"x = {largest:g}"
+            )
+        return table, 1.0 / step
 
     def readings(self, counts: FloatArray) -> FloatArray:
         """x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
