@@ -46,7 +46,7 @@ class View:
         self.frames = frames  # what each finger's newest frame alone says
         self.sensors = sensors
         self.frame_period = 1.0 / settings.tactile.rate
-        self.no_number = False  # the last goal was none
+        self.no_number = False  # a goal was none since the last judgement
         self.grip_width = math.nan  # of the object when it was gripped [m]
         self.seen: list[Frame | None] = [None, None]
         self.changed = [0.0, 0.0]  # when a frame last differed from the one before it [s]
@@ -355,5 +355,4 @@ def overrunning(view: View, state: State, _: float) -> str:
 
 
 def no_number(view: View, _: State, __: float) -> str:
-    found, view.no_number = view.no_number, False
-    return "control: a goal was no number" if found else ""
+    return "control: a goal was no number" if view.no_number else ""

@@ -69,6 +69,8 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     name = request["command"]
     if name not in COMMANDS:
         raise Refused(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
+    if name == "stop":  # which stops, whatever else the message holds
+        return Command(name, {}, "")
     client = request.get("client", "")
     if not isinstance(client, str) or len(client) > 64:
         raise Refused("client: expected a text of at most 64 characters")

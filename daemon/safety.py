@@ -131,6 +131,7 @@ class Safety:
             for watch in self._each_tick:
                 self._look(watch, state)
                 self._busy = self._busy or watch.told or watch.since < math.inf
+            self._view.no_number = False
         self._turn = (self._turn + 1) % len(self._in_turn) if self._in_turn else 0
         if self._in_turn:
             self._look(self._in_turn[self._turn], state)

@@ -226,6 +226,20 @@ def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(
     assert turned - begun < 0.1
 
 
+def test_a_goal_that_is_no_number_is_a_fault_though_a_command_was_refused_for_it(
+    make: Make,
+) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    daemon.loop.state.goal.q[0] = math.nan
+    daemon.loop._safety.bound(daemon.loop.state)
+    assert "a goal was no number" in refusal(daemon, "grasp")
+    daemon.loop.advance(daemon.loop.period)
+    assert daemon.loop.state.fault_name == "goal.number"
+    command(daemon, "clear")
+
+
 def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
     daemon = make()
     command(daemon, "arm")
