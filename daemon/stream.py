@@ -22,7 +22,16 @@ from daemon.statistics import Statistics
 
 _CHANGES = 16  # subscriptions taken in at a time; more wait for the next look
 _KEPT = 50  # events that a late subscriber is told
-_LONGEST_TOPIC = 64  # bytes; whoever subscribes to more gets nothing
+_TOPICS = (
+    messages.STATE,
+    messages.TACTILE,
+    messages.STATS,
+    messages.INPUT,
+    messages.TRUTH,
+    messages.EVENT,
+    messages.COMMAND,
+    messages.SETTINGS,
+)
 
 
 class Publisher:
@@ -52,9 +61,8 @@ class Publisher:
             if not self._bound.readable():
                 break
             change = self._socket.recv(zmq.NOBLOCK)
-            if len(change) > _LONGEST_TOPIC:
-                continue
-            if change[:1] == b"\x01":
+            # What is the beginning of no topic is not kept: there may be any number of it.
+            if change[:1] == b"\x01" and any(each.startswith(change[1:]) for each in _TOPICS):
                 self._subscriptions.add(change[1:])
                 self._owe(change[1:])
             elif change[:1] == b"\x00":  # else no subscription at all: not every socket is a SUB

@@ -13,7 +13,8 @@ from pathlib import Path
 
 UNIT = "softfinger.service"
 RULES = "70-softfinger.rules"
-_WATCHDOG = 2  # s without a tick after which systemd ends the daemon
+# s without a tick after which systemd ends the daemon: `clear` and `arm` may wait for two boards.
+_WATCHDOG = 10
 _EPILOG = """\
 Without --to it only prints. To install:
   sudo softfinger install-service --config /etc/softfinger/hand.toml --user $USER \\
