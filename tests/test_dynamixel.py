@@ -22,7 +22,7 @@ from daemon.records import Goal, Reading
 from daemon.servos import port as port_module
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
-from daemon.servos.checks import check_latency
+from daemon.servos.checks import check_latency, check_servo
 from daemon.servos.dynamixel import DynamixelServos
 from daemon.servos.groups import GroupRead
 from daemon.servos.models import by_name, by_number
@@ -133,6 +133,21 @@ def test_everything_wrong_is_told_at_once_with_what_mends_it(
     assert all("softfinger doctor --fix" in line for line in lines)
     assert "servo 1 (left)" in text
     assert "servo 2 (right)" in text
+
+
+def test_a_drive_mode_that_stiffens_with_any_goal_is_refused(bus: RunningBus) -> None:
+    memory = bus.servo(1).table.memory
+    bus.call(lambda: memory.__setitem__(reg.DRIVE_MODE, 0b1000))
+    text = refusal(bus)
+    assert "servo 2 (right): drive mode 8 switches torque on with any goal" in text
+    table = bytes(memory)
+    assert check_servo("s", by_name("XM430-W350"), table, profile(bus.path), 1).errors
+    bus.call(lambda: memory.__setitem__(reg.DRIVE_MODE, 0b0001))  # reversed: used, and told
+    backend = connected(bus)
+    backend.close()
+    findings = check_servo("s", by_name("XM430-W350"), bytes(memory), profile(bus.path), 1)
+    assert findings.errors == ()
+    assert any("drive mode is reversed" in line for line in findings.notices)
 
 
 def test_one_missing_servo_is_named(bus: RunningBus) -> None:

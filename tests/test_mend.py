@@ -91,6 +91,16 @@ def test_torque_goes_off_and_mute_servos_speak_again(running: Callable[..., Runn
     assert bus.memory(1)[reg.STATUS_RETURN_LEVEL] == 2
 
 
+def test_a_drive_mode_that_stiffens_with_any_goal_is_mended(
+    running: Callable[..., RunningBus],
+) -> None:
+    bus = running()
+    memory = bus.servo(0).table.memory
+    bus.call(lambda: memory.__setitem__(reg.DRIVE_MODE, 0b1001))
+    assert mend(profile(bus)) == ["servo 1 (left): drive mode 9 → 1"]
+    assert bus.memory(0)[reg.DRIVE_MODE] == 1
+
+
 def test_what_can_not_be_mended_is_told_with_what_was(running: Callable[..., RunningBus]) -> None:
     bus = running(prepared=False)
     bus.fault("silent=2")

@@ -17,6 +17,9 @@ from daemon.settings import Settings
 
 # Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
 RETURN_DELAY_MAX = 25
+# Drive mode: a second servo follows this one's; any goal that is written switches the torque on.
+DRIVE_UNFIT = 0b1010
+DRIVE_REVERSE = 0b0001
 MEND = "`softfinger doctor --fix`"
 WATCHDOG_FIRMWARE = 38
 # rad beyond the hand's limits at which a joint's angle is not believed: a wrong zero, or a servo
@@ -73,6 +76,12 @@ def check_servo(
         errors.append(
             f"{name}: operating mode is {reg.MODE_NAMES.get(mode, str(mode))} ({mode}), not "
             f"{reg.MODE_NAMES[wanted]} ({wanted}): {MEND}"
+        )
+    drive = table[reg.DRIVE_MODE]
+    if drive & DRIVE_UNFIT:
+        errors.append(
+            f"{name}: drive mode {drive} switches torque on with any goal, or has it follow "
+            f"another servo: {MEND}"
         )
     delay = table[reg.RETURN_DELAY_TIME]
     if delay > RETURN_DELAY_MAX:
@@ -133,6 +142,8 @@ def _check_range(
 
 def _notices(name: str, model: ServoModel, table: bytes, firmware: int) -> list[str]:
     notices = []
+    if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
+        notices.append(f"{name}: its drive mode is reversed; servos.direction comes on top of that")
     if table[reg.TORQUE_ENABLE]:
         notices.append(f"{name}: torque is on already; it stays so until disarm or arm")
     if table[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:

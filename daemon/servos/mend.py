@@ -12,7 +12,7 @@ import time
 from daemon.records import FINGERS
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
-from daemon.servos.checks import RETURN_DELAY_MAX
+from daemon.servos.checks import DRIVE_UNFIT, RETURN_DELAY_MAX
 from daemon.servos.examine import servo_name
 from daemon.servos.identity import Change, Plan, plan
 from daemon.servos.line import ServoLine
@@ -184,6 +184,9 @@ def _mend_one(
     now = table[reg.OPERATING_MODE]
     if mode is not None and now != mode:
         wanted.append((reg.OPERATING_MODE, mode, f"operating mode {now}"))
+    drive = table[reg.DRIVE_MODE]
+    if drive & DRIVE_UNFIT:
+        wanted.append((reg.DRIVE_MODE, drive & ~DRIVE_UNFIT, f"drive mode {drive}"))
     delay = table[reg.RETURN_DELAY_TIME]
     if delay > RETURN_DELAY_MAX:
         wanted.append((reg.RETURN_DELAY_TIME, 0, f"return delay {delay}"))
