@@ -406,9 +406,10 @@ full_count = {full}
     with thread(tmp_path / "hand", settings=settings):
         sensor = make_sensor(settings, RealClock(), None, 0)
         sensor.open()
-        until(lambda: sensor.latest().data.max() > 40)
+        frames = [sensor.latest().data]
+        until(lambda: (frames.append(sensor.latest().data), frames[-1].max() > 200)[1])
         estimator = make_estimator(settings, make_material(settings.material))
-        estimate = estimator.update(sensor.latest().data, 200.0)
+        estimate = estimator.update(frames[-1], 200.0)
         assert estimate.valid
         assert estimate.contact
         assert 3e-4 < estimate.d < 8e-3

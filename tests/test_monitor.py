@@ -169,7 +169,7 @@ def test_beside_another_commander_of_a_real_daemon(
     where = ["--state", stream, "--commands", commands]
     with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
         page.shows("DISARMED", "running, disarmed")  # told before the page was there
-        page.shows("p99", "25.0", "°C")
+        page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook") as hand:
             hand.arm()
             page.shows("ARMED", "notebook commands the hand")
