@@ -26,7 +26,7 @@ from daemon.simulation.control_port import NoEmulator, send_words
 
 PROFILE = Path(__file__).resolve().parents[2] / "config" / "hil.toml"
 SOFTFINGER = (sys.executable, "-m", "tools.cli")
-_PATIENCE = 60.0  # s for a process to be ready: kernels may be new
+_PATIENCE = 120.0  # s for a process to be ready: kernels may be new
 _STATE_RATE = 250.0  # Hz
 _LOOK = 0.003  # s between two looks at the hand
 _SCHEDSTAT = 80  # bytes
@@ -86,7 +86,11 @@ class Rig:
         self.daemon = daemon
         self.starts += 1
         while self.status() is None:
-            if daemon.poll() is not None or time.monotonic() > begin + _PATIENCE:
+            if daemon.poll() is not None:
+                return False
+            if time.monotonic() > begin + _PATIENCE:
+                daemon.kill()
+                daemon.wait()
                 return False
         self.start_seconds = time.monotonic() - begin
         return True
