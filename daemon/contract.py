@@ -72,6 +72,19 @@ _STATE = (
     Field("compute_s", "float", "s", "work of the last tick"),
     Field("wake_late_s", "float", "s", "this tick's start after its deadline"),
     Field("overruns", "int", "", "ticks whose work outlasted the period"),
+    Field(
+        "goal_force",
+        "float",
+        "N",
+        "the tips' mean force that the grip goes to: what was asked for, or more where the tips "
+        "would slip; no number without a grip",
+    ),
+    Field(
+        "goal_angle",
+        "float",
+        "rad",
+        "the object's angle that the grip turns to or keeps; no number where it keeps none",
+    ),
     *(
         part._replace(name=f"{finger}.{part.name}", meaning=f"{finger} finger: {part.meaning}")
         for finger in FINGERS

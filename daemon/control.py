@@ -230,6 +230,7 @@ class Control:
         """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
         goal.valid = self.torque
         if not self.torque:
+            goal.force = goal.angle = math.nan
             return
         mode = self.mode
         if mode is Mode.MOVING or mode is Mode.RELEASING:
@@ -244,6 +245,18 @@ class Control:
             for index in self._fingers:
                 goal.q[index] = self._ways[index].value
                 goal.current[index] = bound
+        self._tell_goal(goal)
+
+    def _tell_goal(self, goal: Goal) -> None:
+        """What the grip goes to, for those who look on; nothing here follows it."""
+        grip = self._grip
+        goal.force = goal.angle = math.nan
+        if self._gripping:
+            goal.force = grip.force.target
+            if grip.steering:
+                goal.angle = grip.angle.target
+        elif self.mode is Mode.GRASPING:
+            goal.force = self._force
 
     def coast(self, goal: Goal) -> None:
         """In the place of `step` while frames are late: goals stay as they are.

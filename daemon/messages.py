@@ -128,6 +128,8 @@ def state_message(state: State, scene: Parts, step: int = 1) -> dict[str, Any]:
         "compute_s": timing.compute_s,
         "wake_late_s": timing.wake_late_s,
         "overruns": timing.overruns,
+        "goal_force": state.goal.force,
+        "goal_angle": state.goal.angle,
         "left": left,
         "right": right,
         "object": {

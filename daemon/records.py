@@ -87,6 +87,8 @@ class Goal:
     valid: bool = False
     q: list[float] = field(default_factory=_pair)  # goal angle [rad]
     current: list[float] = field(default_factory=_pair)  # bound on the current's magnitude [A]
+    force: float = math.nan  # mean force of the tips that the grip goes to [N], NaN without a grip
+    angle: float = math.nan  # the object's angle that the grip keeps [rad], NaN where it keeps none
 
 
 @dataclass(slots=True)

@@ -446,6 +446,36 @@ def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
     assert daemon.loop.state.mode == "armed"
 
 
+def test_the_state_tells_what_the_grip_goes_to(make: Make) -> None:
+    daemon = make()
+    goal = daemon.loop.state.goal
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert math.isnan(goal.force)
+    command(daemon, "grasp", force=8.0)
+    daemon.loop.advance(0.01)
+    assert goal.force == 8.0
+    assert math.isnan(goal.angle)
+    advance_to(daemon, "holding", 5.0)
+    command(daemon, "rotate", angle=0.1)
+    daemon.loop.advance(0.01)
+    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
+    assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
+    # More than was asked for, since a load would make the tips slip.
+    assert daemon.hand is not None
+    for k in range(1, 101):
+        daemon.hand.push(0.0, 0.12 * k, 0.0)
+        daemon.loop.advance(0.02)
+    assert 9.0 < goal.force <= 18.0
+    daemon.loop.advance(1.0)
+    felt = [contact.force for contact in daemon.loop.state.contacts]
+    assert sum(felt) / 2.0 == pytest.approx(goal.force, rel=0.03)
+    command(daemon, "release")
+    daemon.loop.advance(0.01)
+    assert math.isnan(goal.force)
+    assert math.isnan(goal.angle)
+
+
 def test_an_angle_beyond_the_grip_is_refused(make: Make) -> None:
     daemon = grasped(make(), 8.0)
     with pytest.raises(Refused, match=r"found 0\.6 rad, expected -0\.\d\d to 0\.\d\d in this grip"):
