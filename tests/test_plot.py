@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -129,13 +130,30 @@ def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: Run, path: Pat
 def test_time_page_shows_force_at_its_target(run: Run) -> None:
     figure = drawn(run, "time")
     said = texts(figure)
-    for part in ("force F [N]", "energy U [mJ]", "displacement d [mm]", "rotating", "asked for"):
+    for part in ("force F [N]", "energy U [mJ]", "displacement d [mm]", "rotating", "goal"):
         assert part in said
     (t, force) = lines(figure, "left")[0]
     at = np.searchsorted(t, 1.35)
     assert force[at] == pytest.approx(6.0, rel=0.05)
-    assert lines(figure, "asked for")[0][1][at] == 6.0
+    assert lines(figure, "goal")[0][1][at] == 6.0
+    assert not lines(figure, "asked for")  # it was what the hand went to
     assert np.isnan(force[0])  # nothing is drawn where nothing touches
+
+
+def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: Run) -> None:
+    states = dict(run.states)
+    asked = run.target_force()
+    raised = (run.t > 1.3) & (run.t < 1.5)
+    states["goal_force"] = np.where(raised, 1.4 * asked, asked)
+    figure = drawn(replace(run, states=states), "time")
+    (t, goal), (_, wanted) = lines(figure, "goal")[0], lines(figure, "asked for")[0]
+    at = np.searchsorted(t, 1.4)
+    assert (goal[at], wanted[at]) == (pytest.approx(8.4), 6.0)
+    assert np.isnan(wanted[np.searchsorted(t, 1.2)])
+    # Recordings from before the hand told its goal show what it was asked for.
+    states["goal_force"] = np.full_like(asked, np.nan)
+    figure = drawn(replace(run, states=states), "time")
+    assert lines(figure, "asked for")[0][1][at] == 6.0
 
 
 def test_model_page_has_points_on_the_models_curves(run: Run) -> None:

@@ -235,7 +235,7 @@ def test_what_is_wanted_follows_the_commands() -> None:
     def told(command: str, ok: bool = True, **numbers: float) -> tuple[float, float]:
         request = json.dumps({"command": command, **numbers})
         wanted.take({"command": command, "request": request, "ok": ok, "error": ""}, hand)
-        return wanted.force("holding"), wanted.angle("rotating")
+        return wanted.of({"mode": "holding"})
 
     assert np.isnan(told("arm")).all()
     assert told("grasp") == (
@@ -246,10 +246,13 @@ def test_what_is_wanted_follows_the_commands() -> None:
     assert told("rotate", angle=0.1) == (8.0, 0.1)
     assert told("grasp", ok=False, force=2.0) == (8.0, 0.1)
     assert told("set", compliance=0.1) == (8.0, 0.1)
-    assert math.isnan(wanted.force("disarmed"))
+    assert np.isnan(wanted.of({"mode": "disarmed"})).all()
+    # A state that tells it knows better: the grip raised by itself, a turn that ended early.
+    state = {"mode": "holding", "goal_force": 9.5, "goal_angle": 0.07}
+    assert wanted.of(state) == (9.5, 0.07)
     assert np.isnan(told("release")).all()
     wanted.take({"command": "grasp", "request": "{", "ok": True}, hand)
-    assert math.isnan(wanted.force("holding"))
+    assert math.isnan(wanted.of({"mode": "holding"})[0])
 
 
 def test_statistics_as_a_table() -> None:

@@ -40,6 +40,7 @@ _FINGER = (
     *("d", "theta", "force", "energy", "d_std", "theta_std", "gain"),
 )
 _OBJECT = ("valid", "angle")
+_SINCE = ("goal_force", "goal_angle")  # older recordings have none
 _TRUE = ("d", "theta", "force")
 _TRUE_OBJECT = ("angle",)
 _GAP = 0.1  # s without a state, at least, over which no line is drawn
@@ -102,6 +103,14 @@ class Run:
         """Where the hand closes on, holds or turns an object."""
         return np.isin(self.modes, [MODES.index(mode) for mode in GRIPS])
 
+    def goal_force(self) -> FloatArray:
+        """What the grip went to [N]: what was asked for, or more where the tips would slip."""
+        return self.states["goal_force"]
+
+    def goal_angle(self) -> FloatArray:
+        """The angle that the grip turned to or kept [rad], as the hand went by it."""
+        return self.states["goal_angle"]
+
     def target_force(self) -> FloatArray:
         """The force asked for by the last ``grasp`` while its grip lasts [N], else NaN."""
         default = math.nan if self.settings is None else self.settings.control.force_default
@@ -161,7 +170,7 @@ def load_run(
     progress: Callable[[int], None] | None = None,
 ) -> Run:
     """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
-    states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT})
+    states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT}, _SINCE)
     truth = _Columns(("seq", "mono_ns"), {**dict.fromkeys(FINGERS, _TRUE), "object": _TRUE_OBJECT})
     modes, faults, commands = array("q"), [], []
     stats: dict[str, Any] | None = None
@@ -217,10 +226,15 @@ def _model(
 class _Columns:
     """Maps of one kind into one array a field. A map that is not of that kind is passed over."""
 
-    def __init__(self, own: Iterable[str], nested: dict[str, tuple[str, ...]]) -> None:
+    def __init__(
+        self, own: Iterable[str], nested: dict[str, tuple[str, ...]], since: tuple[str, ...] = ()
+    ) -> None:
+        """``since`` are fields that older recordings lack: NaN there."""
         self._own = tuple(own)
         self._nested = nested
+        self._since = since
         self.names = [*self._own, *(f"{part}.{name}" for part in nested for name in nested[part])]
+        self.names += since
         self._values = array("d")
         self.count = 0
 
@@ -231,6 +245,7 @@ class _Columns:
             for part, names in self._nested.items():
                 inner = message[part]
                 row += [float(inner[name]) for name in names]
+            row += [float(message.get(name, math.nan)) for name in self._since]
         except (KeyError, TypeError, ValueError):
             return False
         self._values.extend(row)

@@ -47,6 +47,9 @@ _JOINT = (
 )
 
 
+_OTHER = 0.01  # of what was asked for: a goal that differs by more is another one
+
+
 def draw_time(run: Run) -> Figure:
     """Force, energy, displacement and the object's angle over time, with the targets."""
     run.need_contact()
@@ -57,14 +60,26 @@ def draw_time(run: Run) -> Figure:
             _line(panel, run, shown, label=finger, **LINES[finger])
         panel.set_ylabel(f"{name} [{unit}]")
         panel.set_ylim(bottom=0.0)
-    _line(panels[0], run, run.target_force(), label="asked for", **TARGET)
+    _targets(panels[0], run, run.goal_force(), run.target_force())
     sound = run.states["object.valid"] > 0.0
     angle = np.where(sound, run.states["object.angle"] * DEGREES, np.nan)
     _line(panels[3], run, angle, color=style.KINDS[2], label="object")
-    _line(panels[3], run, run.target_angle() * DEGREES, **TARGET)
+    _targets(panels[3], run, run.goal_angle() * DEGREES, run.target_angle() * DEGREES)
     panels[3].set_ylabel("object's angle φ [°]")
     _finish(figure, run, strip, panels)
     return figure
+
+
+def _targets(panel: Axes, run: Run, goal: FloatArray, asked: FloatArray) -> None:
+    """What the hand went to, and where that is not what it was asked for, that as well."""
+    if not np.isfinite(goal).any():
+        _line(panel, run, asked, label="asked for", **TARGET)
+        return
+    _line(panel, run, goal, label="goal", **TARGET)
+    other = np.where(np.abs(asked - goal) > _OTHER * np.abs(asked), asked, np.nan)
+    if np.isfinite(other).any():
+        look = {"color": style.GREY, "linestyle": (0, (6, 2)), "linewidth": 0.9}
+        _line(panel, run, other, label="asked for", **look)
 
 
 def draw_joints(run: Run) -> Figure:

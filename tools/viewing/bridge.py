@@ -113,9 +113,8 @@ class Bridge:
         newest = self._newest or self._state
         if newest is not None and number(message, "seq") < number(newest, "seq"):
             self._forget()
-        mode = text(message, "mode")
         self.dropped += len(self._states) == self._states.maxlen
-        self._states.append((message, self._wanted.force(mode), self._wanted.angle(mode)))
+        self._states.append((message, *self._wanted.of(message)))
         self._newest = message
         self._waited += 1
         self._time = when

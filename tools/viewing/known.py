@@ -77,9 +77,10 @@ def _drop(sections: object, place: list[str]) -> bool:
 
 
 class Wanted:
-    """What the hand was last told to reach: force [N] on each tip, angle [rad] of the object.
+    """What the hand goes to: force [N] of the tips, angle [rad] of the object.
 
-    From ``hand/command``; NaN while nothing is wanted.
+    What the state tells; where an older daemon's does not, what was last commanded. NaN while
+    nothing is wanted.
     """
 
     def __init__(self) -> None:
@@ -104,10 +105,10 @@ class Wanted:
         elif command not in ("set", "tare", "status"):
             self._force = self._angle = math.nan
 
-    def force(self, mode: str) -> float:
-        """The wanted force in ``mode``."""
-        return self._force if mode in _GRIPPING else math.nan
-
-    def angle(self, mode: str) -> float:
-        """The wanted angle in ``mode``."""
-        return self._angle if mode in _GRIPPING else math.nan
+    def of(self, state: dict[str, Any]) -> tuple[float, float]:
+        """The wanted force and angle at a state."""
+        if "goal_force" in state:
+            return number(state, "goal_force"), number(state, "goal_angle")
+        if text(state, "mode") in _GRIPPING:
+            return self._force, self._angle
+        return math.nan, math.nan
