@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import signal
 import subprocess
@@ -153,6 +155,43 @@ def test_keys_command_the_hand(fake: FakeDaemon) -> None:
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
 
 
+SETTINGS = {"control": {"force_default": 10.0}, "safety": {"force_max": 12.5}}
+
+
+def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake: FakeDaemon) -> None:
+    def asked() -> list[object]:
+        return [each.get("force") for each in fake.requests]
+
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING", "+- 10 N", "grip: goal 10.0 N, object to 5.0°")
+        fake.changes = {"mode": "armed", "goal_force": math.nan, "goal_angle": math.nan}
+        page.shows("ARMED", "+- N")
+        page.type(b"+")
+        page.shows("settings are not known yet")
+        assert "grip:" not in page.text()
+        fake.send(b"hand/settings", msgpack.packb({"settings": json.dumps(SETTINGS)}))
+        page.shows("+- 10 N")
+        page.type(b"++")
+        page.shows("+- 12 N")
+        page.type(b"+")
+        page.shows("+- 12.5 N")  # a fault beyond
+        page.type(b"-" * 9)
+        page.shows("+- 4 N")  # in smaller steps below 5 N
+        assert fake.requests == []
+        page.type(b"g")
+        page.shows("✓ grasp with 4 N: ok")
+        assert asked() == [4.0]
+        # In a grip they count from what it was told, by whomever, and the hand follows at once.
+        fake.changes = {"goal_force": 9.0}
+        page.shows("HOLDING", "+- 9 N")
+        told = {"command": "grasp", "client": "", "request": '{"force": 7.0}', "ok": True}
+        fake.send(b"hand/command", msgpack.packb(told))
+        page.shows("+- 7 N", "raised from 7.0 N")
+        page.type(b"--")
+        page.shows("✓ grasp with 5 N: ok")
+        assert asked() == [4.0, 6.0, 5.0]
+
+
 def test_named_client(fake: FakeDaemon) -> None:
     with TerminalProcess(command(fake, "--client", "bench")) as page:
         page.shows("HOLDING")
@@ -244,7 +283,7 @@ def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
         assert "\x1b" not in text
         assert "left 1" in text
         assert "N 3.21 mm" in text
-        assert "object +5.0°" in text
+        assert "goal 10.0 N  object +5.0°" in text
         assert "tick 500 Hz" in text
         assert any("warning mode: grasping → holding" in line for line in lines)
         plain.terminate()

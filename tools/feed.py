@@ -143,6 +143,9 @@ class Feed:
         self.warm = math.inf  # °C from which a servo's temperature is warned about
         self.commanding: Commanding | None = None
         self._lease = math.nan  # s
+        self.asked = math.nan  # N that the last grasp was told, by whomever
+        self.force_default = math.nan  # N of a grasp that is told none
+        self.force_max = math.inf  # N that is a fault
         self.skipped = 0
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
         self._bin: list[tuple[float, float]] = []
@@ -182,6 +185,7 @@ class Feed:
             self._bin.clear()
             self._period = 0.0
             self.times = self.commanding = None
+            self.asked = math.nan
         elif 0.0 < mono - self._mono < 60.0:
             step = mono - self._mono
             self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
@@ -265,13 +269,20 @@ class Feed:
             by = f" (to {client})" if client else ""
             when = number(record, "timestamp")
             self._happened(Event(when, "warning", "refused", f"{said}{by}"))
-        elif name not in Lease.FREE and self._lease > 0.0:
+            return
+        if name == "grasp":
+            force = number(json.loads(text(record, "request") or "{}"), "force")
+            self.asked = self.force_default if math.isnan(force) else force
+        if name not in Lease.FREE and self._lease > 0.0:
             self.commanding = Commanding(client, now + self._lease)
 
     def _take_settings(self, record: dict[str, Any]) -> None:
         settings = json.loads(text(record, "settings") or "{}")
         self._lease = number(settings, "commands", "lease")
         warm = number(settings, "safety", "temperature_warn")
+        self.force_default = number(settings, "control", "force_default")
+        most = number(settings, "safety", "force_max")
+        self.force_max = math.inf if math.isnan(most) else most
         self.warm = math.inf if math.isnan(warm) else warm
 
     def news(self) -> list[Event]:

@@ -22,8 +22,9 @@ import zmq
 
 from daemon.keys import KeyFileError, load_client
 from tools.arguments import add_keys
-from tools.feed import FINGERS, Feed, field, number, text
+from tools.feed import FINGERS, Feed, number, text
 from tools.feed_sockets import Commander, Subscriber
+from tools.monitor_keys import HandKeys
 from tools.monitor_page import Page
 from tools.terminal import Keys, Terminal, TerminalGone
 
@@ -31,7 +32,6 @@ REDRAW = 1.0 / 15.0  # s between redraws at most
 PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
 PLAIN_LINE = 1.0  # s between plain lines
 PATIENCE = 2.0  # s to wait for a first state with --no-wait
-STEP_ANGLE = math.radians(5.0)  # of the arrow keys
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -39,7 +39,8 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this command's arguments to ``parser``."""
     parser.description = (
-        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it. "
+        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and "
+        "choose the force. "
         "Prints a plain line a second when the output is not a terminal."
     )
     parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
@@ -209,7 +210,7 @@ def _page_loop(
     ending: _Ending,
 ) -> None:
     keys = Keys()
-    hand = _HandKeys(page.feed, commander)
+    hand = HandKeys(page.feed, commander)
     due = time.monotonic()
     while not (ending.over or ending.suspend):
         if ending.wait(due - time.monotonic(), keyboard) and keyboard is not None:
@@ -228,6 +229,7 @@ def _page_loop(
         subscriber.drain(now)
         commander.collect(now)
         ending.watch(page.feed, page.address, now)
+        page.force = hand.force(now)
         width, height = terminal.size()
         terminal.draw(page.lines(width, height, now, commander.reply))
         due = max(due + REDRAW, time.monotonic() + 0.5 * REDRAW)
@@ -238,51 +240,6 @@ def _read(keyboard: int) -> bytes:
         return os.read(keyboard, 1024)
     except OSError:
         return b""
-
-
-class _HandKeys:
-    """What the keys do to the hand."""
-
-    def __init__(self, feed: Feed, commander: Commander) -> None:
-        self._feed = feed
-        self._commander = commander
-        self._target: float | None = None  # of the object's angle [rad]
-
-    def press(self, key: str, now: float) -> None:
-        """Send what ``key`` stands for; other keys do nothing."""
-        if key in ("left", "right"):
-            self._rotate(STEP_ANGLE if key == "right" else -STEP_ANGLE, now)
-            return
-        simple = {
-            "a": ("arm", "arm"),
-            "g": ("grasp", "grasp"),
-            "r": ("release", "release"),
-            "o": ("release", "release"),
-            " ": ("stop", "stop"),
-            "c": ("clear", "clear"),
-            "d": ("disarm", "disarm"),
-        }
-        if key in simple:
-            label, command = simple[key]
-            self._target = None
-            self._commander.send(now, label, command)
-
-    def _rotate(self, step: float, now: float) -> None:
-        """Several presses add up: they count from the last target, not from where it turns."""
-        state, reply = self._feed.state, self._commander.reply
-        refused = reply is not None and not reply.ok
-        turning = text(state, "mode") in ("rotating", "holding")
-        if self._target is None or refused or not turning:
-            known = field(state, "object", "valid") is not False
-            angle = number(state, "object", "angle") if known else math.nan
-            if not math.isfinite(angle):
-                self._target = None
-                self._commander.refuse(now, "rotate: the object's angle is not known")
-                return
-            self._target = angle
-        self._target += step
-        label = f"rotate to {math.degrees(self._target):.1f}°"
-        self._commander.send(now, label, "rotate", angle=self._target)
 
 
 def _run_plain(address: str, subscriber: Subscriber, ending: _Ending) -> None:
@@ -320,6 +277,9 @@ def plain_line(feed: Feed, now: float) -> str:
         d = 1e3 * number(state, name, "d")
         theta = math.degrees(number(state, name, "theta"))
         parts.append(f"{name} {_number(force, 2)} N {_number(d, 2)} mm {_number(theta, 1, '+')}°")
+    goal = number(state, "goal_force")
+    if math.isfinite(goal):
+        parts.append(f"goal {_number(goal, 1)} N")
     angle = math.degrees(number(state, "object", "angle"))
     parts.append(f"object {_number(angle, 1, '+')}°")
     tick = feed.statistics(now)

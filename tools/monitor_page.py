@@ -20,6 +20,7 @@ from tools import heatmap
 from tools.feed import FINGERS, SCHEMA, Feed, TickStatistics, number, text
 from tools.feed import field as value_at
 from tools.feed_sockets import Reply
+from tools.monitor_keys import key_line
 from tools.typeset import (
     DIM,
     PLAIN,
@@ -44,13 +45,13 @@ CENTRE = 34  # columns of the numbers
 MAP_LINES = 11  # of each map at the least size
 OLD = 1.0  # s after which a frame on the page is called old
 REPLY_TIME = 12.0  # s a reply stays
+_RAISED = 1.01  # of what was asked for: told as raised
 
 BOLD = Style(bold=True)
 GOOD = Style(color="#1fa883")
 WARN = Style(color="#e69f00")
 BAD = Style(color="#ff6a3d", bold=True)
 ALARM = Style(color="#ffffff", bgcolor="#b8360b", bold=True)
-KEY = Style(bold=True, color="#56b4e9")
 SIDE = {"left": Style(color="#56b4e9", bold=True), "right": Style(color="#e69f00", bold=True)}
 
 _BADGES = {
@@ -86,6 +87,7 @@ class Page:
     address: str
     depth: heatmap.Depth = "any"
     keys: bool = True  # a keyboard is there
+    force: float = math.nan  # N that the key for it grasps with
     _pressure: heatmap.FullScale = field(
         default_factory=lambda: heatmap.FullScale(least=5e3, patience=3.0)
     )
@@ -106,7 +108,7 @@ class Page:
         maps, trend, events = _shares(width, height)
         numbers = [
             *self._body(width, maps, now),
-            rule(width),
+            rule(width, cut(self._goal(), width - 4)),
             *self._trends(width, trend),
             self._ticks(width),
         ]
@@ -265,6 +267,18 @@ class Page:
             Segment(" mm wide", DIM),
         ]
 
+    def _goal(self) -> str:
+        """What the grip goes to, in words; empty without a grip."""
+        force = number(self.feed.state, "goal_force")
+        angle = math.degrees(number(self.feed.state, "goal_angle"))
+        if not math.isfinite(force):
+            return ""
+        said = f"grip: goal {force:.1f} N"
+        asked = self.feed.asked
+        if force > _RAISED * asked:
+            said += f", raised from {asked:.1f} N"
+        return said + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
+
     def _trends(self, width: int, lines: int) -> list[Line]:
         """Both forces over the last while, ``lines`` of bars each."""
         columns = width - 30
@@ -353,19 +367,7 @@ class Page:
     def _footer(self, width: int) -> Line:
         if not self.keys:
             return [Segment(" no keyboard here: commands go through softfinger send", DIM)]
-        line = [Segment(" ")]
-        for key, what in (
-            ("a", "arm"),
-            ("g", "grasp"),
-            ("←→", "rotate 5°"),
-            ("r", "release"),
-            ("space", "stop"),
-            ("c", "clear"),
-            ("d", "disarm"),
-            ("q", "quit"),
-        ):
-            line += [Segment(key, KEY), Segment(f" {what}  ", DIM)]
-        return line
+        return key_line(width, self.force, bool(text(self.feed.state, "fault")))
 
 
 def _shares(width: int, height: int) -> tuple[int, int, int]:
