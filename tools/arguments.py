@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from daemon.profiles import load
 from daemon.settings import Settings
+
+if TYPE_CHECKING:
+    from daemon.keys import ClientKeys
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
@@ -36,10 +40,36 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:
-    """``--keys``, for a subcommand that speaks with a daemon that may want them."""
+    """``--keys``, for a subcommand that speaks with a daemon that may want them: `client_keys`."""
     parser.add_argument(
         "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
     )
+
+
+def client_keys(folder: Path | None) -> ClientKeys | None:
+    """The keys that `add_keys` names, to guard a socket or a context with before it connects.
+
+    Raises KeyFileError.
+    """
+    if folder is None:
+        return None
+    from daemon.keys import load_client
+
+    return load_client(folder)
+
+
+def waiting(address: str, folder: Path | None) -> str:
+    """What is told while nothing comes; a daemon that wants keys looks just so without them."""
+    return f"waiting for a stream from {address}{_hint(folder)}"
+
+
+def nothing(address: str, seconds: float, folder: Path | None) -> str:
+    """And what, when no more is waited for."""
+    return f"nothing from {address} within {seconds:g} s; is softfinger running?{_hint(folder)}"
+
+
+def _hint(folder: Path | None) -> str:
+    return " (with access.keys it needs --keys FOLDER)" if folder is None else ""
 
 
 def seconds(text: str) -> float:

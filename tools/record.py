@@ -11,7 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from daemon.settings import Stream
-from tools.arguments import ALL, megabytes, moment, seconds, topic
+from tools.arguments import (
+    ALL,
+    add_keys,
+    client_keys,
+    megabytes,
+    moment,
+    nothing,
+    seconds,
+    topic,
+    waiting,
+)
 from tools.recordings.errors import RecordingError
 
 _EPILOG = """\
@@ -31,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not be there yet")
     parser.add_argument("--address", default=Stream().address, help="the stream's socket")
+    add_keys(parser)
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--from",
@@ -66,12 +77,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Record until told to end; 1 with one line when something went wrong."""
+    from daemon.keys import KeyFileError
+
     try:
         if arguments.recover:
             return _recover(arguments.file)
         with _Ending() as ending:
             return _Recorder(arguments, ending).record()
-    except RecordingError as error:
+    except (RecordingError, KeyFileError) as error:
         print(f"record: {error}", file=sys.stderr)
         return 1
 
@@ -94,6 +107,7 @@ class _Recorder:
         from tools.recordings.writer import RecordingWriter
 
         self._arguments = arguments
+        self._keys = client_keys(arguments.keys)  # before there is a file
         self._ending = ending
         self._gaps: dict[bytes, Gaps] = {}
         self._new_gaps = Gaps
@@ -119,16 +133,18 @@ class _Recorder:
         began = shown = heard = time.monotonic()
         failure = ""
         try:
+            if self._keys is not None:
+                self._keys.guard(socket)
             prepare(socket, arguments.address, *_topics(arguments.topics))
             while not self._ending.asked:
-                waiting = socket.poll(int(_LOOK * 1e3))
+                ready = socket.poll(int(_LOOK * 1e3))
                 now = time.monotonic()
-                if waiting:
+                if ready:
                     heard = now
                     self._take_batch(socket)
                 elif self._first is None and now - began > _WAIT:
                     if arguments.no_wait:
-                        failure = f"nothing from {arguments.address} within {_WAIT:g} s"
+                        failure = nothing(arguments.address, _WAIT, arguments.keys)
                         break
                     self._tell_waiting()
                 if arguments.lifeline is not None and _hung_up(arguments.lifeline):
@@ -212,7 +228,8 @@ class _Recorder:
     def _tell_waiting(self) -> None:
         if not self._told_waiting:
             self._told_waiting = True
-            print(f"record: waiting for a stream from {self._arguments.address}", file=sys.stderr)
+            arguments = self._arguments
+            print(f"record: {waiting(arguments.address, arguments.keys)}", file=sys.stderr)
 
     def _show(self, elapsed: float, silent: float) -> None:
         if not sys.stderr.isatty():
