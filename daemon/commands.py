@@ -211,9 +211,10 @@ def send(
             raise NoAnswer(f"{address}: {error}") from None
         socket.send(pack(request))
         if not socket.poll(int(timeout * 1000)):
+            hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
             raise NoAnswer(
                 f"no answer from {address} within {timeout:g} s; is softfinger running, "
-                "or still starting?"
+                f"or still starting?{hint}"
             )
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:

@@ -173,22 +173,33 @@ def _forces(settings: Settings) -> Iterator[str]:
             yield f"{key}: found {force:g} N, expected above {low:g} to {high:g}"
 
 
+def address_fault(address: str, lacking: str) -> str:
+    """What speaks against binding a socket to ``address``; empty: nothing.
+
+    Without keys only this machine's addresses may be bound; ``lacking`` says where keys would be
+    named, and is empty where they are.
+    """
+    here = _TCP if lacking else _ANY_TCP
+    tcp = here.fullmatch(address)
+    path = address.removeprefix("ipc://")
+    local = path != address and path.isprintable() and path[:1] not in ("", "@", "*")
+    if local or (tcp and 0 < int(tcp[2]) < 65536):
+        return ""
+    hint = ""
+    if lacking and _ANY_TCP.fullmatch(address):
+        hint = f"; other addresses need {lacking}, which `softfinger keys` makes"
+    return (
+        f"found {shown(address)}, expected tcp://127.0.0.1:PORT with a port of 1 to 65535, "
+        f"or ipc://PATH{hint}"
+    )
+
+
 def _addresses(settings: Settings) -> Iterator[str]:
     stream, commands = settings.stream.address, settings.commands.address
-    here = _TCP if not settings.access.keys else _ANY_TCP
     for key, address in (("stream.address", stream), ("commands.address", commands)):
-        tcp = here.fullmatch(address)
-        path = address.removeprefix("ipc://")
-        local = path != address and path.isprintable() and path[:1] not in ("", "@", "*")
-        if not local and not (tcp and 0 < int(tcp[2]) < 65536):
-            if here is _TCP and _ANY_TCP.fullmatch(address):
-                hint = "; other addresses need access.keys, which `softfinger keys` makes"
-            else:
-                hint = ""
-            yield (
-                f"{key}: found {shown(address)}, expected tcp://127.0.0.1:PORT with a port of "
-                f"1 to 65535, or ipc://PATH{hint}"
-            )
+        fault = address_fault(address, "" if settings.access.keys else "access.keys")
+        if fault:
+            yield f"{key}: {fault}"
     if stream == commands:
         yield f"commands.address: found {shown(commands)}, expected another than stream.address"
 

@@ -307,7 +307,7 @@ def test_waiting_is_told_and_a_signal_ends_it(tmp_path: Path) -> None:
         words = ["view", "--address", fake.state_address, "--save", str(tmp_path / "a.rrd")]
         process = subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
         assert process.stderr is not None
-        assert f"waiting for a stream: {fake.state_address}" in process.stderr.readline()
+        assert f"waiting for a stream from {fake.state_address}" in process.stderr.readline()
         fake.silent.clear()
         assert "the stream is here" in process.stderr.readline()
         until(lambda: fake.published > 150)

@@ -15,13 +15,14 @@ import select
 import signal
 import sys
 import time
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
 import zmq
 
-from daemon.keys import KeyFileError, load_client
-from tools.arguments import add_keys
+from daemon.keys import KeyFileError
+from tools.arguments import add_keys, client_keys, nothing
 from tools.feed import FINGERS, Feed, number, text
 from tools.feed_sockets import Commander, Subscriber
 from tools.monitor_keys import HandKeys
@@ -68,14 +69,17 @@ def run(args: argparse.Namespace) -> int:
     context: zmq.Context[Any] = zmq.Context(io_threads=1)
     feed = Feed()
     try:
-        if args.keys is not None:
-            load_client(args.keys).guard(context)
+        keys = client_keys(args.keys)
+        if keys is not None:
+            keys.guard(context)
         subscriber = Subscriber(context, state, feed)
         commander = Commander(context, commands, args.client)
         try:
             with _Ending(args) as ending:
                 if _is_page(args):
-                    _run_page(Page(feed, state), subscriber, commander, ending)
+                    _run_page(
+                        Page(feed, state, guarded=keys is not None), subscriber, commander, ending
+                    )
                 else:
                     _run_plain(state, subscriber, ending)
         finally:
@@ -117,6 +121,7 @@ class _Ending:
         self.suspend = False
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
+        self._keys: Path | None = args.keys
         self._lifeline: int | None = args.lifeline
         self.beside = args.lifeline is not None  # a daemon is in our process group
         self._deadline = math.inf if args.duration is None else time.monotonic() + args.duration
@@ -180,7 +185,7 @@ class _Ending:
         if status == "lost":
             self.why = "the stream has ended"
         elif status == "waiting" and now > self._patience:
-            self.why = f"no daemon publishes on {address}"
+            self.why = nothing(address, PATIENCE, self._keys)
         self.over = bool(self.why)
 
 

@@ -87,6 +87,7 @@ class Page:
     address: str
     depth: heatmap.Depth = "any"
     keys: bool = True  # a keyboard is there
+    guarded: bool = False  # the stream is asked for with keys
     force: float = math.nan  # N that the key for it grasps with
     _pressure: heatmap.FullScale = field(
         default_factory=lambda: heatmap.FullScale(least=5e3, patience=3.0)
@@ -158,6 +159,7 @@ class Page:
             return apart(line, [Segment(self._way_out, ALARM)], width, ALARM)
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
+            what += "" if self.guarded else " (or it wants --keys)"
             return [Segment(cut(what, width), WARN)]
         schema = value_at(self.feed.state, "schema")
         if self.feed.state is not None and schema != SCHEMA:

@@ -26,12 +26,18 @@ class NoRecorder(Exception):
 class RecorderBeside:
     """A recording of all that ``address`` publishes, from before the first message on."""
 
-    def __init__(self, path: Path, address: str, subscribed: Callable[[], bool]) -> None:
-        """``subscribed`` tells whether somebody takes everything. Raises NoRecorder."""
+    def __init__(
+        self, path: Path, address: str, subscribed: Callable[[], bool], keys: str = ""
+    ) -> None:
+        """``subscribed`` tells whether somebody takes everything; ``keys`` is the folder of the
+        client's, if the daemon wants some. Raises NoRecorder.
+        """
         reads, self._lifeline = os.pipe()  # its end is the end of this process
         # -P: a folder named tools where the daemon was started is not ours.
         words = [sys.executable, "-P", "-m", "tools.cli", "record", str(path)]
         words += ["--topics", "all", "--address", address, "--lifeline", str(reads)]
+        if keys:
+            words += ["--keys", keys]
         # A session of its own: Ctrl-C is the daemon's, whose last messages are to be recorded, too.
         self._process = subprocess.Popen(
             words,

@@ -33,6 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument("--address", default=Stream().address, help="where to publish")
     parser.add_argument(
+        "--keys",
+        type=Path,
+        metavar="FOLDER",
+        help="publish to its clients alone, as a daemon with access.keys does; made by "
+        "`softfinger keys`",
+    )
+    parser.add_argument(
         "--speed", type=seconds, default=1.0, metavar="X", help="times as fast (default 1)"
     )
     parser.add_argument("--from", type=moment, default=0.0, metavar="S", dest="start")
@@ -68,12 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _publish(arguments: argparse.Namespace, recording: Any) -> int:
-    import zmq
+    from tools.recordings.republish import Wire
 
-    from daemon.messages import pack
-    from daemon.sockets import AddressError, Bound
-
-    context: zmq.Context[Any] = zmq.Context()
     ended = False
 
     def end(*_: object) -> None:
@@ -82,31 +85,29 @@ def _publish(arguments: argparse.Namespace, recording: Any) -> int:
 
     old = {each: signal.signal(each, end) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
-        bound = Bound(context, zmq.XPUB, arguments.address, "--address", 10_000, 1024)
-    except AddressError as error:
-        raise RecordingError(str(error)) from None
-    try:
-        waited = time.monotonic() + (0.0 if arguments.no_wait else _READERS)
-        while not ended and time.monotonic() < waited and not bound.socket.poll(100):
-            pass
-        sent = 0
-        began = first = None
-        end_at = float("inf") if arguments.end is None else arguments.end
-        for topic, message in recording.messages(start=arguments.start, end=end_at):
-            stamp = message.get("timestamp", 0.0)
-            if began is None or first is None:
-                began, first = time.monotonic(), stamp
-            due = began + (stamp - first) / arguments.speed
-            while not ended and (left := due - time.monotonic()) > 0.0:
-                time.sleep(min(left, 0.1))
-            if ended:
-                break
-            bound.socket.send_multipart([topic, pack(message)])
-            sent += 1
+        with Wire(arguments.address, arguments.keys) as wire:
+            waited = time.monotonic() + (0.0 if arguments.no_wait else _READERS)
+            if not arguments.no_wait:
+                told = f"replay: waiting up to {_READERS:g} s for a subscriber at"
+                print(f"{told} {arguments.address}", file=sys.stderr)
+            while not ended and time.monotonic() < waited and not wire.subscribed(0.1):
+                pass
+            sent = 0
+            began = first = None
+            end_at = float("inf") if arguments.end is None else arguments.end
+            for topic, message in recording.messages(start=arguments.start, end=end_at):
+                stamp = message.get("timestamp", 0.0)
+                if began is None or first is None:
+                    began, first = time.monotonic(), stamp
+                due = began + (stamp - first) / arguments.speed
+                while not ended and (left := due - time.monotonic()) > 0.0:
+                    wire.subscribed(min(left, 0.1))
+                if ended:
+                    break
+                wire.send(topic, message)
+                sent += 1
         print(f"{sent} of {recording.total} messages published")
     finally:
-        bound.close()
-        context.term()
         for number, handler in old.items():
             signal.signal(number, handler)
     return 0

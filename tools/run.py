@@ -154,7 +154,7 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
         daemon.publisher.refresh()
         return bool(daemon.publisher.wants_input)
 
-    return RecorderBeside(path, settings.stream.address, subscribed)
+    return RecorderBeside(path, settings.stream.address, subscribed, settings.access.keys)
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:

@@ -9,9 +9,9 @@ import sys
 from typing import Any
 
 from daemon.commands import NoAnswer, send
-from daemon.keys import KeyFileError, load_client
+from daemon.keys import KeyFileError
 from daemon.settings import CommandSettings
-from tools.arguments import add_keys, seconds
+from tools.arguments import add_keys, client_keys, seconds
 
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
@@ -45,8 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
             return 2
         request[key] = value
     try:
-        keys = load_client(arguments.keys) if arguments.keys else None
-        reply = send(arguments.address, request, arguments.timeout, keys)
+        reply = send(arguments.address, request, arguments.timeout, client_keys(arguments.keys))
     except (NoAnswer, KeyFileError) as error:
         print(f"send: {error}", file=sys.stderr)
         return 2

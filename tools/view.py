@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from daemon.settings import Stream
-from tools.arguments import add_keys, megabytes, moment, seconds
+from tools.arguments import add_keys, client_keys, megabytes, moment, nothing, seconds, waiting
 from tools.viewing.errors import NoRerun, ViewError
 
 if TYPE_CHECKING:
@@ -91,12 +91,13 @@ def _rate(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show until told to end; 1 with one line when something went wrong."""
+    from daemon.keys import KeyFileError
     from tools.recordings.errors import RecordingError
 
     try:
         with _Ending(arguments.duration) as ending:
             return _View(arguments, ending).show()
-    except (ViewError, RecordingError) as error:
+    except (ViewError, RecordingError, KeyFileError) as error:
         print(f"view: {error}", file=sys.stderr)
         return 1
 
@@ -114,6 +115,7 @@ class _View:
         from tools.viewing.bridge import Bridge
 
         self._arguments = arguments
+        self._keys = client_keys(arguments.keys)
         self._ending = ending
         self._notes_told = 0
         self._looked = -math.inf
@@ -190,7 +192,7 @@ class _View:
         heard = time.monotonic()
         silent = ever = False
         period = 1.0 / self._arguments.rate
-        with LiveStream(self._arguments.address, self._arguments.keys) as stream:
+        with LiveStream(self._arguments.address, self._keys) as stream:
             due = heard
             while not ending.over():
                 count = stream.drain(bridge, due)
@@ -202,8 +204,9 @@ class _View:
                     silent = False
                 elif not silent and now - heard > _WAIT:
                     if self._arguments.no_wait:
-                        raise ViewError(f"nothing from {stream.address} within {_WAIT:g} s")
-                    self._say(f"{'silent' if ever else 'waiting for a stream'}: {stream.address}")
+                        raise ViewError(nothing(stream.address, _WAIT, self._arguments.keys))
+                    coming = waiting(stream.address, self._arguments.keys)
+                    self._say(f"silent: {stream.address}" if ever else coming)
                     silent = True
                 bridge.draw()
                 self._tell_notes()

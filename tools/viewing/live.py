@@ -9,7 +9,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from daemon.keys import KeyFileError, load_client
+from daemon.keys import ClientKeys
 from tools.viewing.bridge import TOPICS, Bridge
 from tools.viewing.errors import ViewError
 
@@ -18,14 +18,14 @@ _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 class LiveStream:
-    """A context that reads ``address``; ``keys`` is the client's folder. Raises ViewError."""
+    """A context that reads ``address``, with the client's keys if any. Raises ViewError."""
 
-    def __init__(self, address: str, keys: Any = None) -> None:
+    def __init__(self, address: str, keys: ClientKeys | None = None) -> None:
         self.address = address
         self._context: zmq.Context[Any] = zmq.Context()
         try:
             if keys is not None:
-                load_client(keys).guard(self._context)
+                keys.guard(self._context)
             self._socket = self._context.socket(zmq.SUB)
             self._socket.setsockopt(zmq.LINGER, 0)
             self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
@@ -37,9 +37,6 @@ class LiveStream:
         except zmq.ZMQError as error:
             self.close()
             raise ViewError(f"{address}: {error}") from None
-        except KeyFileError as error:
-            self.close()
-            raise ViewError(str(error)) from None
 
     def drain(self, bridge: Bridge, until: float) -> int:
         """Hand on what comes until the monotonic time ``until`` [s]; how many messages it was."""
