@@ -19,6 +19,7 @@ import zmq
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.doorkeeper import Doorkeeper
+from daemon.grip import Grip
 from daemon.keys import load_server
 from daemon.loop import EventSink, Loop
 from daemon.messages import Facts
@@ -216,3 +217,11 @@ def warm_up(
             made_up = Contact(valid=True, contact=True, d=1e-3, force=1.0, d_std=1e-5)
             prediction.correct(perception.finger, made_up, contacts[perception.finger])
         prediction.fill(contacts, ObjectPose())
+    grip = Grip(settings, [perception.finger for perception in perceptions])
+    grip.start(prediction.held, 1.0, 2.0)
+    grip.steer(0.0, 0.1)
+    reading = Reading()
+    grip.torques(reading, contacts, ObjectPose(), prediction.held)
+    grip.coast(reading, prediction.held)
+    if len(perceptions) == len(FINGERS):
+        grip.angles(contacts, ObjectPose(), prediction.held)

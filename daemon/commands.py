@@ -1,6 +1,6 @@
 """The command server and client: one msgpack map each way, and nothing that decides.
 
-The server lives in the loop's own thread: it is asked once a tick, costs one system-free look when
+The server lives in the loop's own thread: it is asked once a tick, costs one look when
 nobody speaks, and needs no lock. A plain REQ socket is enough for a client.
 
 One command is carried out a tick. What has come beside it is looked through as far as a tick
@@ -65,14 +65,18 @@ class CommandServer:
         self._paces: dict[bytes, tuple[float, float]] = {}  # of a client: may send, at time
         self._waiting: deque[tuple[list[bytes], bytes]] = deque()
         self._refusals = _REFUSALS  # that may still be answered at this tick
+        self._settled = False  # nothing waits anywhere until the socket's descriptor tells
         self.refused_by_pace = 0
 
     def serve(self, handler: Handler) -> bool:
         """Answer one waiting command through ``handler``; False when there was nothing at all."""
-        came = stopped = False
+        if self._settled and not self._bound.signalled():
+            return False
+        came = stopped = self._settled = False
         self._refusals = _REFUSALS
         for _ in range(_LOOK):
             if not self._bound.readable():
+                self._settled = not came and not self._waiting  # else an answer is sent below
                 break
             came = True
             frames = self._socket.recv_multipart(zmq.NOBLOCK)

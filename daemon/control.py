@@ -167,7 +167,7 @@ class Control:
             raise Refused(
                 f"set: compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
             )
-        self._grip.joint_stiffness = 1.0 / compliance
+        self._grip.soften(1.0 / compliance)
 
     def _turns(self) -> tuple[float, float]:
         """The object's angles [rad] that this grip reaches within the tips' and joints' limits.
@@ -331,7 +331,7 @@ class Control:
         self._watch_slip()
         self._watch_settling(dt, contacts)
 
-    def _pull(self, torques: list[float], goal: Goal) -> None:
+    def _pull(self, torques: tuple[float, float], goal: Goal) -> None:
         for index in self._fingers:
             current = torques[index] / self._settings.control.torque_constant
             goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)

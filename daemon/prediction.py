@@ -24,7 +24,6 @@ but turning it ends at the tips' limits.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,27 +34,57 @@ from daemon.settings import Settings
 from kinematics.table import ContactTable
 
 
-def _pair() -> list[float]:
-    return [0.0, 0.0]
+class _Number:
+    """One number that a `Held` was told."""
+
+    def __init__(self, place: int) -> None:
+        self._place = place
+
+    def __get__(self, held: Held, owner: type[Held]) -> float:
+        return held.told.item(self._place)
+
+    def __set__(self, held: Held, value: float) -> None:
+        held.told[self._place] = value
 
 
-@dataclass(slots=True)
+class _Pair:
+    """Two of them, (left, right), ``step`` places apart."""
+
+    def __init__(self, place: int, step: int = 1) -> None:
+        self._places = slice(place, place + step + 1, step)
+
+    def __get__(self, held: Held, owner: type[Held]) -> list[float]:
+        pair: list[float] = held.told[self._places].tolist()
+        return pair
+
+    def __set__(self, held: Held, value: list[float]) -> None:
+        held.told[self._places] = value
+
+
 class Held:
-    """How the held object answers the joints: what a grip law needs. Pairs are (left, right)."""
+    """How the held object answers the joints: what a grip law needs. Pairs are (left, right).
 
-    q: list[float] = field(default_factory=_pair)  # tracked joints [rad]
-    arm: list[float] = field(default_factory=_pair)  # ∂(d1 + d2)/∂q, the force's lever [m]
-    turn: list[float] = field(default_factory=_pair)  # φ̇ = turn1 q̇1 − turn2 q̇2
-    slide: float = 0.0  # ∂(d1 + d2)/∂φ [m/rad]
-    taper: float = 0.0  # rad between the object's faces, as both tips feel them
-    lever: list[float] = field(default_factory=_pair)  # torque over force by the energy [m]
-    stiffness: list[float] = field(default_factory=_pair)  # ∂F/∂d [N/m]
-    shear: float = 0.0  # shear over normal force, by the balance of the object without a load
-    normal: list[float] = field(default_factory=_pair)  # normal forces [N]
-    load: float = 0.0  # what each tip bears along its face, by the joints' torques [N]
-    load_lever: float = 0.0  # and the lever of that load about the pivots [m]
-    stray: float = 0.0  # turning of the object that no joint explains, summed up [rad]
-    angle_std: float = 0.0  # of the object's angle [rad]
+    It is one array that a kernel writes and others read; the names are for people and slow work.
+    """
+
+    __slots__ = ("told",)
+
+    q = _Pair(tracking.JOINT)  # tracked joints [rad]
+    arm = _Pair(tracking.ARM)  # ∂(d1 + d2)/∂q, the force's lever [m]
+    turn = _Pair(tracking.TURN)  # φ̇ = turn1 q̇1 − turn2 q̇2
+    slide = _Number(tracking.SLIDE)  # ∂(d1 + d2)/∂φ [m/rad]
+    taper = _Number(tracking.OBJECT_TAPER)  # rad between the object's faces, as both tips feel them
+    lever = _Pair(tracking.LEVER)  # torque over force by the energy [m]
+    stiffness = _Pair(tracking.TIP_STIFFNESS, tracking.TIP_SIZE)  # ∂F/∂d [N/m]
+    shear = _Number(tracking.SHEAR)  # shear over normal force, by the object's balance, unloaded
+    normal = _Pair(tracking.NORMAL)  # normal forces [N]
+    load = _Number(tracking.LOAD)  # what each tip bears along its face, by the joints' torques [N]
+    load_lever = _Number(tracking.LOAD_LEVER)  # and the lever of that load about the pivots [m]
+    stray = _Number(tracking.STRAYED)  # turning of the object that no joint explains, summed [rad]
+    angle_std = _Number(tracking.ANGLE_STD)  # of the object's angle [rad]
+
+    def __init__(self) -> None:
+        self.told = np.zeros(tracking.TOLD_SIZE)
 
 
 class Prediction:
@@ -82,7 +111,6 @@ class Prediction:
         self._history = np.full(
             (round(tracking.HISTORY * settings.loop.rate) + 2, tracking.H_SIZE), -math.inf
         )
-        self._out = np.zeros(tracking.OUT)
         self._live = [False, False]
         self.held = Held()
 
@@ -131,33 +159,19 @@ class Prediction:
         if not (left or right):
             pose.angle = pose.width = 0.0
             return
-        tracking.tell(self._m, *self._tables, self._out)
-        out = self._out.tolist()
-        angle_std = out[16]
+        told = self.held.told
+        tracking.tell(self._m, *self._tables, told)
+        seen = told[: tracking.ANGLE_STD].tolist()
         if left:
-            _fill_one(contacts[0], out[0:8])
+            _fill_one(contacts[0], seen[: tracking.TIP_SIZE])
         if right:
-            _fill_one(contacts[1], out[8:16])
+            _fill_one(contacts[1], seen[tracking.TIP_SIZE : 2 * tracking.TIP_SIZE])
         if left and right and self._with_object:
             pose.valid = True
-            pose.angle = out[17]
-            pose.width = out[18]
+            pose.angle = seen[tracking.OBJECT_ANGLE]
+            pose.width = seen[tracking.OBJECT_WIDTH]
         else:
             pose.angle = pose.width = 0.0
-        held = self.held
-        held.arm = out[19:21]
-        held.turn = out[21:23]
-        held.slide = out[23]
-        held.taper = out[33]
-        held.lever = out[24:26]
-        held.q = out[27:29]
-        held.stiffness = [out[4], out[12]]
-        held.shear = out[26]
-        held.normal = out[29:31]
-        held.load = out[31]
-        held.load_lever = out[32]
-        held.stray = out[34]
-        held.angle_std = angle_std
 
 
 def _fill_one(contact: Contact, told: list[float]) -> None:

@@ -1,29 +1,81 @@
 """Smooth references: a target that may jump at any tick in, a jerk-limited way to it out.
 
-Holds `Reference` and nothing that knows what the value means.
+Holds `Reference`, the kernels on its memory, and nothing that knows what the value means.
 """
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
 
-class _Mean:
-    """Mean of the last ``count`` values, one a tick."""
+from kinematics.kernels import kernel
 
-    def __init__(self, count: int) -> None:
-        self.count = max(count, 1)
-        self.reset(0.0)
+FloatArray = NDArray[np.float64]
 
-    def reset(self, value: float) -> None:
-        self._values = [value] * self.count
-        self._sum = value * self.count
-        self._at = 0
+# Places in a reference's memory; the windows of both means follow behind.
+TARGET, VALUE, SPEED = 0, 1, 2
+_RAMP, _IDLE, _DT = 3, 4, 5  # _IDLE: ticks since the ramp arrived
+_FIRST, _SECOND = 6, 9  # of each mean: its window's length, the place in it, the window's sum
+_WINDOWS = 12
 
-    def step(self, value: float) -> float:
-        at = self._at
-        self._sum += value - self._values[at]
-        self._values[at] = value
-        self._at = at + 1 if at + 1 < self.count else 0
-        return self._sum / self.count
+
+@kernel
+def reset(r: FloatArray, value: float) -> None:
+    """Be at ``value``, at rest."""
+    r[TARGET] = r[_RAMP] = r[VALUE] = value
+    r[SPEED] = 0.0
+    r[_IDLE] = r[_FIRST] + r[_SECOND]
+    for mean in (_FIRST, _SECOND):
+        r[mean + 1] = 0.0
+        r[mean + 2] = value * r[mean]
+    for k in range(_WINDOWS, r.shape[0]):
+        r[k] = value
+
+
+@kernel
+def arrived(r: FloatArray) -> bool:
+    """At the target, at rest."""
+    there: bool = r[_IDLE] >= r[_FIRST] + r[_SECOND] and r[_RAMP] == r[TARGET]
+    return there
+
+
+@kernel
+def _mean(r: FloatArray, mean: int, window: int, value: float) -> float:
+    """Take ``value`` into a running mean whose window begins at ``window``."""
+    at = int(r[mean + 1])
+    r[mean + 2] += value - r[window + at]
+    r[window + at] = value
+    r[mean + 1] = at + 1.0 if at + 1.0 < r[mean] else 0.0
+    result: float = r[mean + 2] / r[mean]
+    return result
+
+
+@kernel
+def advance(r: FloatArray, rate: float) -> float:
+    """One tick on towards the target, at most ``rate`` a second; returns the value."""
+    left = r[TARGET] - r[_RAMP]
+    last: float = r[VALUE]
+    if left == 0.0:
+        length = r[_FIRST] + r[_SECOND]
+        if r[_IDLE] >= length:
+            return last
+        r[_IDLE] += 1.0
+        if r[_IDLE] >= length:
+            last = r[TARGET]
+            reset(r, last)  # the running sums' rounding ends here
+            return last
+    else:
+        most = rate * r[_DT]
+        r[_IDLE] = 0.0
+        if abs(left) <= most:
+            r[_RAMP] = r[TARGET]
+        else:
+            r[_RAMP] += most if left > 0.0 else -most
+    smooth = _mean(r, _FIRST, _WINDOWS, r[_RAMP])
+    value = _mean(r, _SECOND, _WINDOWS + int(r[_FIRST]), smooth)
+    r[VALUE] = value
+    r[SPEED] = (value - last) / r[_DT]
+    return value
 
 
 class Reference:
@@ -36,41 +88,43 @@ class Reference:
 
     def __init__(self, dt: float, window: float) -> None:
         """``dt`` is the tick and ``window`` the first mean's length [s]."""
-        self._dt = dt
-        self._means = _Mean(round(window / dt)), _Mean(round(0.5 * window / dt))
-        self._length = self._means[0].count + self._means[1].count
+        first, second = max(round(window / dt), 1), max(round(0.5 * window / dt), 1)
+        self.memory = np.zeros(_WINDOWS + first + second)
+        self.memory[_DT] = dt
+        self.memory[_FIRST] = first
+        self.memory[_SECOND] = second
         self.reset(0.0)
+        advance(self.memory, 0.0)  # nothing to do yet, but compiled now and by no tick
+        arrived(self.memory)
 
     def reset(self, value: float) -> None:
         """Be at ``value``, at rest."""
-        self.target = self._ramp = self.value = value
-        self.speed = 0.0
-        self._idle = self._length  # ticks since the ramp arrived
-        for mean in self._means:
-            mean.reset(value)
+        reset(self.memory, value)
+
+    @property
+    def target(self) -> float:
+        """Where it goes to; it may be set at any tick."""
+        return self.memory.item(TARGET)
+
+    @target.setter
+    def target(self, value: float) -> None:
+        self.memory[TARGET] = value
+
+    @property
+    def value(self) -> float:
+        """Where it is."""
+        return self.memory.item(VALUE)
+
+    @property
+    def speed(self) -> float:
+        """How fast it moves [1/s]."""
+        return self.memory.item(SPEED)
 
     @property
     def arrived(self) -> bool:
         """At the target, at rest."""
-        return self._idle >= self._length and self._ramp == self.target
+        return bool(arrived(self.memory))
 
     def step(self, rate: float) -> float:
         """One tick on towards the target, at most ``rate`` a second; returns the value."""
-        left = self.target - self._ramp
-        if left == 0.0:
-            if self._idle >= self._length:
-                return self.value
-            self._idle += 1
-            if self._idle >= self._length:
-                self.reset(self.target)  # the running sums' rounding ends here
-                return self.value
-        else:
-            most = rate * self._dt
-            self._idle = 0
-            self._ramp = (
-                self.target if abs(left) <= most else self._ramp + (most if left > 0.0 else -most)
-            )
-        last = self.value
-        self.value = self._means[1].step(self._means[0].step(self._ramp))
-        self.speed = (self.value - last) / self._dt
-        return self.value
+        return advance(self.memory, rate)

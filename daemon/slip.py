@@ -96,22 +96,29 @@ class SlipWatch:
         self._age = _SMOOTH
         self._known = True
 
+    def kept(self, asked: float) -> float:
+        """The grip force [N] for ``asked`` between two looks."""
+        return max(asked, min(self._needed, self._most))
+
+    def due(self) -> bool:
+        """Whether this tick takes a look: not every one does, loads are slower."""
+        self.turned = False
+        if self._ticks:
+            self._ticks -= 1
+            return False
+        self._ticks = self._every - 1
+        return True
+
     def step(
         self, held: Held, contacts: list[Contact], asked: float, holding: bool, closing: float
     ) -> float:
-        """The grip force [N] of this tick: ``asked``, or more where the margin needs it.
+        """Look; the grip force [N] to go to: ``asked``, or more where the margin needs it.
 
         ``holding`` says that nothing but loads moves the joints; ``closing``, -1 to 1, how much of
         the joints' friction is given at present for closing.
         """
-        self.turned = False
-        if self._ticks:
-            self._ticks -= 1
-            return max(asked, min(self._needed, self._most))
-        self._ticks = self._every - 1
         law = self._law
         self._most = most = max(min(asked + law.grip_raise_max, self._force_most), asked)
-        self.turned = False
         found = held.load - closing * self._friction - self._share * _mean(held.normal)
         self._smooth += (found - self._smooth) * self._dt / _SMOOTH
         if holding and self._known:

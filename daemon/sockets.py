@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import os
+import select
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +16,15 @@ import zmq
 from daemon.keys import ServerKeys
 
 _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)  # plain numbers: enum flags cost a microsecond
+
+# The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
+_poll = ctypes.PyDLL(None).poll
+
+
+class _PollFd(ctypes.Structure):
+    """One descriptor, as the system's poll takes it."""
+
+    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
 
 
 class AddressError(Exception):
@@ -80,9 +91,18 @@ class Bound:
         finally:
             if before >= 0:
                 os.umask(before)
+        descriptor = cast(int, self.socket.getsockopt(zmq.FD))
+        self._asked = ctypes.byref(_PollFd(descriptor, select.POLLIN, 0))
+
+    def signalled(self) -> bool:
+        """Something may have come since `readable` last said no, if nothing was sent since then.
+
+        libzmq's descriptor tells of a change once, not of what waits; a third of `readable`'s time.
+        """
+        return bool(_poll(self._asked, 1, 0))
 
     def readable(self) -> bool:
-        """A message waits. About a microsecond; no system call unless something happened."""
+        """A message waits. About a microsecond."""
         return bool(cast(int, self.socket.getsockopt(_EVENTS)) & _POLLIN)
 
     def close(self) -> None:

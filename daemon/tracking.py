@@ -44,9 +44,17 @@ TAPER, TOLD = 35, 36  # α as found and as told [rad]
 _TAPER_VAR, _TAPER_COV = 37, 38  # variance of α, covariance with φ
 MEMORY = 39
 
-# Columns of the history, and of what a tick gives out.
+# Columns of the history.
 _H_T, _H_WAY, _H_Q, H_SIZE = 0, 1, 4, 6
-OUT = 35
+
+# Places in what a tick is told; pairs are (left, right).
+TIP_D, TIP_THETA, TIP_FORCE, TIP_ENERGY = 0, 1, 2, 3  # of the left tip; the right tip's follow
+TIP_STIFFNESS, TIP_D_STD, TIP_THETA_STD, TIP_INSIDE = 4, 5, 6, 7
+TIP_SIZE = 8
+OBJECT_ANGLE, OBJECT_WIDTH, ANGLE_STD = 16, 17, 18
+ARM, TURN, LEVER, JOINT, NORMAL = 19, 21, 23, 25, 27
+SLIDE, OBJECT_TAPER, SHEAR, LOAD, LOAD_LEVER, STRAYED = 29, 30, 31, 32, 33, 34
+TOLD_SIZE = 35
 
 
 @kernel
@@ -273,12 +281,12 @@ def _between(history: FloatArray, row: int, later: int, share: float, column: in
 
 
 @kernel
-def tell(m: FloatArray, table1: FloatArray, table2: FloatArray, out: FloatArray) -> None:
-    """Write what the estimates mean: see `Prediction.fill` for the order."""
+def tell(m: FloatArray, table1: FloatArray, table2: FloatArray, told: FloatArray) -> None:
+    """Write what the estimates mean into ``told``."""
     taper = m[TAPER]
-    motion = held_motion(
-        m[_Q], m[_Q + 1], m[D], m[D + 1], m[_ANGLE], taper, m[_B], m[_L], m[_E], m[_A]
-    )
+    d1 = m[D]
+    d2 = m[D + 1]
+    motion = held_motion(m[_Q], m[_Q + 1], d1, d2, m[_ANGLE], taper, m[_B], m[_L], m[_E], m[_A])
     theta1 = m[_ANGLE] - 0.5 * taper + m[_Q]
     theta2 = m[_ANGLE] + 0.5 * taper - m[_Q + 1]
     for finger in range(2):
@@ -288,42 +296,36 @@ def tell(m: FloatArray, table1: FloatArray, table2: FloatArray, out: FloatArray)
             table, m[D + finger], total_tilt(theta, m[_TILT + finger])
         )
         gain = m[_GAIN + finger]
-        at = 8 * finger
-        out[at] = max(m[D + finger], 0.0)
-        out[at + 1] = theta
-        out[at + 2] = gain * force
-        out[at + 3] = gain * energy
-        out[at + 4] = gain * stiffness
-        out[at + 5] = math.sqrt(_variance(m, finger))
-        out[at + 6] = math.sqrt(_side_variance(m, -1.0 if finger == 0 else 1.0))
-        out[at + 7] = 1.0 if inside else 0.0
-    out[33] = taper
-    out[34] = m[STRAY]
-    out[16] = math.sqrt(_variance(m, 2))
-    out[17] = m[_ANGLE]
-    out[18] = motion[5]
-    out[19] = motion[0]
-    out[20] = motion[1]
-    out[21] = motion[2]
-    out[22] = motion[3]
-    out[23] = motion[4]
-    d1 = m[D]
-    d2 = m[D + 1]
+        tip = TIP_SIZE * finger
+        told[tip + TIP_D] = max(m[D + finger], 0.0)
+        told[tip + TIP_THETA] = theta
+        told[tip + TIP_FORCE] = gain * force
+        told[tip + TIP_ENERGY] = gain * energy
+        told[tip + TIP_STIFFNESS] = gain * stiffness
+        told[tip + TIP_D_STD] = math.sqrt(_variance(m, finger))
+        told[tip + TIP_THETA_STD] = math.sqrt(_side_variance(m, -1.0 if finger == 0 else 1.0))
+        told[tip + TIP_INSIDE] = 1.0 if inside else 0.0
+        told[JOINT + finger] = m[_Q + finger]
+    told[ANGLE_STD] = math.sqrt(_variance(m, 2))
+    told[OBJECT_ANGLE] = m[_ANGLE]
+    told[OBJECT_TAPER] = taper
+    told[STRAYED] = m[STRAY]
+    told[ARM], told[ARM + 1], told[TURN], told[TURN + 1], told[SLIDE], told[OBJECT_WIDTH], _ = (
+        motion
+    )
     lever1, lever2, shear, normal1, normal2 = holding_levers(
         table1, table2, d1, d2, theta1, theta2, taper, motion
     )
     out_of_grip = 0.5 * math.tan(0.5 * taper) * (normal1 + normal2)
     gain1 = m[_GAIN]
     gain2 = m[_GAIN + 1]
-    out[24] = lever1
-    out[25] = lever2
-    out[26] = 0.0
+    told[LEVER] = lever1
+    told[LEVER + 1] = lever2
+    told[SHEAR] = 0.0
     if normal1 + normal2 > 0.0:
-        out[26] = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
-    out[27] = m[_Q]
-    out[28] = m[_Q + 1]
-    out[29] = gain1 * normal1
-    out[30] = gain2 * normal2
+        told[SHEAR] = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
+    told[NORMAL] = gain1 * normal1
+    told[NORMAL + 1] = gain2 * normal2
     if gain1 > 0.0 and gain2 > 0.0:
         torque1 = m[TORQUE] / gain1
         torque2 = m[TORQUE + 1] / gain2
@@ -331,5 +333,5 @@ def tell(m: FloatArray, table1: FloatArray, table2: FloatArray, out: FloatArray)
         load, lever = load_by_torques(
             table1, table2, d1, d2, theta1, theta2, taper, motion, rolled, torque1, torque2
         )
-        out[31] = 0.5 * (gain1 + gain2) * load
-        out[32] = lever
+        told[LOAD] = 0.5 * (gain1 + gain2) * load
+        told[LOAD_LEVER] = lever

@@ -84,6 +84,12 @@ def later(state: State, dt: float) -> None:
         contact.t_arrival += dt
 
 
+def levers(lever: float) -> Held:
+    held = Held()
+    held.lever = [lever, lever]
+    return held
+
+
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
     """The fault after so many seconds of this state; every row has had its turn."""
     found = None
@@ -94,7 +100,7 @@ def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]
 
 
 def test_a_sound_state_has_no_cause_and_no_warning() -> None:
-    judge = safety(held=Held(lever=[0.08, 0.08]))
+    judge = safety(held=levers(0.08))
     state = sound()
     state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
     assert judged(judge, state, 3.0) == ("", "")
@@ -428,7 +434,7 @@ def test_a_warning_at_its_limit_does_not_flicker() -> None:
 
 
 def test_torque_that_the_tip_does_not_feel_is_told() -> None:
-    judge, state = safety(held=Held(lever=[0.08, 0.08])), sound()
+    judge, state = safety(held=levers(0.08)), sound()
     state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
     judged(judge, state, 0.5)
     assert judge.warnings == []
@@ -439,7 +445,7 @@ def test_torque_that_the_tip_does_not_feel_is_told() -> None:
 
 
 def test_shear_near_friction_is_told() -> None:
-    held = Held(lever=[0.0, 0.0])
+    held = Held()
     judge, state = safety(held=held), sound()
     held.shear = 0.5
     judged(judge, state, 0.3)
