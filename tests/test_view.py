@@ -5,6 +5,8 @@ from __future__ import annotations
 import http.client
 import math
 import os
+import re
+import select
 import signal
 import subprocess
 import sys
@@ -18,6 +20,7 @@ import numpy as np
 import psutil
 import pytest
 import rerun as rr
+import zmq
 from rerun.chunk import RrdReader
 
 from daemon import messages
@@ -27,8 +30,9 @@ from tests.fake_daemon import FakeDaemon, event, frame, state
 from tests.recorded_hand import record_hand
 from tools import cli
 from tools.recordings.reader import Recording
-from tools.viewing.bridge import Bridge
+from tools.viewing.bridge import TOPICS, Bridge
 from tools.viewing.errors import ViewError
+from tools.viewing.live import LiveStream
 from tools.viewing.page import Page, policy
 
 GRASP = {
@@ -318,6 +322,36 @@ def test_waiting_is_told_and_a_signal_ends_it(tmp_path: Path) -> None:
     assert "states shown" in said
 
 
+def test_while_nothing_is_read_messages_wait_and_what_is_lost_of_them_is_told(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    """As while a busy machine draws for seconds: states wait, and frames push out no state."""
+    publisher = context.socket(zmq.XPUB)
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # as the daemon's
+    publisher.bind(addresses[0])
+    bridge = Bridge(rr.RecordingStream("test"), keep=100)
+    states, frames = 8000, 6000
+    with LiveStream(addresses[0]) as stream:
+        until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
+        big = {**frame(0.0, 0), "rows": 64, "cols": 64, "data": bytes(2 * 64 * 64)}
+        for k in range(1, states + 1):
+            publisher.send_multipart([messages.STATE, messages.pack({**state(0.0, k), **EVERY})])
+            if k <= frames:
+                publisher.send_multipart([messages.TACTILE, messages.pack({**big, "seq": k})])
+            if k % 100 == 0:
+                select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
+        until(lambda: stream.drain(bridge, 0.0) == 0)
+        publisher.send_multipart([messages.TACTILE, messages.pack({**big, "seq": frames + 1})])
+        seen = bridge.frames
+        until(lambda: stream.drain(bridge, 0.0) and bridge.frames > seen)
+    assert bridge.dropped == states - 100  # deliberately, and told as such
+    assert list(bridge.lost) == ["hand/tactile"]
+    assert bridge.frames + bridge.lost["hand/tactile"] == frames + 1
+
+
+EVERY = {"seq_step": 1}
+
+
 def test_without_the_extra_it_names_what_to_install() -> None:
     script = (
         "import sys; sys.modules['rerun'] = None; import tools.cli as c; sys.exit(c.main(['view']))"
@@ -381,6 +415,7 @@ def test_a_recording_that_was_cut_short_is_shown_as_far_as_it_goes(
     assert cli.main(["view", str(tmp_path / "cut.mcap"), "--save", str(tmp_path / "a.rrd")]) == 0
     said = capsys.readouterr().err
     assert "cut short" in said
+    assert re.search(r"[1-9]\d* of [1-9]\d* frames drawn", said)
     assert "lost on the way: none" in said
     assert len(Shown(tmp_path / "a.rrd").rows["/plots/force", "scalars"]) > 20
 

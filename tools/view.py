@@ -38,6 +38,7 @@ _SLOW_LOOK = 1.0  # s between two looks at this process's memory
 _BREATH = 50.0  # MB that it may grow by itself
 _AHEAD = 200  # pictures of a recording that are sent before the viewer is waited for
 _PATIENCE = 60.0  # s for that
+_REST = 1.0  # s between two pictures at most, where drawing is slow
 _LOOK = 0.2  # s between two looks at the viewer
 _NICE = 5  # the viewer stands back behind everything that is in a hurry
 
@@ -186,8 +187,10 @@ class _View:
         self._recording.set_sinks(*sinks)
 
     def _show_stream(self, viewer: Viewer | None) -> None:
+        from tools.viewing.known import warm_up
         from tools.viewing.live import LiveStream
 
+        warm_up()
         bridge, ending = self._bridge, self._ending
         heard = time.monotonic()
         silent = ever = False
@@ -212,7 +215,7 @@ class _View:
                 self._tell_notes()
                 after = time.monotonic()
                 # Never busy for more than half of its time, however slow the machine is.
-                due = after + max(period - (after - now), after - now)
+                due = after + max(period - (after - now), min(after - now, _REST))
                 if not self._shows(viewer):
                     return
             stream.drain(bridge, 0.0)
@@ -286,9 +289,14 @@ class _View:
     def _account(self) -> None:
         bridge = self._bridge
         lost = ", ".join(f"{count} of {topic}" for topic, count in bridge.lost.items())
-        parts = [f"{bridge.shown} states shown", f"lost on the way: {lost or 'none'}"]
+        parts = [f"{bridge.shown} states shown"]
+        if bridge.frames:
+            parts.append(f"{bridge.drawn} of {bridge.frames} frames drawn")
         if bridge.dropped:
-            parts.append(f"{bridge.dropped} states passed over")
+            parts.append(f"{bridge.dropped} states passed over to keep up")
+        if bridge.swamped:
+            parts.append(f"{bridge.swamped} events passed over")
+        parts.append(f"lost on the way: {lost or 'none'}")
         if bridge.unreadable:
             parts.append(f"{bridge.unreadable} messages could not be read")
         self._say(", ".join(parts))

@@ -41,9 +41,11 @@ _PLOTTED = 0.2  # s of the stream that go into the plots at once: fewer, larger 
 class Bridge:
     """Takes messages, logs to ``recording``.
 
-    ``shown`` counts the states that went into the plots, ``dropped`` those that were passed over
-    since more came than are kept for one drawing, ``unreadable`` messages that are none; ``notes``
-    is what a person should be told, once each.
+    What came is told apart from what was lost on the way: ``shown`` counts the states that went
+    into the plots, ``dropped`` those that were passed over since more came than are kept for one
+    drawing, ``swamped`` likewise the events, ``frames`` those that came and ``drawn`` the newest
+    of them, ``unreadable`` messages that are none. ``notes`` is what a person should be told, once
+    each.
     """
 
     def __init__(self, recording: rr.RecordingStream, keep: int = 2000) -> None:
@@ -68,6 +70,9 @@ class Bridge:
         self._plots: dict[str, layout.Plot] = {}
         self.shown = 0
         self.dropped = 0
+        self.swamped = 0
+        self.frames = 0
+        self.drawn = 0
         self.unreadable = 0
         self.notes: list[str] = []
 
@@ -98,7 +103,9 @@ class Bridge:
             finger = text(message, "finger")
             if finger in FINGERS:
                 self._frames[finger] = message
+                self.frames += 1
         elif topic == messages.EVENT:
+            self.swamped += len(self._events) == _EVENTS
             self._events.append(message)
         elif topic == messages.STATS:
             self._statistics = message
@@ -178,6 +185,7 @@ class Bridge:
             self._at(frame)
             try:
                 drawing.frame(frame, self._state)
+                self.drawn += 1
             except ValueError:
                 self.unreadable += 1
         self._frames.clear()

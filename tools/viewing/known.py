@@ -51,6 +51,14 @@ class Hand:
         return Landscape(table, tip.radius, self.settings.safety.d_max)
 
 
+def warm_up() -> None:
+    """What takes long when it is done first, before messages wait for it."""
+    landscape = Hand().landscape()
+    if landscape is not None:
+        landscape.picture()
+        landscape.contours()
+
+
 def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:
     """A ``hand/settings``, and the keys in it that could not be read."""
     try:
