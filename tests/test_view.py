@@ -330,7 +330,7 @@ def test_while_nothing_is_read_messages_wait_and_what_is_lost_of_them_is_told(
     publisher.setsockopt(zmq.SNDHWM, 2000)  # as the daemon's
     publisher.bind(addresses[0])
     bridge = Bridge(rr.RecordingStream("test"), keep=100)
-    states, frames = 8000, 6000
+    states, frames = 20_000, 6000
     with LiveStream(addresses[0]) as stream:
         until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
         big = {**frame(0.0, 0), "rows": 64, "cols": 64, "data": bytes(2 * 64 * 64)}
