@@ -17,6 +17,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+import zmq
 
 from daemon import contract, messages
 from daemon.client import Hand
@@ -273,6 +274,28 @@ def test_ctrl_c_ends_it_with_its_account(fake: FakeDaemon, tmp_path: Path) -> No
     assert not Recording(path).truncated
 
 
+def test_what_was_sent_before_the_end_is_written(
+    addresses: tuple[str, str], context: zmq.Context[Any], tmp_path: Path
+) -> None:
+    publisher = context.socket(zmq.XPUB)
+    publisher.setsockopt(zmq.SNDHWM, 0)
+    publisher.bind(addresses[0])
+    path = tmp_path / "run.mcap"
+    process = record(path, "--address", addresses[0], "--topics", "state")
+    assert publisher.poll(20_000)
+    assert publisher.recv() == b"\x01hand/state"
+    message = sample(messages.STATE)
+    for k in range(5000):
+        publisher.send(messages.STATE, zmq.SNDMORE)
+        publisher.send(messages.pack({**message, "seq": k}))
+    process.send_signal(signal.SIGTERM)
+    status, out, _ = ended(process)
+    assert status == 0
+    assert "5000 messages written; lost on the way: none" in out
+    seqs = [read["seq"] for _, read in Recording(path).messages()]
+    assert seqs == list(range(5000))
+
+
 def test_split_files_follow_each_other(fake: FakeDaemon, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     process = record(
@@ -318,7 +341,7 @@ def test_garbage_on_the_stream_is_counted_and_left_out(fake: FakeDaemon, tmp_pat
     assert "could not be read and were left out" in out
 
 
-@pytest.mark.parametrize("missing", ["mcap", "orjson"])
+@pytest.mark.parametrize("missing", ["mcap", "orjson", "zstandard"])
 def test_a_missing_extra_is_named(tmp_path: Path, missing: str) -> None:
     code = (
         f"import sys; sys.modules[{missing!r}] = None\n"

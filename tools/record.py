@@ -30,7 +30,11 @@ With --split-size or --split-time it goes on in FILE-2.mcap, FILE-3.mcap and so 
 Exit status: 0 written, 1 not or not all, with the reason."""
 
 _WAIT = 2.0  # s without a message until the waiting is told, or --no-wait gives up
-_LOOK = 0.1  # s between two looks at the clock
+# s between two looks at the clock and the socket, where what came since then is waiting: waking for
+# each message would cost more than all that is done with it.
+_LOOK = 0.1
+_QUIET = 0.02  # s without a message after which nothing is on its way any more
+_BACKLOG = 10.0  # s for what waits when the end is asked for
 _SHOW = 0.5  # s between two progress lines
 _BATCH = 1000  # messages between two looks at the clock
 
@@ -120,6 +124,7 @@ class _Recorder:
         self._bytes = 0  # in the files before this one
         self._unreadable = 0
         self._told_waiting = False
+        self._complete = False  # all until --to has come
 
     def record(self) -> int:
         """Take messages until the end."""
@@ -130,31 +135,11 @@ class _Recorder:
         arguments = self._arguments
         context: zmq.Context[Any] = zmq.Context()
         socket = context.socket(zmq.SUB)
-        began = shown = heard = time.monotonic()
-        failure = ""
         try:
             if self._keys is not None:
                 self._keys.guard(socket)
             prepare(socket, arguments.address, *_topics(arguments.topics))
-            while not self._ending.asked:
-                ready = socket.poll(int(_LOOK * 1e3))
-                now = time.monotonic()
-                if ready:
-                    heard = now
-                    self._take_batch(socket)
-                elif self._first is None and now - began > _WAIT:
-                    if arguments.no_wait:
-                        failure = nothing(arguments.address, _WAIT, arguments.keys)
-                        break
-                    self._tell_waiting()
-                if arguments.lifeline is not None and _hung_up(arguments.lifeline):
-                    break
-                if arguments.duration is not None and now - began >= arguments.duration:
-                    break
-                if now - shown >= _SHOW:
-                    self._writer.flush()
-                    self._show(now - began, now - heard)
-                    shown = now
+            failure = self._take_all(socket)
             self._writer.close()
         except zmq.ZMQError as error:
             failure = f"{arguments.address}: {error}"
@@ -165,16 +150,67 @@ class _Recorder:
             self._clear_line()
         return self._account(failure)
 
-    def _take_batch(self, socket: Any) -> None:
+    def _take_all(self, socket: Any) -> str:
+        """Take messages until the end; why it had to end, else an empty text."""
+        arguments = self._arguments
+        began = shown = heard = time.monotonic()
+        failure = ""
+        until_quiet = _LOOK
+        while not self._ending.asked and not self._complete:
+            taken = self._take_batch(socket)
+            if taken < _BATCH:
+                time.sleep(self._pause(time.monotonic() - began))
+            now = time.monotonic()
+            if taken:
+                heard = now
+            elif self._first is None and now - began > _WAIT:
+                if arguments.no_wait:
+                    failure = nothing(arguments.address, _WAIT, arguments.keys)
+                    break
+                self._tell_waiting()
+            if arguments.lifeline is not None and _hung_up(arguments.lifeline):
+                break
+            if arguments.duration is not None and now - began >= arguments.duration:
+                until_quiet = 0.0
+                break
+            if now - shown >= _SHOW:
+                self._writer.flush()
+                self._show(now - began, now - heard)
+                shown = now
+        self._take_rest(socket, until_quiet)
+        return failure
+
+    def _pause(self, elapsed: float) -> float:
+        duration = self._arguments.duration
+        return _LOOK if duration is None else min(_LOOK, max(0.0, duration - elapsed))
+
+    def _take_batch(self, socket: Any) -> int:
+        """Take what waits; how many messages, ``_BATCH`` at most."""
         import zmq
 
-        for _ in range(_BATCH):
+        receive = socket.recv_multipart
+        for count in range(_BATCH):
             try:
-                frames = socket.recv_multipart(zmq.NOBLOCK)
+                frames = receive(zmq.NOBLOCK)
             except zmq.Again:
-                return
+                return count
             self._take(frames)
-            if self._ending.asked:
+            if self._complete:
+                return count + 1
+        return _BATCH
+
+    def _take_rest(self, socket: Any, until_quiet: float) -> None:
+        """Take what waits, and for ``until_quiet`` s at most what is still on its way.
+
+        That is what was sent before the end was asked for: a daemon's last words among it.
+        """
+        began = time.monotonic()
+        while not self._complete:
+            behind = self._take_batch(socket) == _BATCH
+            age = time.monotonic() - began
+            if behind and age < _BACKLOG:
+                continue
+            if age >= until_quiet or not socket.poll(int(_QUIET * 1e3)):
                 return
 
     def _take(self, frames: list[bytes]) -> None:
@@ -197,7 +233,7 @@ class _Recorder:
             if arguments.start and when - self._first < arguments.start:
                 return
             if arguments.end is not None and when - self._first > arguments.end:
-                self._ending.asked = True
+                self._complete = True
                 return
         gaps = self._gaps.get(topic)
         if gaps is None:
@@ -210,6 +246,8 @@ class _Recorder:
 
     def _split_if_due(self) -> None:
         arguments, writer = self._arguments, self._writer
+        if arguments.split_size is None and arguments.split_time is None:
+            return
         full = arguments.split_size is not None and writer.size >= arguments.split_size * 1e6
         age = time.monotonic() - self._opened
         if not full and (arguments.split_time is None or age < arguments.split_time):

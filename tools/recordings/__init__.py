@@ -5,5 +5,6 @@ Foxglove and PlotJuggler open the file; a float keeps all its digits, and a floa
 is null. Tactile frames are images there: one channel a finger, ``foxglove.RawImage`` with the
 topic's own fields beside it. Log times are the messages' Unix times.
 
-Needs mcap and orjson, the extra ``record``; nothing here imports them before they are needed.
+Needs mcap, orjson and zstandard, the extra ``record``; nothing here imports them before
+they are needed.
 """

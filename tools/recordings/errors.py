@@ -12,6 +12,16 @@ class NoMcap(RecordingError):
 
     def __init__(self) -> None:
         super().__init__(
-            "recordings need mcap and orjson, the extra 'record'; from the project's folder: "
-            "pip install '.[record]'"
+            "recordings need mcap, orjson and zstandard, the extra 'record'; from the "
+            "project's folder: pip install '.[record]'"
         )
+
+
+def require_packages() -> None:
+    """Raises NoMcap unless what recordings are written and read with is here."""
+    try:
+        import mcap  # noqa: F401
+        import orjson  # noqa: F401
+        import zstandard  # noqa: F401
+    except ImportError:
+        raise NoMcap from None

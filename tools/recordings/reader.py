@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tools.recordings.errors import NoMcap, RecordingError
+from tools.recordings.errors import RecordingError, require_packages
 from tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
@@ -26,11 +26,7 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            import mcap.reader  # noqa: F401
-            import orjson  # noqa: F401
-        except ImportError:
-            raise NoMcap from None
+        require_packages()
         self.path = path
         self.truncated = False
         self.damage = ""  # what ended the reading of a truncated file

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from tools.recordings.errors import NoMcap, RecordingError
+from daemon import messages
+from tools.recordings.container import Container
+from tools.recordings.errors import RecordingError, require_packages
 from tools.recordings.layout import (
     ENCODING,
     LIBRARY,
@@ -20,20 +21,16 @@ from tools.recordings.layout import (
     to_json,
 )
 
-if TYPE_CHECKING:
-    from mcap.writer import Writer
-
 # What a killed recorder loses at most: messages that did not fill a chunk yet.
 CHUNK = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
 
 
 class _Channel:
-    """A channel's number, its converter and how many messages it has."""
+    """A channel's number and its converter."""
 
     def __init__(self, number: int, convert: Converter) -> None:
         self.number = number
         self.convert = convert
-        self.count = 0
 
 
 class RecordingWriter:
@@ -43,11 +40,9 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            import orjson
-            from mcap.writer import CompressionType, Writer
-        except ImportError:
-            raise NoMcap from None
+        require_packages()
+        import orjson
+
         self.path = path
         try:
             self._file = path.open("xb")
@@ -57,77 +52,59 @@ class RecordingWriter:
             raise RecordingError(f"{path}: {error.strerror}") from None
         self._dumps = orjson.dumps
         self._json_error = orjson.JSONEncodeError
-        self._channels: dict[str, _Channel] = {}
+        self._channels: dict[bytes | str, _Channel] = {}  # by topic, frames' by channel
         self._schemas: dict[bytes, int] = {}
-        self._writer: Writer | None = Writer(
-            self._file, chunk_size=CHUNK, compression=CompressionType.ZSTD
-        )
+        self._ended = False
         self.messages = 0
         self.unfit = 0  # messages that JSON can't hold
-        self.first = math.nan  # Unix time of the earliest message [s]
-        self.last = math.nan
-        self._writer.start(profile=PROFILE, library=LIBRARY)
+        try:
+            self._container = Container(self._file, PROFILE, LIBRARY, CHUNK)
+        except OSError as error:
+            raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
         """Write one message; the map may be changed. Raises RecordingError."""
-        assert self._writer is not None
-        name = channel_name(topic, message)
+        assert not self._ended
+        key = channel_name(topic, message) if topic == messages.TACTILE else topic
+        channel = self._channels.get(key)
+        if channel is None:
+            channel = self._channels[key] = self._open(channel_name(topic, message), topic)
         stamp = message.get("timestamp")
         when = stamp if isinstance(stamp, float) and 0.0 <= stamp < 1e10 else time.time()
         sequence = message.get("seq")
-        channel = self._channels.get(name) or self._open(name, topic)
+        if not isinstance(sequence, int):
+            sequence = 0
         try:
             data = self._dumps(channel.convert(message))
         except (self._json_error, TypeError):
             self.unfit += 1
             return
-        nanoseconds = int(when * 1e9)
         try:
-            self._writer.add_message(
-                channel.number,
-                nanoseconds,
-                data,
-                nanoseconds,
-                sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0,
-            )
+            self._container.message(channel.number, int(when * 1e9), sequence & 0xFFFFFFFF, data)
         except OSError as error:
             raise self._failed(error) from None
-        channel.count += 1
         self.messages += 1
-        self.first = when if math.isnan(self.first) else min(self.first, when)
-        self.last = when if math.isnan(self.last) else max(self.last, when)
 
     def _open(self, name: str, topic: bytes) -> _Channel:
-        assert self._writer is not None
         schema = self._schemas.get(topic)
         if schema is None:
             title, fields = schema_of(topic)
-            schema = self._writer.register_schema(
-                title, SCHEMA_ENCODING, json.dumps(fields, ensure_ascii=False).encode()
-            )
-            self._schemas[topic] = schema
-        number = self._writer.register_channel(name, ENCODING, schema)
-        channel = self._channels[name] = _Channel(number, to_json(topic))
-        return channel
+            text = json.dumps(fields, ensure_ascii=False).encode()
+            schema = self._schemas[topic] = self._container.schema(title, SCHEMA_ENCODING, text)
+        return _Channel(self._container.channel(name, ENCODING, schema), to_json(topic))
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Put a file into the recording, as the settings are. Raises RecordingError."""
-        assert self._writer is not None
-        now = time.time_ns()
+        assert not self._ended
         try:
-            self._writer.add_attachment(now, now, name, media_type, data)
+            self._container.attachment(time.time_ns(), name, media_type, data)
         except OSError as error:
             raise self._failed(error) from None
 
     @property
     def size(self) -> int:
         """Bytes in the file so far; a chunk's messages count once it is full."""
-        return 0 if self._file.closed else self._file.tell()
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Messages by channel."""
-        return {name: channel.count for name, channel in self._channels.items()}
+        return self._container.size
 
     def flush(self) -> None:
         """Hand to the system what chunks are full: from then on a killed process loses it not."""
@@ -138,17 +115,17 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Write the last chunk and the summary. Raises RecordingError."""
-        writer, self._writer = self._writer, None
-        if writer is None:
+        if self._ended:
             return
+        self._ended = True
         try:
-            writer.finish()  # type: ignore[no-untyped-call]
+            self._container.finish()
             self._file.close()
         except OSError as error:
             raise self._failed(error) from None
 
     def _failed(self, error: OSError) -> RecordingError:
-        self._writer = None
+        self._ended = True
         try:
             self._file.close()
         except OSError:
