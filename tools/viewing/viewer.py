@@ -1,8 +1,8 @@
 """Rerun's viewer as a child process: its window, or its web viewer behind a page of ours.
 
 All its sockets are on the loopback, its memory is bounded, and it ends with this process, whatever
-ends this one. Its makers' usage statistics stay off: the window's by its environment, the web
-viewer's by what the page is allowed to reach (`tools.viewing.page`).
+ends this one. It reaches no other machine, for news, examples or its makers' usage statistics: the
+window by its environment, the web viewer by what the page is allowed to (`tools.viewing.page`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,11 @@ from tools.viewing.page import Page, viewer_address
 
 LOOPBACK = "127.0.0.1"
 _START = 20.0  # s that a viewer may take until it listens
+_NOWHERE = f"http://{LOOPBACK}:9"  # a proxy that is none: what would go out ends here
+_QUIET = {
+    **{"CI": "1", "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
+    **dict.fromkeys(("ALL_PROXY", "HTTPS_PROXY", "HTTP_PROXY"), _NOWHERE),
+}
 _PR_SET_PDEATHSIG = 1  # from <sys/prctl.h>
 
 
@@ -46,13 +51,13 @@ class Viewer:
         words = [str(_program()), "--bind", LOOPBACK, "--port", str(self.receiver)]
         words += ["--server-memory-limit", bound]
         if window:
-            words += ["--memory-limit", bound, "--expect-data-soon"]
+            words += ["--memory-limit", bound, "--hide-welcome-screen"]
         else:
             words += ["--serve-web", "--web-viewer-port", str(hidden)]
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  closed with the viewer
         self._process = subprocess.Popen(
             words,
-            env={**os.environ, "CI": "1", "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
+            env={**os.environ, **_QUIET},
             stdin=subprocess.DEVNULL,
             stdout=self._said,
             stderr=self._said,
