@@ -220,11 +220,13 @@ def test_recording_a_running_daemon_loses_nothing(
     assert recording.count(messages.TACTILE) > 20
 
 
+@pytest.mark.parametrize("padding", [0, 20_000])
 def test_a_killed_recorder_leaves_a_file_that_can_be_closed(
-    fake: FakeDaemon, tmp_path: Path
+    fake: FakeDaemon, tmp_path: Path, padding: int
 ) -> None:
+    """Chunks that take seconds to fill are written all the same."""
     path = tmp_path / "run.mcap"
-    fake.changes = {"padding": "x" * 20_000}  # fills chunks fast
+    fake.changes = {"padding": "x" * padding}
     process = record(path, "--address", fake.state_address)
     until(lambda: path.exists() and path.stat().st_size > 3000)
     process.kill()

@@ -96,51 +96,10 @@ class Container:
         self._parts += (_MESSAGE_HEAD.pack(_MESSAGE, length, channel, sequence, when, when), data)
         self._filled += 9 + length
         if self._filled > self._chunk:
-            self._end_chunk()
+            self.end_chunk()
 
-    def attachment(self, when: int, name: str, media_type: str, data: bytes) -> None:
-        """Put a file beside the messages."""
-        told = struct.pack("<QQ", when, when)
-        body = told + _text(name) + _text(media_type) + struct.pack("<Q", len(data)) + data
-        body += struct.pack("<I", zlib.crc32(body))
-        record = _record(_ATTACHMENT, body)
-        place = struct.pack("<QQ", self.size, len(record)) + told + struct.pack("<Q", len(data))
-        self._attachments += _record(_ATTACHMENT_INDEX, place + _text(name) + _text(media_type))
-        self._attachment_count += 1
-        self._write(record)
-
-    def finish(self) -> None:
-        """Write what is left and the summary."""
-        self._end_chunk()
-        self._write(_record(_DATA_END, struct.pack("<I", 0)))
-        groups = (
-            (_SCHEMA, b"".join(self._schemas)),
-            (_CHANNEL, b"".join(self._channels)),
-            (_STATISTICS, self._statistics()),
-            (_CHUNK_INDEX, bytes(self._chunks)),
-            (_ATTACHMENT_INDEX, bytes(self._attachments)),
-        )
-        start = place = self.size
-        offsets = []
-        for opcode, records in groups:
-            if records:
-                place_and_length = struct.pack("<BQQ", opcode, place, len(records))
-                offsets.append(_record(_SUMMARY_OFFSET, place_and_length))
-            place += len(records)
-        summary = b"".join(records for _, records in groups) + b"".join(offsets)
-        footer = struct.pack("<BQQQ", _FOOTER, 20, start, place)
-        checksum = zlib.crc32(summary + footer)
-        self._write(summary + footer + struct.pack("<I", checksum) + _MAGIC)
-
-    def _write(self, data: bytes) -> None:
-        self._file.write(data)
-        self.size += len(data)
-
-    def _append(self, record: bytes) -> None:
-        self._parts.append(record)
-        self._filled += len(record)
-
-    def _end_chunk(self) -> None:
+    def end_chunk(self) -> None:
+        """Write the messages that are waiting for their chunk to fill."""
         indices = {channel: index for channel, index in self._indices.items() if index}
         if not indices:
             return
@@ -176,6 +135,48 @@ class Container:
             index.clear()
         self._parts.clear()
         self._filled = 0
+
+    def attachment(self, when: int, name: str, media_type: str, data: bytes) -> None:
+        """Put a file beside the messages."""
+        told = struct.pack("<QQ", when, when)
+        body = told + _text(name) + _text(media_type) + struct.pack("<Q", len(data)) + data
+        body += struct.pack("<I", zlib.crc32(body))
+        record = _record(_ATTACHMENT, body)
+        place = struct.pack("<QQ", self.size, len(record)) + told + struct.pack("<Q", len(data))
+        self._attachments += _record(_ATTACHMENT_INDEX, place + _text(name) + _text(media_type))
+        self._attachment_count += 1
+        self._write(record)
+
+    def finish(self) -> None:
+        """Write what is left and the summary."""
+        self.end_chunk()
+        self._write(_record(_DATA_END, struct.pack("<I", 0)))
+        groups = (
+            (_SCHEMA, b"".join(self._schemas)),
+            (_CHANNEL, b"".join(self._channels)),
+            (_STATISTICS, self._statistics()),
+            (_CHUNK_INDEX, bytes(self._chunks)),
+            (_ATTACHMENT_INDEX, bytes(self._attachments)),
+        )
+        start = place = self.size
+        offsets = []
+        for opcode, records in groups:
+            if records:
+                place_and_length = struct.pack("<BQQ", opcode, place, len(records))
+                offsets.append(_record(_SUMMARY_OFFSET, place_and_length))
+            place += len(records)
+        summary = b"".join(records for _, records in groups) + b"".join(offsets)
+        footer = struct.pack("<BQQQ", _FOOTER, 20, start, place)
+        checksum = zlib.crc32(summary + footer)
+        self._write(summary + footer + struct.pack("<I", checksum) + _MAGIC)
+
+    def _write(self, data: bytes) -> None:
+        self._file.write(data)
+        self.size += len(data)
+
+    def _append(self, record: bytes) -> None:
+        self._parts.append(record)
+        self._filled += len(record)
 
     def _statistics(self) -> bytes:
         counts = b"".join(struct.pack("<HQ", *each) for each in self._counts.items())

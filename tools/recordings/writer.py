@@ -21,7 +21,7 @@ from tools.recordings.layout import (
     to_json,
 )
 
-# What a killed recorder loses at most: messages that did not fill a chunk yet.
+# What a killed recorder loses at most: what didn't fill a chunk yet, since the last flush.
 CHUNK = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
 
 
@@ -107,8 +107,10 @@ class RecordingWriter:
         return self._container.size
 
     def flush(self) -> None:
-        """Hand to the system what chunks are full: from then on a killed process loses it not."""
+        """Hand all to the system, in a short chunk: from then on a killed process loses it not."""
+        assert not self._ended
         try:
+            self._container.end_chunk()
             self._file.flush()
         except OSError as error:
             raise self._failed(error) from None
