@@ -370,3 +370,23 @@ def test_topics_by_name(fake: FakeDaemon, tmp_path: Path) -> None:
     status, _, error = ended(record(tmp_path / "b.mcap", "--topics", "dreams"))
     assert status == 2
     assert "found topic 'dreams', expected one of state, tactile" in error
+
+
+def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path: Path) -> None:
+    """A daemon that runs for hours tells a recorder its first events and settings again."""
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path)
+    old = {"schema": 1, "seq": 1, "again": True, "timestamp": 1.7e9 - 7200.0, "mono_ns": 5}
+    writer.add(b"hand/settings", dict(old))
+    for k in range(3):
+        writer.add(b"hand/state", {"schema": 1, "seq": k, "timestamp": 1.7e9 + 0.25 * k})
+    writer.add(b"hand/event", {**old, "seq": 2})
+    writer.close()
+    recording = Recording(path)
+    assert (recording.start, recording.duration) == (pytest.approx(1.7e9), pytest.approx(0.5))
+    kept = [message for topic, message in recording.messages() if b"state" not in topic]
+    assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2  # as it was told
+    lonely = RecordingWriter(tmp_path / "b.mcap")
+    lonely.add(b"hand/settings", dict(old))
+    lonely.close()
+    assert Recording(tmp_path / "b.mcap").count(b"hand/settings") == 1

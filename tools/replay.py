@@ -93,13 +93,14 @@ def _publish(arguments: argparse.Namespace, recording: Any) -> int:
             while not ended and time.monotonic() < waited and not wire.subscribed(0.1):
                 pass
             sent = 0
-            began = first = None
+            began, first = time.monotonic(), None
             end_at = float("inf") if arguments.end is None else arguments.end
             for topic, message in recording.messages(start=arguments.start, end=end_at):
                 stamp = message.get("timestamp", 0.0)
-                if began is None or first is None:
+                again = message.get("again") is True  # its time is from before the recording
+                if first is None and not again:
                     began, first = time.monotonic(), stamp
-                due = began + (stamp - first) / arguments.speed
+                due = began if again or first is None else began + (stamp - first) / arguments.speed
                 while not ended and (left := due - time.monotonic()) > 0.0:
                     wire.subscribed(min(left, 0.1))
                 if ended:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,8 @@ class RecordingWriter:
         self._channels: dict[bytes | str, _Channel] = {}  # by topic, frames' by channel
         self._schemas: dict[bytes, int] = {}
         self._ended = False
+        self._newest = math.nan  # time of the newest message [s]
+        self._early: list[tuple[bytes, dict[str, Any]]] = []  # told again before any other came
         self.messages = 0
         self.unfit = 0  # messages that JSON can't hold
         try:
@@ -63,14 +66,35 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Write one message; the map may be changed. Raises RecordingError."""
+        """Write one message; the map may be changed. Raises RecordingError.
+
+        What is told again has its first time in it, from before the recording: in the file it
+        stands where it came, so that the file's time is the recording's own.
+        """
         assert not self._ended
+        stamp = message.get("timestamp")
+        when = stamp if isinstance(stamp, float) and 0.0 <= stamp < 1e10 else time.time()
+        if message.get("again") is not True:
+            self._newest = when
+            if self._early:
+                self._write_early(when)
+        elif math.isnan(self._newest):
+            self._early.append((topic, message))
+            return
+        else:
+            when = self._newest
+        self._write(topic, message, when)
+
+    def _write_early(self, when: float) -> None:
+        early, self._early = self._early, []
+        for topic, message in early:
+            self._write(topic, message, when)
+
+    def _write(self, topic: bytes, message: dict[str, Any], when: float) -> None:
         key = channel_name(topic, message) if topic == messages.TACTILE else topic
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = self._open(channel_name(topic, message), topic)
-        stamp = message.get("timestamp")
-        when = stamp if isinstance(stamp, float) and 0.0 <= stamp < 1e10 else time.time()
         sequence = message.get("seq")
         if not isinstance(sequence, int):
             sequence = 0
@@ -119,6 +143,8 @@ class RecordingWriter:
         """Write the last chunk and the summary. Raises RecordingError."""
         if self._ended:
             return
+        if self._early:
+            self._write_early(time.time())
         self._ended = True
         try:
             self._container.finish()
