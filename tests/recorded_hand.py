@@ -8,7 +8,6 @@ from typing import Any
 
 import msgpack
 
-from daemon import messages
 from daemon.assembly import Daemon, facts
 from daemon.commands import Handler, Refused
 from daemon.profiles import load
@@ -56,13 +55,13 @@ def published(
     )
     taken: Messages = []
 
-    def take(topic: bytes, message: dict[str, Any]) -> None:
-        taken.append((topic, msgpack.unpackb(messages.pack(message))))
+    def take(topic: bytes, packed: bytes) -> None:
+        taken.append((topic, msgpack.unpackb(packed)))
 
     with Daemon(settings) as daemon:
         publisher = daemon.publisher
         assert publisher is not None
-        publisher._send = take  # type: ignore[method-assign]
+        publisher._send_packed = take  # type: ignore[method-assign]
         publisher._subscriptions.add(b"hand/")
         publisher.refresh()
         publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
