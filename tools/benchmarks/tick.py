@@ -9,6 +9,7 @@ from typing import Any
 
 import zmq
 
+from daemon import messages
 from daemon.assembly import Daemon
 from daemon.loop import Loop
 from daemon.settings import Settings
@@ -17,27 +18,31 @@ from tools.benchmarks.report import Row, row
 
 _TICKS = 20_000
 _SECONDS = 20  # of virtual time
+_SUBSCRIBERS: dict[tuple[bytes, ...], str] = {
+    (): "nobody subscribed",
+    (messages.STATE, messages.TACTILE): "state and frames subscribed",
+    (messages.STATE, messages.TACTILE, messages.INPUT): "every tick's input, too",
+}
 
 
 def measure() -> list[Row]:
     """Ticks of a hand that holds an object, in µs."""
     rows = [_virtual_second()]
-    for subscribed in (False, True):
-        words = "state and frames subscribed" if subscribed else "nobody subscribed"
+    for topics, words in _SUBSCRIBERS.items():
         for canned in (True, False):
             plant = "pipeline alone" if canned else "with the simulated hand's physics"
-            with _holding(subscribed) as daemon:
+            with _holding(topics) as daemon:
                 if canned:
                     can(daemon)
                 samples = _run(daemon.loop, daemon)
-            aim = 20.0 if canned else None
+            aim = 20.0 if canned and len(topics) < 3 else None
             rows.append(row(f"tick, {plant}, {words}", "µs", samples, aim))
     return rows
 
 
 def _virtual_second() -> Row:
     """The whole daemon on virtual time: physics, rendered frames, estimator, control."""
-    with _holding(subscribed=False) as daemon:
+    with _holding(()) as daemon:
         samples = []
         for _ in range(_SECONDS):
             before = time.perf_counter()
@@ -47,8 +52,8 @@ def _virtual_second() -> Row:
 
 
 @contextmanager
-def _holding(subscribed: bool) -> Iterator[Daemon]:
-    """A daemon on virtual time that has grasped the simulated object."""
+def _holding(topics: tuple[bytes, ...]) -> Iterator[Daemon]:
+    """A daemon on virtual time that has grasped the simulated object, and who subscribes."""
     settings = Settings.model_validate(
         {
             "loop": {"clock": "virtual"},
@@ -59,9 +64,9 @@ def _holding(subscribed: bool) -> Iterator[Daemon]:
     context: zmq.Context[Any] = zmq.Context()
     socket = context.socket(zmq.SUB)
     with Daemon(settings) as daemon:
-        if subscribed:
-            socket.setsockopt(zmq.SUBSCRIBE, b"hand")
-            socket.connect(settings.stream.address)
+        for topic in topics:
+            socket.setsockopt(zmq.SUBSCRIBE, topic)
+        socket.connect(settings.stream.address)
         hold(daemon)
         yield daemon
     socket.close(linger=0)
