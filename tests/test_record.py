@@ -22,7 +22,7 @@ import zmq
 from daemon import contract, messages
 from daemon.client import Hand
 from tests.conftest import until
-from tests.daemon_process import SOFTFINGER, Running
+from tests.daemon_process import SOFTFINGER, Running, softfinger
 from tests.fake_daemon import FakeDaemon, frame, state
 from tests.test_contract import flat, sample
 from tools.recordings.errors import RecordingError
@@ -327,6 +327,7 @@ def test_no_daemon_is_waited_for_or_not(addresses: tuple[str, str], tmp_path: Pa
     assert "waiting for a stream" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert ended(process)[0] == 0
+    assert not list(tmp_path.iterdir())  # nothing came, and nothing is in the next one's way
 
 
 def test_garbage_on_the_stream_is_counted_and_left_out(fake: FakeDaemon, tmp_path: Path) -> None:
@@ -390,3 +391,30 @@ def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path: Path
     lonely.add(b"hand/settings", dict(old))
     lonely.close()
     assert Recording(tmp_path / "b.mcap").count(b"hand/settings") == 1
+
+
+def test_a_damaged_chunk_is_told_and_left_out_and_recovered(
+    tmp_path: Path, addresses: tuple[str, str]
+) -> None:
+    path = tmp_path / "bent.mcap"
+    sent = written(path, 3000)
+    assert Recording(path).check()
+    bent = bytearray(path.read_bytes())
+    place = len(bent) // 2
+    bent[place : place + 4] = bytes(each ^ 0x55 for each in bent[place : place + 4])
+    path.write_bytes(bent)
+    told: list[str] = []
+    recording = Recording(path, told.append)
+    read = list(recording.messages())
+    assert not recording.truncated
+    assert len(told) == 1
+    assert "damaged (" in told[0]
+    assert 1000 < len(read) < len(sent)
+    assert read[0] == sent[0]
+    assert read[-1] == sent[-1]  # what comes behind it is there
+    fast = ("--no-wait", "--speed", "1e6", "--address", addresses[0])
+    for words in (("export", "--topics", "state"), ("replay", *fast)):
+        done = softfinger(words[0], str(path), *words[1:])
+        assert "damaged (" in done.stderr, words
+    assert recover(path)[0] == len(read)
+    assert Recording(path).check()

@@ -117,6 +117,9 @@ def test_what_lacks_in_a_recording_is_told(taken: Messages, tmp_path: Path) -> N
             message["seq_step"] = 4
     with pytest.raises(RecordingError, match="one of 4 frames was published"):
         recompute(record(tmp_path / "thinned.mcap", thinned))
+    other = load(changes=["tactile.rows=32", "tactile.cols=32"])
+    with pytest.raises(RecordingError, match="44 × 44 cells, the settings' sensors 32 × 32"):
+        recompute(record(tmp_path / "other.mcap", taken), other)
 
 
 def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(

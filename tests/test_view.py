@@ -401,6 +401,7 @@ def test_bad_input_is_one_clear_line(
         status = ended.code
     assert status in (1, 2)
     assert reason in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.rrd"))  # no file without content, in the next one's way
 
 
 def test_a_recording_that_was_cut_short_is_shown_as_far_as_it_goes(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,6 +72,11 @@ def nothing(address: str, seconds: float, folder: Path | None) -> str:
 
 def _hint(folder: Path | None) -> str:
     return " (with access.keys it needs --keys FOLDER)" if folder is None else ""
+
+
+def teller(subcommand: str) -> Callable[[str], None]:
+    """What tells a person a word beside the work."""
+    return lambda said: print(f"{subcommand}: {said}", file=sys.stderr, flush=True)
 
 
 def seconds(text: str) -> float:

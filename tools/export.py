@@ -7,7 +7,7 @@ import math
 import sys
 from pathlib import Path
 
-from tools.arguments import moment, seconds
+from tools.arguments import moment, seconds, teller
 from tools.recordings.errors import RecordingError
 
 _EPILOG = """\
@@ -47,9 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     start = -math.inf if arguments.start is None else arguments.start
     end = math.inf if arguments.end is None else arguments.end
     try:
-        recording = Recording(path)
-        if recording.truncated:
-            print(f"export: {path} is cut short: {recording.damage}", file=sys.stderr)
+        recording = Recording(path, teller("export"))
         topics = _topics(arguments.topics, recording.topics)
         folder.mkdir(parents=True, exist_ok=True)
         with Progress("export", recording.size) as progress:

@@ -7,7 +7,7 @@ import math
 import sys
 from pathlib import Path
 
-from tools.arguments import moment, seconds
+from tools.arguments import moment, seconds, teller
 from tools.recordings.errors import RecordingError
 
 # Beside each other in help, so that a page can be chosen without drawing all.
@@ -64,9 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         with style.settings():
             pass  # before a long recording is read: is there anything to draw with?
-        recording = Recording(path)
-        if recording.truncated:
-            print(f"plot: {path} is cut short: {recording.damage}", file=sys.stderr)
+        recording = Recording(path, teller("plot"))
         with Progress("plot", recording.size) as progress:
             held = load_run(recording, start, end, cache_folder(), progress)
         folder.mkdir(parents=True, exist_ok=True)

@@ -98,7 +98,8 @@ def _recover(path: Path) -> int:
 
     messages, damage = recover(path)
     print(
-        f"{path}: {messages} messages; " + (f"cut short ({damage}), closed" if damage else "sound")
+        f"{path}: {messages} messages; "
+        + (f"was not whole ({damage}), what was sound is closed" if damage else "sound")
     )
     return 0
 
@@ -289,6 +290,9 @@ class _Recorder:
         return sum(gaps.lost for gaps in self._gaps.values())
 
     def _account(self, failure: str) -> int:
+        if not self._messages:  # nothing came: no file, which would be in the next one's way
+            for path in self._files:
+                path.unlink(missing_ok=True)
         for path in self._files:
             if path.exists():
                 print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.settings import SettingsError, Stream
-from tools.arguments import moment, seconds
+from tools.arguments import moment, seconds, teller
 from tools.recordings.errors import RecordingError
 
 _EPILOG = """\
@@ -61,9 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tools.recordings.reader import Recording
 
     try:
-        recording = Recording(arguments.file)
-        if recording.truncated:
-            print(f"replay: {arguments.file} is cut short: {recording.damage}", file=sys.stderr)
+        recording = Recording(arguments.file, teller("replay"))
         return (
             _recompute(arguments, recording)
             if arguments.recompute

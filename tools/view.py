@@ -119,6 +119,7 @@ class _View:
         self._keys = client_keys(arguments.keys)
         self._ending = ending
         self._notes_told = 0
+        self._saves = False
         self._looked = -math.inf
         self._resident = math.inf  # MB, the least since something is shown
         self._rerun = rerun
@@ -134,7 +135,7 @@ class _View:
         if arguments.file is not None:
             from tools.recordings.reader import Recording
 
-            recording = Recording(arguments.file)
+            recording = Recording(arguments.file, self._say)
         os.nice(_NICE)
         viewer = None
         try:
@@ -149,6 +150,9 @@ class _View:
             if viewer is not None:  # first: one that hangs would hold up what follows
                 viewer.close()
             self._recording.disconnect()
+            if self._saves and self._bridge.shown == 0 and arguments.save is not None:
+                arguments.save.unlink(missing_ok=True)  # it would be in the next one's way
+                self._saves = False
         self._account()
         if self._bridge.shown == 0:
             where = arguments.address if recording is None else arguments.file
@@ -177,6 +181,7 @@ class _View:
         if save is not None:
             try:
                 save.touch(exist_ok=False)
+                self._saves = True
             except FileExistsError:
                 raise ViewError(f"{save}: is there already") from None
             except OSError as error:
@@ -226,8 +231,6 @@ class _View:
         from tools.viewing.bridge import TOPICS
 
         arguments, bridge = self._arguments, self._bridge
-        if recording.damage:
-            self._say(f"{recording.path}: cut short ({recording.damage}); what is sound is shown")
         drawn, period, pictures = math.nan, 1.0 / arguments.rate, 0
         with Progress("view", recording.size) as progress:
             end = math.inf if arguments.end is None else arguments.end
@@ -300,7 +303,7 @@ class _View:
         if bridge.unreadable:
             parts.append(f"{bridge.unreadable} messages could not be read")
         self._say(", ".join(parts))
-        if self._arguments.save is not None:
+        if self._saves:
             size = self._arguments.save.stat().st_size
             self._say(f"{self._arguments.save}: {size / 1e6:.2f} MB")
 

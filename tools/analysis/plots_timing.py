@@ -58,6 +58,8 @@ def _histogram(panel: Axes, values: FloatArray) -> None:
     if wide:
         edges = np.geomspace(low, high * 1.0001, _BINS + 1)
         panel.set_xscale("log")
+        if high < 100.0 * low:  # else the decades are enough
+            _name_ticks(panel, low, high)
     else:
         reach = max(high - low, 0.02 * high)
         edges = np.linspace(low - 0.02 * reach, high + 0.02 * reach, _BINS + 1)
@@ -75,6 +77,19 @@ def _histogram(panel: Axes, values: FloatArray) -> None:
         panel.axvline(value, color=style.INK, linestyle=dash, linewidth=0.9, label=shown)
     panel.legend(loc="upper right", handlelength=1.6, frameon=True, framealpha=1.0, edgecolor="w")
     panel.set_ylim(top=panel.get_ylim()[1] * 12.0)  # room for the legend
+
+
+def _name_ticks(panel: Axes, low: float, high: float) -> None:
+    """Few round numbers on a logarithmic axis of less than two decades."""
+    from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
+
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    round_numbers = np.concatenate([decades, 2.0 * decades, 5.0 * decades])
+    shown = np.sort(round_numbers[(round_numbers >= low) & (round_numbers <= high)])
+    panel.xaxis.set_major_locator(FixedLocator(shown.tolist()))
+    panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    panel.xaxis.set_minor_locator(NullLocator())
+    panel.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _table(panel: Axes, stats: dict[str, Any]) -> None:

@@ -20,6 +20,7 @@ from daemon.model import FingerModel, make_models
 from daemon.records import FINGERS
 from daemon.settings import Settings
 from daemon.tactile.recording import load_recording
+from tools.arguments import teller
 from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
 
@@ -60,7 +61,7 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     from daemon.recompute import with_calibrations
     from tools.recordings.recomputed import recorded_settings
 
-    recording = Recording(path)
+    recording = Recording(path, teller("analyse"))
     if not recording.count(messages.TACTILE):
         raise RecordingError(f"{path}: no tactile frames in it")
     if own:

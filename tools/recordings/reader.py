@@ -22,14 +22,16 @@ class Recording:
 
     ``counts`` messages by channel, ``start`` and ``end`` [Unix s] (NaN when empty) and
     ``attachments`` come from the summary at the file's end. A file without one, as a killed
-    recorder leaves it, is ``truncated``: it is read through once instead.
+    recorder leaves it, is ``truncated``: it is read through once instead. Chunks that are damaged
+    are left out. ``tell`` is called once with what is wrong with the file, as soon as it is known.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
         require_packages()
         self.path = path
         self.truncated = False
-        self.damage = ""  # what ended the reading of a truncated file
+        self.damage = ""  # what is wrong with it, as far as it was read
+        self._tell = tell
         self.counts: dict[str, int] = {}
         self.start = math.nan
         self.end = math.nan
@@ -45,8 +47,10 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         if summary is None:
-            self._damaged(None)
+            self.truncated = True
             self._scan()
+            if not self.damage:
+                self._damaged(None)
         else:
             self._take(summary)
 
@@ -79,7 +83,8 @@ class Recording:
         """Topic and map of each message, as it came off the wire, from ``start`` to ``end`` s.
 
         Times count from the recording's first message. ``progress`` is told the bytes of the file
-        that are behind. A truncated file ends where its sound part ends.
+        that are behind. A truncated file ends where its sound part ends; a damaged chunk is left
+        out.
         """
         import orjson
         from mcap.records import Message
@@ -97,10 +102,10 @@ class Recording:
             if chunk.message_end_time < begin or chunk.message_start_time > finish:
                 continue
             try:
-                records = breakup_chunk(chunk)
+                records = breakup_chunk(chunk, validate_crc=True)
             except Exception as error:  # the format's, the compression's and more of their kinds
                 self._damaged(error)
-                return
+                continue
             for record in records:
                 if not isinstance(record, Message) or record.channel_id not in wanted:
                     continue
@@ -133,9 +138,24 @@ class Recording:
             except Exception as error:
                 self._damaged(error)
 
+    def check(self) -> bool:
+        """Read every chunk; whether the file is whole and sound."""
+        from mcap.stream_reader import get_chunk_data_stream
+
+        for chunk in self._chunks():
+            try:
+                get_chunk_data_stream(chunk, validate_crc=True)
+            except Exception as error:
+                self._damaged(error)
+        return not self.truncated and not self.damage
+
     def _damaged(self, error: Exception | None) -> None:
-        self.truncated = True
-        self.damage = str(error or "") or "its end is missing"
+        first = not self.damage
+        nameless = "its end is missing" if self.truncated else "a chunk can't be read"
+        self.damage = self.damage or str(error or "") or nameless
+        if first and self._tell is not None:
+            what = "cut short" if self.truncated else "damaged"
+            self._tell(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
 
     def _summary(self) -> Summary | None:
         from mcap.exceptions import EndOfFile, InvalidMagic
@@ -164,6 +184,7 @@ class Recording:
             except RecordingError:
                 raise
             except Exception as error:
+                self.truncated = True
                 self._damaged(error)
         return None
 
@@ -191,7 +212,7 @@ class Recording:
                 records = breakup_chunk(chunk, validate_crc=True)
             except Exception as error:
                 self._damaged(error)
-                break
+                continue
             self.chunks += 1
             for record in records:
                 if isinstance(record, Message) and record.channel_id in names:

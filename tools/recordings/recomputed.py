@@ -98,6 +98,12 @@ def recompute(
             if counts is None:
                 result.missing_frames += 1
                 continue
+            if counts.shape != (used.tactile.rows, used.tactile.cols):
+                raise RecordingError(
+                    f"{recording.path}: its frames have {counts.shape[0]} × {counts.shape[1]} "
+                    f"cells, the settings' sensors {used.tactile.rows} × {used.tactile.cols}: "
+                    "another hand's recording, or another hand's settings"
+                )
             taken[finger] = Frame(
                 part["frame_seq"],
                 part["frame_t"],

@@ -17,7 +17,7 @@ def recover(path: Path) -> tuple[int, str]:
     Raises RecordingError.
     """
     recording = Recording(path)
-    if not recording.truncated:
+    if recording.check():
         return recording.total, ""
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)
