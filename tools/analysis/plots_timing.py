@@ -84,7 +84,8 @@ def _name_ticks(panel: Axes, low: float, high: float) -> None:
     from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    round_numbers = np.concatenate([decades, 2.0 * decades, 5.0 * decades])
+    parts = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if high < 4.0 * low else (1.0, 2.0, 5.0)
+    round_numbers = np.concatenate([part * decades for part in parts])
     shown = np.sort(round_numbers[(round_numbers >= low) & (round_numbers <= high)])
     panel.xaxis.set_major_locator(FixedLocator(shown.tolist()))
     panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
