@@ -12,24 +12,24 @@ from typing import Any, Protocol
 
 from daemon.broadcast import Broadcast
 from daemon.clock import Clock
-from daemon.commands import CommandServer, Handler, Refused
+from daemon.commands import Handler, Refused
 from daemon.control import Control
+from daemon.drive import Drive
 from daemon.messages import Truth
-from daemon.modes import Command, Lease, Mode, parse
+from daemon.modes import Command, Mode
+from daemon.orders import Orders
 from daemon.perception import FingerPerception
 from daemon.prediction import Held, Prediction
-from daemon.records import FINGERS, Contact, State
+from daemon.records import Contact, State
 from daemon.safety import BUS, Safety
 from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
 from daemon.statistics import Statistics, record
 from daemon.stream import Publisher
-from daemon.tactile.base import TactileError
 from daemon.task import Task, TaskOver
 
 EventSink = Callable[[str, str, str], None]
 
-_RETRY = 0.5  # s between two tries to turn torque off
 _STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
 _DEAF = 0.1  # s in which what waited meanwhile has come through the socket's own thread
 _LATE = 0.05  # s after its deadline from which a late tick is told
@@ -65,7 +65,6 @@ class Loop:
         self.period = 1.0 / settings.loop.rate
         self._settings = settings
         self._clock = clock
-        self.servos = servos
         self.perceptions = perceptions
         self._prediction = prediction
         self._held = Held() if prediction is None else prediction.held
@@ -73,12 +72,23 @@ class Loop:
         self._server = server
         self._on_event = on_event
         self._control = Control(settings, servos is not None, bool(perceptions))
-        self._lease = Lease(settings.commands.lease)
         self._task = Task.named(settings.task)
         self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
         sensors = bool(perceptions)
         self._safety = Safety(
             settings, servos is not None, sensors, self._held, self._frames, perceptions
+        )
+        self._drive = Drive(servos, self.state, self._safety, self._fail, self.emit)
+        self._orders = Orders(
+            settings,
+            self.state,
+            self._control,
+            self._safety,
+            self._drive,
+            perceptions,
+            self.emit,
+            self._feel,
+            self._paced,
         )
         self._fault_after_opening = ("", "")  # name and reason
         self.statistics = Statistics()
@@ -89,8 +99,15 @@ class Loop:
         self._ending = False
         self._stopping = False
         self._deaf_until = -math.inf  # until then commands are from before a stall
-        self._off_again = False  # torque off is asked for although the state says so already
-        self._next_try = -math.inf  # when torque off may be tried again after it failed
+
+    @property
+    def servos(self) -> Servos | None:
+        """What is read and driven."""
+        return self._drive.servos
+
+    @servos.setter
+    def servos(self, servos: Servos | None) -> None:
+        self._drive.servos = servos
 
     # What may be asked from outside the tick, a signal handler included
 
@@ -120,9 +137,7 @@ class Loop:
             self.advance(duration)
         finally:
             self._control.torque = False
-            self._next_try = -math.inf
-            if self.servos is not None and self.state.torque:
-                self._torque_off(self.servos)
+            self._drive.end()
             if self.state.torque:
                 self.emit("error", "end", "ended, torque MAY STILL BE ON")
             else:
@@ -182,7 +197,7 @@ class Loop:
         self._feel()
         self._decide()
         decided = clock.now()
-        self._write(now)
+        self._drive.write(self._control.torque, now)
         written = clock.now()
         if self._broadcast is not None:
             self._broadcast(state)
@@ -199,12 +214,12 @@ class Loop:
         return done
 
     def _read(self) -> None:
-        state, reading = self.state, self.state.reading
-        if self.servos is None:
+        state, reading, servos = self.state, self.state.reading, self._drive.servos
+        if servos is None:
             return
         state.read_error = state.write_error = ""
         try:
-            self.servos.read(reading)
+            servos.read(reading)
         except ServoError as error:
             reading.valid = False
             state.read_error = str(error)
@@ -267,58 +282,12 @@ class Loop:
             name, reason = self._fault_after_opening
             self._fail(reason, name)
 
-    def _write(self, now: float) -> None:
-        state, servos = self.state, self.servos
-        if servos is None:
-            return
-        wanted = self._control.torque
-        if wanted and not state.torque:
-            self._torque_on(servos)
-        elif not wanted and (state.torque or self._off_again):
-            self._off_again = False
-            self._torque_off(servos)
-        elif wanted and state.goal.valid:
-            state.goal.seq = state.seq
-            state.goal.t = now
-            try:
-                self._safety.write(servos, state)
-            except ServoError as error:
-                state.write_error = str(error)
-                self._fail(str(error))
-                self._torque_off(servos)
-
-    def _torque_on(self, servos: Servos) -> None:
-        self.state.torque = True  # from here on it may be on, whatever the servos answer
-        try:
-            servos.set_torque(True)
-        except ServoError as error:
-            self.state.write_error = str(error)
-            self._fail(str(error))
-            self._torque_off(servos)
-
-    def _torque_off(self, servos: Servos) -> None:
-        """Turn torque off; when that fails, again every half second. The first failure is told."""
-        state = self.state
-        if state.t < self._next_try:
-            return
-        state.torque = True  # as far as is known, until they have answered
-        try:
-            servos.set_torque(False)
-        except ServoError as error:
-            state.write_error = str(error)
-            if self._next_try < 0.0:
-                self.emit("error", "servos", f"torque could not be turned off: {error}")
-            self._next_try = state.t + _RETRY
-        else:
-            state.torque = False
-            self._next_try = -math.inf
-
     # Commands, events and faults
 
     def command(self, request: dict[str, Any]) -> dict[str, Any]:
         """Carry out one request at the present tick. Raises Refused with the reason."""
         try:
-            reply = self._carry_out(request)
+            reply = self._orders.carry_out(request)
         except Refused as refusal:
             self._tell(request, str(refusal))
             raise
@@ -330,109 +299,8 @@ class Loop:
             state = self.state
             self._publisher.command(state.wall, state.t, state.seq, request, error)
 
-    def _carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
-        control = self._control
-        command = parse(request, control.mode)
-        self._lease.check(command, self.state.t)
-        if command.name == "clear":
-            self._reconnect()
-        if command.name in ("clear", "arm"):
-            self._reopen(command.name)
-        self._refuse_unsafe(command.name)
-        reply = control.command(command)
-        self._lease.renew(command, self.state.t)
-        if command.name in ("stop", "disarm"):
-            # Whatever the state says: another program may have switched it on.
-            self._off_again = True
-            self._next_try = -math.inf
-        if command.name == "tare":
-            for perception in self.perceptions:
-                perception.tare()
-        if command.name == "clear":
-            self.state.fault = self.state.fault_name = ""
-        if command.name == "status":
-            reply |= self._status()
-        return reply
-
-    def _reconnect(self) -> None:
-        """Servos that have gone silent are connected anew, as after an unplug: only on command.
-
-        Raises Refused with all that is wrong with them.
-        """
-        state, servos = self.state, self.servos
-        silent = state.t - state.reading.t > self._settings.servos.fault_after
-        if servos is None or not silent:
-            return
-        try:
-            servos.connect()
-            servos.read(state.reading)
-            if state.torque:
-                # It may still be on where the port went away before it could be turned off.
-                servos.set_torque(False)
-                state.torque = False
-        except ServoError as error:
-            raise Refused(f"clear: {error}") from None
-        self.emit("info", "servos", "connected anew")
-
-    def _reopen(self, name: str) -> None:
-        """Sensors whose port was lost are opened anew: only on command and with torque off.
-
-        Raises Refused for ``clear`` where one can't be; without sensors a hand may be armed.
-        """
-        if self.state.torque:
-            return
-        for perception in self.perceptions:
-            sensor, side = perception.sensor, FINGERS[perception.finger]
-            if not sensor.counters().get("port_lost"):
-                continue
-            sensor.close()
-            try:
-                sensor.open()
-            except TactileError as error:
-                if name == "clear":
-                    raise Refused(f"{name}: {error}") from None
-                self.emit("warning", "tactile", str(error))
-            else:
-                self.emit("info", "tactile", f"{side} sensor opened anew")
-                self._feel()
-
-    def _refuse_unsafe(self, name: str) -> None:
-        """What neither the mode nor the control law knows, and still speaks against a command."""
-        state = self.state
-        if name in ("arm", "clear"):
-            if state.torque and not self._control.torque:
-                raise Refused(f"{name}: torque could not be turned off yet")
-            cause = self._safety.cause(state, gripping=name == "clear")
-            if cause:
-                raise Refused(f"{name}: {cause}")
-        if name == "arm" and self.servos is not None and not state.reading.valid:
-            raise Refused("arm: the servos were not read at this tick")
-        if name == "grasp":
-            cause = self._safety.cause(state, gripping=True)
-            if cause:
-                raise Refused(f"grasp: {cause}")
-            if any(perception.taring for perception in self.perceptions):
-                raise Refused("grasp: tare is still at work")
-        if name == "tare" and any(contact.contact for contact in state.contacts):
-            raise Refused("tare: something touches a tip")
-
-    def _status(self) -> dict[str, Any]:
-        state = self.state
-        counters = {} if self.servos is None else {"servos": self.servos.counters()}
-        for perception in self.perceptions:
-            counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
-        limited = dict(self._safety.limited)
-        if isinstance(self._server, CommandServer) and self._server.refused_by_pace:
-            limited["commands.pace"] = self._server.refused_by_pace
-        return {
-            "fault": state.fault,
-            "fault_name": state.fault_name,
-            "torque": state.torque,
-            "seq": state.seq,
-            "overruns": state.timing.overruns,
-            "counters": counters,
-            "limited": limited,
-        }
+    def _paced(self) -> int:
+        return 0 if self._server is None else self._server.refused_by_pace
 
     def _by_person(self, request: dict[str, Any]) -> dict[str, Any]:
         reply = self.command(request)

@@ -131,7 +131,7 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path: Path) -> None:
         loop.command({"command": "grasp"})
         assert rig.emulator.tell("left:unplug") == "ok"
         until(lambda: left.counters()["port_lost"] == 1)
-        loop.advance(1.0)
+        loop.advance(2.0)
         assert (loop.state.mode, loop.state.fault_name) == ("fault", "tactile.silent")
         for _ in range(2):  # a try that failed is no last one
             with pytest.raises(Refused, match="no such port"):
