@@ -258,13 +258,15 @@ class Drawing:
                 outlines, colors=[(255, 255, 255)], radii=rr.Radius.ui_points(1.2), draw_order=2.0
             ),
         )
-        spots: list[Any] = [] if place is None else [place.centroid]
-        sizes: list[Any] = [rr.Radius.ui_points(5.0)] * len(spots)
+        # Twice, with a white rim: on a hot map the right finger's orange would not be seen.
+        spots: list[Any] = [] if place is None else [place.centroid, place.centroid]
+        sizes: list[Any] = [rr.Radius.ui_points(6.5), rr.Radius.ui_points(4.5)][: len(spots)]
+        shades = [(255, 255, 255), layout.COLOURS[name]][: len(spots)]
         self._log(
             f"pressure/{name}/centroid",
             rr.Points2D(
                 [*spots, (0.5 * shape[1], shape[0] - 1.5)],
-                colors=[*[layout.COLOURS[name]] * len(spots), (200, 200, 200)],
+                colors=[*shades, (200, 200, 200)],
                 radii=[*sizes, rr.Radius.ui_points(0.0)],
                 labels=[*[""] * len(spots), f"peak {1e-3 * peak:.1f} kPa"],
                 show_labels=True,
