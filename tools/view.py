@@ -130,7 +130,9 @@ class _View:
 
     def show(self) -> int:
         """From the first message to the end."""
-        arguments = self._arguments
+        from tools.viewing.known import warm_up
+
+        arguments, ending = self._arguments, self._ending
         recording = None
         if arguments.file is not None:
             from tools.recordings.reader import Recording
@@ -142,6 +144,8 @@ class _View:
             if arguments.web or arguments.save is None:
                 viewer = self._open()
             self._connect(viewer)
+            warm_up()
+            ending.begin()
             if recording is None:
                 self._show_stream(viewer)
             else:
@@ -192,10 +196,8 @@ class _View:
         self._recording.set_sinks(*sinks)
 
     def _show_stream(self, viewer: Viewer | None) -> None:
-        from tools.viewing.known import warm_up
         from tools.viewing.live import LiveStream
 
-        warm_up()
         bridge, ending = self._bridge, self._ending
         heard = time.monotonic()
         silent = ever = False
@@ -317,7 +319,12 @@ class _Ending:
 
     def __init__(self, duration: float | None) -> None:
         self._asked = threading.Event()
-        self._deadline = math.inf if duration is None else time.monotonic() + duration
+        self._duration = math.inf if duration is None else duration
+        self._deadline = math.inf
+
+    def begin(self) -> None:
+        """The duration counts from now on: a slow start takes nothing of it."""
+        self._deadline = time.monotonic() + self._duration
 
     def over(self) -> bool:
         """Time to end."""
