@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from daemon.settings import FINGER_NAMES, Settings
+from daemon.settings import FINGER_NAMES, GRIP_SHARE, Settings
 
 _SIMULATED = ("simulated", "replay", "none")
 _LONGEST = 60  # characters of a value that are shown
@@ -159,10 +159,11 @@ def _limits(settings: Settings) -> Iterator[str]:
 
 
 def _forces(settings: Settings) -> Iterator[str]:
-    low, high = settings.control.contact_force, 0.9 * settings.safety.force_max
+    low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
     if low >= high:
         yield (
-            f"control.contact_force: found {low:g} N, expected below 0.9 safety.force_max, {high:g}"
+            f"control.contact_force: found {low:g} N, expected below {GRIP_SHARE:g} "
+            f"safety.force_max, {high:g}"
         )
         return
     wanted = [("control.force_default", settings.control.force_default)]

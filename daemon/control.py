@@ -16,7 +16,7 @@ from daemon.modes import Command, Mode
 from daemon.prediction import Held
 from daemon.records import FINGERS, Contact, Goal, ObjectPose, Reading
 from daemon.reference import Reference
-from daemon.settings import Settings
+from daemon.settings import GRIP_SHARE, Settings
 
 Event = tuple[str, str, str]  # level, kind, text
 
@@ -125,7 +125,8 @@ class Control:
         if self._settings.servos.mode == "position":
             raise Refused('grasp: nothing bounds the current while servos.mode is "position"')
         force = numbers.get("force", self._settings.control.force_default)
-        low, high = self._settings.control.contact_force, 0.9 * self._settings.safety.force_max
+        low = self._settings.control.contact_force
+        high = GRIP_SHARE * self._settings.safety.force_max
         if not low < force <= high:
             raise Refused(f"grasp: force: found {force:g} N, expected above {low:g} to {high:g}")
         if self._gripping:

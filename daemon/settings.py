@@ -216,6 +216,9 @@ class Control(Section):
     grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin
 
 
+GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
+
+
 class Safety(Section):
     """Limits. The goal is bounded by them; crossing a hard one latches a fault."""
 

@@ -30,7 +30,7 @@ import math
 
 from daemon.prediction import Held
 from daemon.records import Contact
-from daemon.settings import Settings
+from daemon.settings import GRIP_SHARE, Settings
 
 _EACH = 0.008  # s between two looks
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
@@ -44,7 +44,6 @@ _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth,
 _SIGNS = 3.0  # standard deviations of the angle, more than that
 _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
 _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
-_FORCE_SHARE = 0.9  # of the force that is a fault
 
 
 class SlipWatch:
@@ -55,7 +54,7 @@ class SlipWatch:
         self._every = max(round(_EACH * settings.loop.rate), 1)
         self._dt = self._every / settings.loop.rate
         self._width = settings.object.width
-        self._force_most = _FORCE_SHARE * settings.safety.force_max
+        self._force_most = GRIP_SHARE * settings.safety.force_max
         self._friction = 0.0  # what a joint's friction looks like, as a load [N]
         self.forget()
 

@@ -155,7 +155,7 @@ def test_keys_command_the_hand(fake: FakeDaemon) -> None:
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
 
 
-SETTINGS = {"control": {"force_default": 10.0}, "safety": {"force_max": 12.5}}
+SETTINGS = {"control": {"force_default": 10.0}, "safety": {"force_max": 14.0}}
 
 
 def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake: FakeDaemon) -> None:
@@ -174,7 +174,7 @@ def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake: FakeDaemon) 
         page.type(b"++")
         page.shows("+- 12 N")
         page.type(b"+")
-        page.shows("+- 12.5 N")  # a fault beyond
+        page.shows("+- 12.6 N")  # nine tenths of the force that is a fault
         page.type(b"-" * 9)
         page.shows("+- 4 N")  # in smaller steps below 5 N
         assert fake.requests == []

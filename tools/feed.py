@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.modes import Lease
+from daemon.settings import GRIP_SHARE
 
 FINGERS = ("left", "right")
 SCHEMA = 1  # of hand/state, the newest this module knows
@@ -145,7 +146,7 @@ class Feed:
         self._lease = math.nan  # s
         self.asked = math.nan  # N that the last grasp was told, by whomever
         self.force_default = math.nan  # N of a grasp that is told none
-        self.force_max = math.inf  # N that is a fault
+        self.force_most = math.inf  # N that a grip may be asked for
         self.skipped = 0
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
         self._bin: list[tuple[float, float]] = []
@@ -282,7 +283,7 @@ class Feed:
         warm = number(settings, "safety", "temperature_warn")
         self.force_default = number(settings, "control", "force_default")
         most = number(settings, "safety", "force_max")
-        self.force_max = math.inf if math.isnan(most) else most
+        self.force_most = math.inf if math.isnan(most) else GRIP_SHARE * most
         self.warm = math.inf if math.isnan(warm) else warm
 
     def news(self) -> list[Event]:

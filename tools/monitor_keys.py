@@ -83,7 +83,7 @@ class HandKeys:
         step = next(step for most, step in _STEPS if present + 0.01 * way <= most)
         wanted = round(step * (round(present / step) + way), 3)
         # What of that it may grasp with, the daemon says.
-        self._chosen = min(max(wanted, step), self._feed.force_max)
+        self._chosen = min(max(wanted, step), self._feed.force_most)
         self._pressed = now
         if self._gripping:
             self._grasp(now)
