@@ -175,7 +175,7 @@ def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake: FakeDaemon) 
         page.shows("+- 12 N")
         page.type(b"+")
         page.shows("+- 12.6 N")  # nine tenths of the force that is a fault
-        page.type(b"-" * 9)
+        page.type(b"-" * 10)
         page.shows("+- 4 N")  # in smaller steps below 5 N
         assert fake.requests == []
         page.type(b"g")
