@@ -303,6 +303,8 @@ def page() -> str:
         f"Schema {messages.SCHEMA}. Two frames a message, topic and msgpack map with text keys,",
         "in SI units. Fields are only ever added, none is left out, and none changes its type:",
         "a float is always sent as a float. A field named `left.q` is `q` in the map `left`.",
+        "The integers of `hand/state` and `hand/input` take 64 bits whatever their value, so that",
+        "while its texts stay the same, each message of such a topic is laid out as the last one.",
     ]
     for topic, fields in TOPICS.items():
         lines += [
