@@ -47,6 +47,7 @@ class Broadcast:
         self._scene = Parts.of(settings)
         self.truth: Truth | None = None  # a simulated hand's
         self._numbers = [0, 0]  # frames of each finger that went out
+        self._seen: list[Frame | None] = [None, None]  # newest of each finger
         self._published = [-1, -1]  # of which n frames one went out, for each finger
         self._states = self._maps = 0  # messages that went out
         self._told = _Counts()  # when the rates were last told
@@ -59,24 +60,26 @@ class Broadcast:
         publisher.repeat()
         if publisher.wants_tactile:
             for perception in self._perceptions:
-                self._frame(state, perception)
+                if perception.frame is not self._seen[perception.finger]:
+                    self._frame(state, perception)
         if publisher.wants_input:  # behind the frames, which it refers to
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
             publisher.input(state, (frames[0], frames[1]))
-        if publisher.wants_state and schedule.state.due(seq):
-            self._states += 1
-            publisher.state(state, self._scene, schedule.state.every)
-        if self.truth is not None and publisher.wants_truth and schedule.state.due(seq):
-            publisher.truth(state, self.truth, schedule.state.every)
+        if schedule.state.due(seq):
+            if publisher.wants_state:
+                self._states += 1
+                publisher.state(state, self._scene, schedule.state.every)
+            if publisher.wants_truth and self.truth is not None:
+                publisher.truth(state, self.truth, schedule.state.every)
         if schedule.stats.due(seq):
             rates = self._rates(state)
             if publisher.wants_stats:
                 publisher.stats(state, self._period, rates, self._statistics, schedule.stats.every)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:
-        frame = perception.frame
+        frame = self._seen[perception.finger] = perception.frame
         every = self._schedule.tactile_every
         if frame is None or frame.seq // every == self._published[perception.finger]:
             return

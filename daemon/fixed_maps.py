@@ -18,11 +18,11 @@ from daemon.contract import TOPICS, Field
 from daemon.messages import INPUT, SCHEMA, STATE, Parts
 from daemon.records import Frame, State
 
-_FALSE = 0xC2  # msgpack's; true is the next
+FALSE = 0xC2  # msgpack's byte; true is the next
 _MARKS = {"bool": (b"", "B"), "int": (b"\xd3", "q"), "float": (b"\xcb", "d")}
 
 Texts = tuple[str, ...]
-Numbers = list[float]  # or integers, or flags
+Numbers = list[float]  # or integers; a flag is a number, too: `FALSE` plus it
 
 
 class FixedMap:
@@ -36,18 +36,14 @@ class FixedMap:
             for part in outer:
                 place = place.setdefault(part, {})
             place[name] = field
-        kinds = [field.kind for field in fields if field.kind != "str"]
-        self._flags = [place for place, kind in enumerate(kinds) if kind == "bool"]
         self._texts: Texts | None = None
         self._struct = struct.Struct("")
         self._parts: list[bytes | float] = []  # by turns what stays, and a number
 
     def pack(self, texts: Texts, numbers: Numbers) -> bytes:
-        """The map as msgpack; ``numbers`` is used up."""
+        """The map as msgpack."""
         if texts != self._texts:
             self._lay_out(texts)
-        for place in self._flags:
-            numbers[place] += _FALSE
         self._parts[1::2] = numbers
         return self._struct.pack(*self._parts)
 
@@ -88,14 +84,18 @@ class StateMap(FixedMap):
     def __call__(self, state: State, scene: Parts, step: int = 1) -> bytes:
         """As `daemon.messages.state_message`."""
         timing, reading, goal, pose = state.timing, state.reading, state.goal, state.object
+        q, dq, current = reading.q, reading.dq, reading.current
+        temperature, voltage = reading.temperature, reading.voltage
+        goal_q, goal_current = goal.q, goal.current
+        fingers, sensors, t = scene.fingers, scene.sensors, state.t
         read = reading.valid or not scene.servos
         numbers = [
             SCHEMA,
             state.seq,
             step,
             state.wall,
-            int(state.t * 1e9),
-            state.torque,
+            int(t * 1e9),
+            FALSE + state.torque,
             timing.tick_s,
             timing.compute_s,
             timing.wake_late_s,
@@ -104,16 +104,15 @@ class StateMap(FixedMap):
             goal.angle,
         ]
         for finger, contact in enumerate(state.contacts):
-            sound = contact.valid or not scene.sensors
             numbers += (
-                scene.fingers[finger] and read and sound,
-                reading.q[finger],
-                reading.dq[finger],
-                reading.current[finger],
-                reading.temperature[finger],
-                reading.voltage[finger],
-                goal.q[finger],
-                goal.current[finger],
+                FALSE + (fingers[finger] and read and (contact.valid or not sensors)),
+                q[finger],
+                dq[finger],
+                current[finger],
+                temperature[finger],
+                voltage[finger],
+                goal_q[finger],
+                goal_current[finger],
                 contact.d,
                 contact.theta,
                 contact.tilt_y,
@@ -122,12 +121,12 @@ class StateMap(FixedMap):
                 contact.d_std,
                 contact.theta_std,
                 contact.gain,
-                contact.misfit,
-                contact.contact,
+                FALSE + contact.misfit,
+                FALSE + contact.contact,
                 contact.seq,
-                state.t - contact.t if contact.seq else 0.0,
+                t - contact.t if contact.seq else 0.0,
             )
-        numbers += (pose.valid, pose.angle, pose.width)
+        numbers += (FALSE + pose.valid, pose.angle, pose.width)
         return self.pack((state.mode, state.fault, state.fault_name), numbers)
 
 
@@ -149,7 +148,7 @@ class InputMap(FixedMap):
             state.timing.late_in_row,
             reading.seq,
             reading.t,
-            reading.valid,
+            FALSE + reading.valid,
             reading.alert,
         ]
         for finger, frame in enumerate(frames):
@@ -162,7 +161,7 @@ class InputMap(FixedMap):
                 reading.voltage[finger],
             )
             if frame is None:
-                numbers += (0, 0.0, 0.0, False)
+                numbers += (0, 0.0, 0.0, FALSE)
             else:
-                numbers += (frame.seq, frame.t_sample, frame.t_arrival, frame.valid)
+                numbers += (frame.seq, frame.t_sample, frame.t_arrival, FALSE + frame.valid)
         return self.pack((state.read_error, state.write_error), numbers)

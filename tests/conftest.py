@@ -1,4 +1,4 @@
-"""What several tests share: free addresses and conditions to wait for."""
+"""What several tests share: free addresses, whole daemons, and conditions to wait for."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
 
+from daemon.assembly import Daemon
+from daemon.settings import Settings
 from tests.daemon_process import Running
+from tests.loop_harness import Make
 
 
 @pytest.fixture
@@ -71,3 +75,21 @@ def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {seconds:g} s: {condition}")
         select.select([], [], [], 0.002)  # leaves the processor to what is waited for
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Daemons on virtual time without sockets; sections are given as keyword arguments."""
+    daemons = []
+
+    def build(**sections: Any) -> Daemon:
+        loop = {"clock": "virtual"} | sections.pop("loop", {})
+        settings = Settings.model_validate({"loop": loop, **sections})
+        daemon = Daemon(settings, wire=False)
+        daemons.append(daemon)
+        daemon.loop.advance(0.3)
+        return daemon
+
+    yield build
+    for daemon in daemons:
+        daemon.close()

@@ -4,66 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
-import msgpack
 import pytest
-import zmq
 
 from daemon.assembly import Daemon
-from daemon.commands import CommandServer, Refused
+from daemon.commands import Refused
 from daemon.messages import Parts, pack, state_message
 from daemon.records import Frame
-from daemon.servos.base import ServoError
-from daemon.settings import Settings
-from daemon.simulation import layout
-
-Make = Callable[..., Daemon]
-
-
-@pytest.fixture
-def make() -> Iterator[Make]:
-    """Daemons on virtual time without sockets; sections are given as keyword arguments."""
-    daemons = []
-
-    def build(**sections: Any) -> Daemon:
-        loop = {"clock": "virtual"} | sections.pop("loop", {})
-        settings = Settings.model_validate({"loop": loop, **sections})
-        daemon = Daemon(settings, wire=False)
-        daemons.append(daemon)
-        daemon.loop.advance(0.3)
-        return daemon
-
-    yield build
-    for daemon in daemons:
-        daemon.close()
-
-
-def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
-    return daemon.loop.command({"command": name, **numbers})
-
-
-def torque_of(daemon: Daemon) -> Any:
-    """Whether the plant's servos have torque, each."""
-    assert daemon.hand is not None
-    return daemon.hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2]
-
-
-def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
-    """Advance until the hand is in ``mode``; fail when it is not within ``seconds``."""
-    finish = daemon.clock.now() + seconds
-    while daemon.loop.state.mode != mode:
-        assert daemon.clock.now() < finish, f"{daemon.loop.state.mode}, not {mode}"
-        daemon.loop.advance(0.01)
-
-
-def grasped(daemon: Daemon, force: float) -> Daemon:
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    command(daemon, "grasp", force=force)
-    advance_to(daemon, "holding", 3.0)
-    return daemon
+from tests.loop_harness import Make, advance_to, command, grasped, refusal, torque_of
 
 
 def test_starts_disarmed_with_torque_off_and_does_not_move(make: Make) -> None:
@@ -226,165 +176,6 @@ def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(
     assert turned - begun < 0.1
 
 
-def test_a_goal_that_is_no_number_is_a_fault_though_a_command_was_refused_for_it(
-    make: Make,
-) -> None:
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    daemon.loop.state.goal.q[0] = math.nan
-    daemon.loop._safety.bound(daemon.loop.state)
-    assert "a goal was no number" in refusal(daemon, "grasp")
-    daemon.loop.advance(daemon.loop.period)
-    assert daemon.loop.state.fault_name == "goal.number"
-    command(daemon, "clear")
-
-
-def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    assert daemon.loop.servos is not None
-
-    def failing(reading: Any) -> None:
-        reading.valid = False
-
-    daemon.loop.servos.read = failing  # type: ignore[method-assign]
-    advance_to(daemon, "fault", 0.2)
-    assert "no good reading" in daemon.loop.state.fault
-    with pytest.raises(Refused, match="clear: servos: no good reading"):
-        command(daemon, "clear")
-
-
-def test_torque_that_can_not_be_turned_off_is_told_once_and_tried_again(make: Make) -> None:
-    daemon = make()
-    events: list[tuple[str, str, str]] = []
-    daemon.loop._on_event = lambda *event: events.append(event)
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    servos = daemon.loop.servos
-    assert servos is not None
-    really, tries = servos.set_torque, []
-
-    def failing(on: bool) -> None:
-        tries.append(on)
-        if len(tries) < 4:
-            raise ServoError("no answer")
-        really(on)
-
-    servos.set_torque = failing  # type: ignore[method-assign]
-    command(daemon, "stop")
-    daemon.loop.advance(1.2)
-    assert daemon.loop.state.torque, "torque was not turned off, and the state says it was"
-    daemon.loop.advance(1.0)
-    assert not daemon.loop.state.torque
-    assert tries == [False] * 4
-    assert [text for _, kind, text in events if kind == "servos"] == [
-        "torque could not be turned off: no answer"
-    ]
-
-
-def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
-    daemon = make()
-    servos = daemon.loop.servos
-    assert servos is not None
-    really, tries = servos.set_torque, []
-
-    def failing(on: bool) -> None:
-        tries.append(on)
-        if on:
-            raise ServoError("overload")
-        really(on)
-
-    servos.set_torque = failing  # type: ignore[method-assign]
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("fault", "overload")
-    assert not daemon.loop.state.torque
-    assert tries == [True, False]
-
-
-def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make: Make) -> None:
-    daemon = grasped(make(), 6.0)
-    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process stood still
-    advance_to(daemon, "fault", 0.1)
-    assert "watchdog" in daemon.loop.state.fault
-    daemon.loop.advance(0.2)
-    command(daemon, "clear")
-    command(daemon, "arm")
-    command(daemon, "move", left=-0.1, right=-0.1)
-    advance_to(daemon, "armed", 3.0)
-    assert daemon.hand is not None
-    assert daemon.hand.q.tolist() == pytest.approx([-0.1, -0.1], abs=0.04)
-
-
-def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> None:
-    daemon = make()
-    assert daemon.loop.servos is not None
-    for name in ("stop", "disarm"):
-        daemon.loop.servos.set_torque(True)  # as another program may have done
-        command(daemon, name)
-        daemon.loop.advance(daemon.loop.period)
-        assert daemon.hand is not None
-        assert not torque_of(daemon).any()
-        assert not daemon.loop.state.torque
-
-
-def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
-    make: Make, context: zmq.Context[Any]
-) -> None:
-    daemon = make()
-    server = CommandServer(context, "inproc://commands", 200)
-    daemon.loop._server = server
-    client = context.socket(zmq.DEALER)
-    client.connect("inproc://commands")
-    client.send(msgpack.packb({"command": "arm"}))
-    daemon.loop.stop()
-    daemon.loop.advance(5 * daemon.loop.period)
-    assert daemon.loop.state.mode == "disarmed"
-    assert "before a stop" in msgpack.unpackb(client.recv(zmq.NOBLOCK))["error"]
-    client.send(msgpack.packb({"command": "arm"}))
-    daemon.loop.advance(daemon.loop.period)
-    assert daemon.loop.state.mode == "armed"
-    client.close()
-    server.close()
-
-
-def test_arm_waits_until_a_failing_torque_off_has_worked(make: Make) -> None:
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    servos = daemon.loop.servos
-    assert servos is not None
-    really = servos.set_torque
-    answers = iter([ServoError("no answer"), None])
-
-    def failing_once(on: bool) -> None:
-        answer = next(answers)
-        if answer is not None:
-            raise answer
-        really(on)
-
-    servos.set_torque = failing_once  # type: ignore[method-assign]
-    command(daemon, "stop")
-    daemon.loop.advance(0.1)
-    with pytest.raises(Refused, match="arm: torque could not be turned off yet"):
-        command(daemon, "arm")
-    daemon.loop.advance(0.6)
-    servos.set_torque = really  # type: ignore[method-assign]
-    command(daemon, "arm")
-
-
-def test_arm_is_refused_before_the_servos_were_read() -> None:
-    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
-    with Daemon(settings, wire=False) as daemon:
-        assert daemon.loop.servos is not None
-        daemon.loop.servos.read = lambda reading: None  # type: ignore[method-assign]
-        daemon.loop.advance(0.01)
-        with pytest.raises(Refused, match="arm: servos: no good reading yet"):
-            command(daemon, "arm")
-
-
 def blinded(daemon: Daemon, counts: int) -> None:
     """From now on all cells of both sensors read ``counts``."""
     for perception in daemon.loop.perceptions:
@@ -435,17 +226,6 @@ def test_tare_is_refused_while_something_touches(make: Make) -> None:
         command(daemon, "tare")
 
 
-def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
-    daemon = make(task={"name": "demo"})
-    advance_to(daemon, "holding", 5.0)
-    daemon.loop.stop()
-    daemon.loop.advance(1.0)
-    assert daemon.loop.state.mode == "disarmed"
-    command(daemon, "arm")
-    daemon.loop.advance(15.0)
-    assert daemon.loop.state.mode == "armed"
-
-
 def test_the_state_tells_what_the_grip_goes_to(make: Make) -> None:
     daemon = make()
     goal = daemon.loop.state.goal
@@ -485,12 +265,6 @@ def test_an_angle_beyond_the_grip_is_refused(make: Make) -> None:
     command(daemon, "rotate", angle=0.95 * float(found[1]))
     daemon.loop.advance(4.0)
     assert daemon.loop.state.fault == ""
-
-
-def refusal(daemon: Daemon, name: str, **numbers: float) -> str:
-    with pytest.raises(Refused) as caught:
-        command(daemon, name, **numbers)
-    return str(caught.value)
 
 
 def run_recorded(make: Make, seed: int) -> list[bytes]:
@@ -538,79 +312,3 @@ def test_tare_removes_a_standing_offset(make: Make) -> None:
     daemon.loop.advance(1.0)
     assert daemon.hand is not None
     assert daemon.loop.state.contacts[0].force == pytest.approx(daemon.hand.force[0], rel=0.05)
-
-
-SCENES: dict[str, dict[str, Any]] = {
-    "two fingers": {},
-    "one finger": {"scene": {"fingers": ("left",)}},
-    "the other finger": {"scene": {"fingers": ("right",)}},
-    "sensor without servos": {"servos": {"backend": "none"}},
-    "servos without sensors": {"tactile": {"backend": "none"}},
-    "no object model": {"scene": {"object_model": False}},
-}
-
-
-@pytest.mark.parametrize("sections", SCENES.values(), ids=SCENES.keys())
-def test_every_scene_runs_and_its_messages_have_one_shape(
-    make: Make, sections: dict[str, Any]
-) -> None:
-    daemon = make(**sections)
-    daemon.loop.advance(2.0)
-    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
-    reference = state_message(make().loop.state, Parts.of(daemon.settings))
-    assert message.keys() == reference.keys()
-    for part in ("left", "right", "object"):
-        assert message[part].keys() == reference[part].keys()
-        for key, value in reference[part].items():
-            assert type(message[part][key]) is type(value), (part, key)
-    fingers = daemon.settings.scene.fingers
-    assert message["left"]["valid"] is ("left" in fingers)
-    assert message["right"]["valid"] is ("right" in fingers)
-
-
-def test_one_finger_presses_on_a_fixed_object(make: Make) -> None:
-    daemon = grasped(make(scene={"fingers": ("left",)}), 6.0)
-    daemon.loop.advance(2.0)
-    assert daemon.loop.state.contacts[0].force == pytest.approx(6.0, rel=0.05)
-    assert daemon.loop.state.contacts[1].force == 0.0
-    assert not daemon.loop.state.object.valid
-    with pytest.raises(Refused, match="needs both fingers"):
-        command(daemon, "rotate", angle=0.1)
-
-
-def test_watching_a_compression_needs_no_servos(make: Make) -> None:
-    daemon = make(servos={"backend": "none"})
-    deepest = 0.0
-    for _ in range(80):
-        daemon.loop.advance(0.1)
-        deepest = max(deepest, daemon.loop.state.contacts[0].d)
-    assert deepest > 0.002
-    with pytest.raises(Refused, match="arm: this scene has no servos"):
-        command(daemon, "arm")
-
-
-def test_servos_without_sensors_move_but_do_not_grasp(make: Make) -> None:
-    daemon = make(tactile={"backend": "none"})
-    command(daemon, "arm")
-    command(daemon, "move", left=-0.1)
-    advance_to(daemon, "armed", 3.0)
-    with pytest.raises(Refused, match="needs a tactile sensor"):
-        command(daemon, "grasp")
-
-
-def test_the_demo_task_grasps_turns_and_releases_by_itself(make: Make) -> None:
-    daemon = make(task={"name": "demo"})
-    seen: list[str] = []
-    turned: list[float] = []
-    for _ in range(2000):
-        daemon.loop.advance(0.01)
-        state = daemon.loop.state
-        if not seen or seen[-1] != state.mode:
-            seen.append(state.mode)
-        if state.object.valid:
-            turned.append(state.object.angle)
-    assert daemon.loop.state.fault == ""
-    once = ["grasping", "holding", *(["rotating", "holding"] * 3), "releasing", "armed"]
-    assert seen[: len(once) + 2] == ["disarmed", "armed", *once]
-    assert max(turned) > 0.12
-    assert min(turned) < -0.12

@@ -41,26 +41,25 @@ _FILL, _MORE = 5_000, 100_000  # messages: until the queue is full, and after th
 _KEPT = 2.0  # MiB that memory may grow meanwhile by what is not the queue
 
 _BUSY = "while True: pass"
-# Ten subscribers, of which the first never reads; `ready` once they are connected.
+# Ten subscribers to what tools subscribe to, of which the first never reads; `ready` once they are
+# connected.
 _SUBSCRIBERS = """
 import sys, zmq
 context = zmq.Context()
 sockets = []
-for number in range(int(sys.argv[2])):
+for number in range(10):
     socket = context.socket(zmq.SUB)
-    socket.subscribe("hand")
+    for topic in ("state", "tactile", "event", "stats", "settings", "command"):
+        socket.subscribe(f"hand/{topic}")
     socket.connect(sys.argv[1])
     sockets.append(socket)
 poller = zmq.Poller()
-for socket in sockets[1:] if len(sockets) > 1 else sockets:
+for socket in sockets[1:]:
     poller.register(socket)
-log = open(sys.argv[3], "wb") if len(sys.argv) > 3 else None
 print("ready", flush=True)
 while True:
     for socket, _ in poller.poll():
-        topic, payload = socket.recv_multipart()
-        if log is not None:
-            log.write(topic + payload)
+        socket.recv_multipart()
 """
 _STUCK = """
 import sys, time, zmq
@@ -135,12 +134,14 @@ def _beside(priority: int, rounds: int, seconds: float) -> list[Beside]:
         noisy = stack.enter_context(_daemon(f"ipc://{folder}/noisy", priority, noise=True))
         subscribe = [sys.executable, "-c", _SUBSCRIBERS, address]
         busy = [sys.executable, "-c", _BUSY]
-        record = [*subscribe, "1", str(folder / "record")]
+        record = [sys.executable, "-m", "tools.cli", "record", "--address", address]
+        file = str(folder / "run.mcap")
         neighbours: dict[str, tuple[Connection, list[list[str]]]] = {
             "quiet": (holding, []),
             "all processors busy": (holding, [busy] * (os.cpu_count() or 1)),
-            "ten subscribers, one never reads": (holding, [[*subscribe, "10"]]),
-            "a recorder": (holding, [record]),
+            "ten subscribers, one never reads": (holding, [subscribe]),
+            "a recorder": (holding, [[*record, file]]),
+            "a recorder of every topic": (holding, [[*record, "--topics", "all", "--", file]]),
             f"both sensors send noise at {_NOISE_RATE:g} Hz": (noisy, []),
         }
         taken: dict[str, list[Any]] = {name: [] for name in neighbours}
@@ -171,16 +172,20 @@ def _beside(priority: int, rounds: int, seconds: float) -> list[Beside]:
 
 @contextlib.contextmanager
 def _running(commands: list[list[str]]) -> Iterator[None]:
-    """Processes that run meanwhile; those that subscribe say when they are ready."""
+    """Processes that run meanwhile; subscribers say when they are ready, recorders have a file."""
     processes = []
+    file = Path(commands[0][-1]) if commands and "record" in commands[0] else None
     try:
         for command in commands:
-            waits = _SUBSCRIBERS in command
             process = subprocess.Popen(command, stdout=subprocess.PIPE)
             processes.append(process)
-            if waits:
+            if _SUBSCRIBERS in command:
                 assert process.stdout is not None
                 process.stdout.readline()
+        while file is not None and not file.exists():
+            if processes[0].poll() is not None:
+                raise RuntimeError("the recorder did not start")
+            time.sleep(0.01)
         yield
     finally:
         for process in processes:
@@ -188,6 +193,8 @@ def _running(commands: list[list[str]]) -> Iterator[None]:
             process.wait()
             assert process.stdout is not None
             process.stdout.close()
+        if file is not None:
+            file.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
