@@ -25,7 +25,6 @@ HELD = frozenset({Mode.HOLDING, Mode.ROTATING})
 PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
 _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
 _ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
-_ASKEW = math.radians(45.0)  # between the faces felt: no taper or shift is as large
 _SLOW = 0.05  # rad/s below which a joint stands
 
 
@@ -232,12 +231,11 @@ def hand_angle(view: View, state: State, share: float) -> str:
     apart = (left.theta - q[0]) - (right.theta + q[1]) + view.settings.object.taper
     if abs(apart) <= bound:
         return ""
-    why = (
-        "a sensor has shifted, its centre or rotation is wrong, or the object tapers (object.taper)"
+    return (
+        f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: the object "
+        "lies askew between the tips or tapers (object.taper), a sensor has shifted, or its centre "
+        "or rotation is wrong"
     )
-    if abs(apart) > _ASKEW:
-        why = "the tips touch faces that are not opposite: put the object upright between them"
-    return f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: {why}"
 
 
 def hand_width(view: View, state: State, share: float) -> str:

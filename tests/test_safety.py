@@ -357,9 +357,7 @@ def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -
     frames[1].theta += 0.1
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
-    assert "12.0° apart: a sensor has shifted" in text
-    frames[1].theta += 1.0
-    assert "the tips touch faces that are not opposite" in judged(judge, state, 0.5)[1]
+    assert "12.0° apart: the object lies askew" in text
     frames[1].theta_std = 0.06  # not known well enough to accuse anybody
     assert judged(judge, state, 0.5) == ("", "")
 

@@ -23,6 +23,7 @@ _READY_WITHIN = 15.0  # s
 _PLACE_AFTER = 5.0  # s without a grip: the object has slipped away, and is put back
 _TRIPPED = 0.7  # s in which the daemon finds that a servo was stopped
 _TRIES = 5
+_ASKEW = 0.07  # rad between the faces that the tips feel, above which an object is put upright
 _GRIPPING = ("grasping", "holding", "rotating")
 _TURN = 0.08  # rad
 
@@ -80,6 +81,9 @@ def _grip(rig: Rig, case: Case, chance: random.Random, found: Trial) -> None:
                 raise RigError(f"the hand does not grip: {rig.status()}")
             _start_anew(rig)
             continue
+        if not _upright(rig):
+            _place(rig)
+            continue
         found.phase = _phase(rig, case, chance)
         time.sleep(chance.uniform(0.0, 0.02))
         rig.states(0.0)
@@ -122,6 +126,16 @@ def ready(rig: Rig, chance: random.Random) -> bool:
         time.sleep(0.01)
         now = time.monotonic()
     return False
+
+
+def _upright(rig: Rig) -> bool:
+    """Whether both tips feel opposite faces: a grip on an edge would end in a fault of its own."""
+    states = rig.states(0.1)
+    if not states:
+        return False
+    left, right = states[-1]["left"], states[-1]["right"]
+    apart = (left["theta"] - left["q"]) - (right["theta"] + right["q"])
+    return bool(abs(apart + rig.settings.object.taper) < _ASKEW)
 
 
 def _place(rig: Rig) -> None:
