@@ -24,6 +24,7 @@ SECONDS = 600.0
 _LOOK = 5.0  # s between two looks at wire and memory
 _WARM = 0.1  # share of the time after which memory counts
 _FLAT = 0.01
+_ASKEW = ("hand.angle", "tip.tilt")  # the object lies askew, as stops leave it: it is put upright
 
 
 @dataclass
@@ -36,6 +37,7 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # looks in each
     done: Counter[str] = field(default_factory=Counter)  # commands carried out
     faults: Counter[str] = field(default_factory=Counter)
+    placed: int = 0  # times that the object was put upright
     wrong: list[str] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)  # MB of the daemon, resident
 
@@ -54,7 +56,7 @@ class Account:
                 f"memory: {100.0 * self.growth:+.2f} % over {len(self.memory)} looks",
                 f"modes: {told(self.modes)}",
                 f"carried out: {told(self.done)}",
-                f"faults: {told(self.faults)}",
+                f"faults: {told(self.faults)}; the object put upright {self.placed} times",
                 f"wrong: {'; '.join(self.wrong) or 'nothing'}",
             )
         )
@@ -78,6 +80,9 @@ def soak(seconds: float, seed: int = 1) -> Account:
             account.modes[status["mode"]] += 1
             if status["fault"] and status["fault"] != last:
                 account.faults[status["fault_name"]] += 1
+                if status["fault_name"] in _ASKEW:
+                    rig.tell("place")
+                    account.placed += 1
             last = status["fault"]
             request = _next(chance, status["mode"])
             if request is not None and rig.ask(request, 5.0)["ok"]:
