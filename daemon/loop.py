@@ -20,7 +20,7 @@ from daemon.modes import Command, Mode
 from daemon.orders import Orders
 from daemon.perception import FingerPerception
 from daemon.prediction import Held, Prediction
-from daemon.records import Contact, State
+from daemon.records import FINGERS, Contact, State
 from daemon.safety import BUS, Safety
 from daemon.servos.base import ServoError, Servos
 from daemon.settings import Settings
@@ -235,6 +235,9 @@ class Loop:
                 perception.update(contacts[finger])
             elif perception.update(self._frames[finger]):
                 prediction.correct(finger, self._frames[finger], contacts[finger])
+            if perception.tare_failed:
+                reason, perception.tare_failed = perception.tare_failed, ""
+                self.emit("warning", "tare", f"{FINGERS[finger]} sensor's zero stays: {reason}")
         if prediction is not None:
             prediction.fill(contacts, self.state.object)
         self._safety.mark_stale(self.state)

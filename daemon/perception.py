@@ -47,6 +47,8 @@ class FingerPerception:
         self._zero: NDArray[np.uint16] | None = None
         self._tare_sum: NDArray[np.uint32] | None = None
         self._tare_left = 0
+        self._zero_before: tuple[NDArray[np.uint16] | None, float | None] = None, None
+        self.tare_failed = ""  # why the last tare left the zero as it was, until that is told
 
     @property
     def taring(self) -> bool:
@@ -155,6 +157,7 @@ class FingerPerception:
 
     def _learn_zero(self, counts: NDArray[np.uint16]) -> None:
         if self._tare_sum is None:
+            self._zero_before = self._zero, self._estimator.saturation
             if self._converter is None:
                 self._zero = None
                 self._estimator.saturation = self._full
@@ -164,9 +167,13 @@ class FingerPerception:
         if self._tare_left:
             return
         mean = self._tare_sum / _TARE_FRAMES
-        if self._converter is not None:
+        ends = self._full - np.round(mean)
+        if not np.median(ends) > 0.0:  # over such a zero no contact could be felt
+            self._zero, self._estimator.saturation = self._zero_before
+            self.tare_failed = "most cells are full where nothing presses"
+        elif self._converter is not None:
             self._converter.zero[:] = mean
             self._estimator.saturation = self._converter.saturation
         else:
             self._zero = np.round(mean).astype(np.uint16)
-            self._estimator.saturation = least_end(self._full - self._zero.astype(np.float64))
+            self._estimator.saturation = least_end(ends)

@@ -13,6 +13,7 @@ from daemon.assembly import Daemon
 from daemon.commands import Refused
 from daemon.messages import Parts, pack, state_message
 from daemon.records import Frame
+from daemon.settings import Settings
 from tests.loop_harness import Make, advance_to, command, grasped, refusal, torque_of
 
 
@@ -312,3 +313,19 @@ def test_tare_removes_a_standing_offset(make: Make) -> None:
     daemon.loop.advance(1.0)
     assert daemon.hand is not None
     assert daemon.loop.state.contacts[0].force == pytest.approx(daemon.hand.force[0], rel=0.05)
+
+
+def test_a_tare_of_full_sensors_leaves_the_zero_and_is_told() -> None:
+    events = []
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
+    with Daemon(settings, wire=False, on_event=lambda *event: events.append(event)) as daemon:
+        daemon.loop.advance(0.3)
+        perception = daemon.loop.perceptions[1]
+        before = perception._estimator.saturation
+        blinded(daemon, settings.tactile.full_count)
+        command(daemon, "tare")
+        daemon.loop.advance(0.5)
+        assert not perception.taring
+        assert perception._estimator.saturation == before
+    text = "right sensor's zero stays: most cells are full where nothing presses"
+    assert events.count(("warning", "tare", text)) == 1
