@@ -14,8 +14,8 @@ import zmq
 
 from daemon.assembly import Daemon
 from daemon.settings import Settings
-from tests.daemon_process import Running
-from tests.loop_harness import Make
+from tests.harness.daemon_process import Running
+from tests.harness.loop import Make
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""Fuzzing: each module a program, of which the tests run a little."""

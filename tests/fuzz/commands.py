@@ -1,0 +1,320 @@
+"""Random, mutated and oversized input to all that takes input from outside; a refusal or nothing.
+
+``python -m tests.fuzz.commands --count N`` gives N messages to a running hand's commands, every
+hundredth through a real socket, N profiles and N calibration files; ``--only commands`` and so on
+chooses. A short run of each is among the tests. It ends at the first input that is neither carried
+out nor refused, and prints it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgpack
+import zmq
+
+from daemon.assembly import Daemon
+from daemon.calibration import CalibrationFileError, load_calibration
+from daemon.commands import CommandServer, Refused, decode
+from daemon.modes import COMMANDS
+from daemon.profiles import load
+from daemon.settings import Settings, SettingsError
+
+ROOT = Path(__file__).parents[2]
+_MAX_BYTES = 4096
+
+_ODD = (
+    *(None, True, False, 0, -1, 1, 2**63, -(2**63), 0.0, -0.0, 1e308, -1e308, 5e-324),
+    *(float("nan"), float("inf"), float("-inf"), "", "stop", "x" * 5000, "\0", "é\u202e", b"\xff"),
+    *([], {}, [[]], {"command": "stop"}, msgpack.Timestamp(1), msgpack.ExtType(5, b"x")),
+)
+
+
+class Counts(dict[str, int]):
+    """How often each thing happened."""
+
+    def add(self, what: str) -> None:
+        self[what] = self.get(what, 0) + 1
+
+
+def mutated(rng: random.Random, data: bytes) -> bytes:
+    """Some bytes changed, cut, doubled, put in or grown far too large."""
+    made = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 5, 20))):
+        kind = rng.randrange(7)
+        at = rng.randrange(len(made) + 1)
+        if kind == 0 and made:
+            made[at % len(made)] = rng.randrange(256)
+        elif kind == 1 and made:
+            made[at % len(made)] ^= 1 << rng.randrange(8)
+        elif kind == 2:
+            del made[at : at + rng.randrange(1, 9)]
+        elif kind == 3:
+            made[at:at] = rng.randbytes(rng.randrange(1, 9))
+        elif kind == 4:
+            made[at:at] = made[at : at + rng.randrange(1, 30)]
+        elif kind == 5:
+            del made[at:]
+        elif rng.random() < 0.02:
+            made[at:at] = rng.randbytes(1) * rng.choice((100, 5000, 20_000))
+    return bytes(made)
+
+
+# --- commands ---------------------------------------------------------------------------------
+
+
+def some_request(rng: random.Random) -> Any:
+    """A command of the right form, or nearly."""
+    name = rng.choice([*COMMANDS, "arm", "grasp", "nothing"])
+    request: dict[Any, Any] = {"command": name}
+    for key in COMMANDS.get(name, (None, {}))[1]:
+        if rng.random() < 0.8:
+            request[key] = rng.choice((rng.uniform(-2, 12), rng.choice(_ODD)))
+    if rng.random() < 0.3:
+        request["client"] = rng.choice(("", "me", "you", rng.choice(_ODD)))
+    if rng.random() < 0.2:
+        request[rng.choice(("force", "left", "junk", 3, b"x"))] = rng.choice(_ODD)
+    return request if rng.random() < 0.97 else rng.choice((request["command"], [request], None))
+
+
+def some_message(rng: random.Random) -> bytes:
+    """Bytes for the command socket."""
+    kind = rng.random()
+    if kind < 0.1:
+        return rng.randbytes(rng.randrange(0, 200))
+    if kind < 0.12:
+        return rng.randbytes(rng.choice((_MAX_BYTES - 1, _MAX_BYTES + 1, 4 * _MAX_BYTES + 1)))
+    if kind < 0.15:  # nested, or lengths that promise more than there is
+        deep = rng.choice((b"\x91" * 3000, b"\x81\xa1a" * 1000, b"\xdf\xff\xff\xff\xff"))
+        return deep + rng.randbytes(rng.randrange(8))
+    try:
+        packed = msgpack.packb(some_request(rng))
+    except (OverflowError, ValueError):
+        packed = struct.pack(">Bq", 0xD3, -5)
+    return packed if kind < 0.35 else mutated(rng, packed)
+
+
+class CommandTarget:
+    """A hand on the virtual clock behind a real command server, asked directly and by its socket.
+
+    After every message the hand lives on: it ticks, its goals are inside the limits, torque is off
+    where its mode says so.
+    """
+
+    def __init__(self) -> None:
+        settings = Settings.model_validate({"loop": {"clock": "virtual"}})
+        self.daemon = Daemon(settings, wire=False)
+        self.loop = self.daemon.loop
+        self.loop.advance(0.3)
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.server = CommandServer(self.context, "inproc://fuzz", _MAX_BYTES)
+        self.client = self.context.socket(zmq.DEALER)
+        self.client.connect("inproc://fuzz")
+        self.asked = 0
+
+    def give(self, rng: random.Random) -> tuple[str, bytes]:
+        """One message; what became of it."""
+        self.asked += 1
+        message = some_message(rng)
+        if self.asked % 100 == 0:
+            told = self._by_socket(message)
+        else:
+            reply = self.server._answer(message, self.loop.command)
+            told = "done" if reply["ok"] else "refused"
+            if not reply["ok"]:
+                assert isinstance(reply["error"], str), reply
+                assert len(reply["error"]) < 500, reply
+            msgpack.packb(reply)
+        if self.asked % 20 == 0:
+            self.loop.advance(self.loop.period)
+            self._check()
+        return told, message
+
+    def _by_socket(self, message: bytes) -> str:
+        self.client.send_multipart([b"", message])
+        assert self.server.serve(self.loop.command), "the message did not arrive"
+        while self.server.serve(self.loop.command):
+            pass
+        assert self.client.poll(1000), "no reply"
+        reply = msgpack.unpackb(self.client.recv_multipart()[-1])
+        assert set(reply) >= {"ok"}, reply
+        return "done" if reply["ok"] else "refused"
+
+    def _check(self) -> None:
+        state, hand = self.loop.state, self.daemon.settings.hand
+        if state.mode == "fault":
+            self.loop.advance(0.1)
+        if state.mode in ("disarmed", "fault"):
+            assert not state.torque, state.mode
+        elif state.goal.valid:
+            for i in range(2):
+                assert hand.q_min[i] <= state.goal.q[i] <= hand.q_max[i], state.goal
+                assert 0.0 <= state.goal.current[i] <= self.daemon.settings.safety.current_max
+
+    def close(self) -> None:
+        self.client.close(linger=0)
+        self.server.close()
+        self.context.destroy(linger=0)
+        self.daemon.close()
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+class FileTarget:
+    """A reader of files that gives what it read or raises its one error."""
+
+    def __init__(
+        self, read: Callable[[Path], Any], error: type[Exception], seeds: list[bytes], end: str
+    ) -> None:
+        self._read = read
+        self._error = error
+        self._seeds = seeds
+        self._folder = TemporaryDirectory()
+        self._path = Path(self._folder.name) / f"fuzz{end}"
+
+    def give(self, rng: random.Random) -> tuple[str, bytes]:
+        """One file; what became of it."""
+        kind = rng.random()
+        text = rng.choice(self._seeds)
+        if kind < 0.05:
+            text = rng.randbytes(rng.randrange(0, 400))
+        elif kind < 0.5:
+            text = mutated(rng, text)
+        elif kind < 0.98:
+            text = _tokens_mixed(rng, text)
+        else:
+            text = rng.choice((b"[", b"{", b"a=[", b'{"a":')) * rng.choice((50, 3000))
+        self._path.write_bytes(text)
+        try:
+            self._read(self._path)
+        except self._error as error:
+            return ("refused" if str(error) else "refused without a word"), text
+        return "done", text
+
+    def close(self) -> None:
+        self._folder.cleanup()
+
+
+_VALUES = (
+    *(b"0", b"-1", b"1e308", b"-1e-308", b"nan", b"inf", b"1e999", b"true", b'""', b'"none"'),
+    *(b"[]", b"{}", b"[1, 2]", b'["left"]', b"9" * 400, b'"' + b"x" * 3000 + b'"', b"null"),
+    *(b"1979-05-27", b"0x7fffffffffffffff", b"[[1.0, 2.0]]", b'"\\u0000"', b"\xff\xfe"),
+)
+
+
+def _tokens_mixed(rng: random.Random, text: bytes) -> bytes:
+    """Values of a text file replaced by odd ones, lines dropped, doubled or moved."""
+    lines = text.split(b"\n")
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        at = rng.randrange(len(lines))
+        line = lines[at]
+        kind = rng.randrange(4)
+        if kind == 0 and (b"=" in line or b":" in line):
+            sign = b"=" if b"=" in line else b":"
+            key, _, _ = line.partition(sign)
+            comma = b"," if line.rstrip().endswith(b",") else b""
+            lines[at] = key + sign + b" " + rng.choice(_VALUES) + comma
+        elif kind == 1:
+            del lines[at]
+            lines = lines or [b""]
+        elif kind == 2:
+            lines.insert(rng.randrange(len(lines) + 1), line)
+        else:
+            lines.insert(at, rng.choice(_VALUES))
+    return b"\n".join(lines)
+
+
+def settings_target() -> FileTarget:
+    """Profiles."""
+    seeds = [path.read_bytes() for path in sorted((ROOT / "config").glob("*.toml"))]
+    short = [b"[safety]\ncurrent_max = 1.0\n[tip]\nradius = 0.01\n", b'task.name = "demo"\n', b""]
+    return FileTarget(load, SettingsError, short * 3 + seeds, ".toml")
+
+
+def calibration_target() -> FileTarget:
+    """Calibration files, of a small sensor: the larger ones are only longer."""
+    rows, cols = 4, 5
+    sensor = {"finger": "left", "label": "x", "rows": rows, "cols": cols, "full_count": 255}
+    table = [[1.0 + 0.1 * column for column in range(cols)] for _ in range(rows)]
+    steps = {
+        "tare": {"date": "d", "zero": table, "noise": 0.5, "frames": 16},
+        "equilibrate": {"date": "d", "gain": table, "dead": 0, "spread": 0.1, "residual": 0.01},
+        "curve": {
+            **{"date": "d", "kind": "power", "residual": 0.01},
+            "coefficients": [1.1, 400.0, 0.0, 0.0],
+        },
+        "centre": {
+            **{"date": "d", "centre": [0.001, 0.0], "rotation": 0.01},
+            **{"scale": 1.0, "residual": 1e-4},
+        },
+        "modulus": {"date": "d", "modulus": 3e5, "offset": 0.0, "residual": 0.02},
+    }
+    whole = {"format": 1, "sensor": sensor | {"pitch": [0.001, 0.001]}, "date": "d", **steps}
+    seeds = [json.dumps(whole, indent=1).encode(), json.dumps(whole).encode()]
+    for name in steps:
+        part = {key: value for key, value in whole.items() if key not in steps or key == name}
+        seeds.append(json.dumps(part, indent=1).encode())
+    return FileTarget(load_calibration, CalibrationFileError, seeds, ".json")
+
+
+TARGETS: dict[str, Callable[[], Any]] = {
+    "commands": CommandTarget,
+    "settings": settings_target,
+    "calibration": calibration_target,
+}
+
+
+def fuzz(name: str, count: int, seed: int) -> Counts:
+    """Give ``count`` inputs to one target. Raises what should not have been raised."""
+    target, rng, counts = TARGETS[name](), random.Random(seed), Counts()
+    try:
+        for _ in range(count):
+            before = rng.getstate()
+            try:
+                counts.add(target.give(rng)[0])
+            except BaseException:
+                rng.setstate(before)
+                print(f"{name}, seed {seed}, input {sum(counts.values())}", file=sys.stderr)
+                raise
+    finally:
+        target.close()
+    return counts
+
+
+def random_bytes_are_decoded_or_refused(count: int, seed: int) -> None:
+    """The parser alone, on bytes without any form."""
+    rng = random.Random(seed)
+    for _ in range(count):
+        try:
+            decode(rng.randbytes(rng.randrange(60)))
+        except Refused:
+            pass
+
+
+def _main(words: list[str] | None = None) -> Iterator[str]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", choices=TARGETS)
+    arguments = parser.parse_args(words)
+    for name in [arguments.only] if arguments.only else TARGETS:
+        begin = time.monotonic()
+        counts = fuzz(name, arguments.count, arguments.seed)
+        took = time.monotonic() - begin
+        told = ", ".join(f"{number} {what}" for what, number in sorted(counts.items()))
+        yield f"{name}: {arguments.count} in {took:.0f} s: {told}"
+
+
+if __name__ == "__main__":
+    for line in _main():
+        print(line, flush=True)

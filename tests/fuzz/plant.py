@@ -1,0 +1,165 @@
+"""Random commands, pushes and parameters against the simulated hand, in every scene it has.
+
+The tests run some thousand commands; ``python -m tests.fuzz.plant --count 1000000`` runs a million.
+A hand's commands are drawn in one go and carried out inside one compiled loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+
+import numpy as np
+
+from daemon.simulation import layout
+from daemon.simulation.plant import step
+from kinematics.kernels import kernel
+from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
+
+LONGER = 10  # times the step that the plant chooses, in one hand of three
+EACH = 400  # commands to a hand
+SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
+# joint, mode, torque on, goal, current, three of a push, whether to, reset, seconds, quiet
+_COLUMNS = 12
+
+FINE, NOT_FINITE, UNTOLD, RUNAWAY, CREATED = range(5)
+WRONG = (
+    "",
+    "not finite",
+    "past the limit untold",
+    "joints far past their stops",
+    "energy from nowhere",
+)
+
+
+@kernel
+def past_limit(memory, finger):
+    """How far the rim must be pressed in by the tip's d and θ alone [m]."""
+    radius = memory[layout.RADIUS]
+    d = memory[layout.CONTACT_D + finger]
+    theta = memory[layout.CONTACT_THETA + finger]
+    bend = memory[layout.CONTACT_BEND + finger]
+    if bend == 0.0:
+        return d - radius * (1.0 - abs(math.sin(theta)))
+    away = radius - d + 1.0 / bend
+    beyond = max(abs(away * math.sin(theta)) - radius, 0.0)
+    return 1.0 / bend - math.hypot(away * math.cos(theta), beyond)
+
+
+@kernel
+def carry_out(memory, data, ring, commands):
+    """Carry the commands out one by one; what went wrong, and at which."""
+    h = memory[layout.STEP]
+    for k in range(commands.shape[0]):
+        joint = int(commands[k, 0])
+        for place, value in (
+            (layout.MODE, commands[k, 1]),
+            (layout.TORQUE_ON, commands[k, 2]),
+            (layout.GOAL_Q, commands[k, 3]),
+            (layout.GOAL_CURRENT, commands[k, 4]),
+        ):
+            memory[place + joint] = value
+        if commands[k, 8] > 0.0:
+            memory[layout.PUSH : layout.PUSH + 3] = commands[k, 5:8]
+        if commands[k, 9] > 0.0:  # open, the object back between the fingers
+            memory[layout.POSITION : layout.VELOCITY + 5] = 0.0
+            memory[layout.POSITION + 3] = 0.08
+        if commands[k, 11] > 0.0:  # no input for a while: from then on the energy may only fall
+            for j in range(2):
+                memory[layout.TORQUE_ON + j] = 0.0
+                memory[layout.CURRENT + j] = 0.0
+            memory[layout.PUSH : layout.PUSH + 3] = 0.0
+        most = math.inf
+        for _ in range(int(commands[k, 10] / h) + 1):
+            step(memory, data, ring, 1)
+            if commands[k, 11] > 0.0:
+                total = memory[layout.TOTAL]
+                if total > most:
+                    return CREATED, k
+                most = total + 1e-12 * (abs(total) + 1e-3)
+        for place in range(layout.TIP):
+            if not math.isfinite(memory[place]):
+                return NOT_FINITE, k
+        for finger in range(2):
+            rim = memory[layout.CONTACT_RIM + finger]
+            pressed = memory[layout.CONTACT_FORCE + finger] > 0.0
+            if pressed and past_limit(memory, finger) > 1e-9 and not rim > 0.0:
+                return UNTOLD, k
+            if abs(memory[layout.POSITION + finger]) > 1.6:
+                return RUNAWAY, k
+    return FINE, commands.shape[0]
+
+
+def random_hand(generator: np.random.Generator, long: bool = False):
+    """A hand of random scene and parameters.
+
+    Masses from 1 g to 10 kg, moduli from 10 kPa to 10 MPa, friction from 0 to 2, joints from 1e-4
+    to 0.1 kg·m², gravity in any direction.
+    """
+    table = (PAPER, TABLE_I)[generator.integers(2)]
+    modulus = float(10 ** generator.uniform(4, 7))
+    parameters = {
+        "object_shape": str(generator.choice(SHAPES)),
+        "object_radius": float(generator.uniform(0.005, 0.03)),
+        "object_taper": float(generator.uniform(-1, 1)),
+        "object_mass": float(10 ** generator.uniform(-3, 1)),
+        "modulus_scale": modulus / float(table.data[3]),
+        "tip_friction": float(generator.uniform(0, 2)),
+        "palm_friction": float(generator.uniform(0, 2)),
+        "palm": float(generator.uniform(-0.05, 0.045)),
+        "joint_inertia": float(10 ** generator.uniform(-4, -1)),
+        "tip_loss": float(10 ** generator.uniform(-5, -1)),
+        "gravity": tuple(float(g) for g in generator.normal(size=2)),
+    }
+    hand = make(table, **parameters)
+    if long:
+        hand = make(table, step=LONGER * hand.step, **parameters)
+    return hand
+
+
+def random_commands(generator: np.random.Generator, count: int) -> np.ndarray:
+    commands = np.empty((count, _COLUMNS))
+    commands[:, 0] = generator.integers(2, size=count)
+    commands[:, 1] = generator.choice([CURRENT, POSITION, BOUNDED], size=count)
+    commands[:, 2] = generator.random(count) < 0.9
+    commands[:, 3] = generator.uniform(-2, 2, count)
+    commands[:, 4] = generator.uniform(-4, 4, count)
+    commands[:, 5:8] = generator.normal(size=(count, 3)) * [1, 1, 0.05]
+    commands[:, 5:8] *= (generator.random(count) < 0.5)[:, None]
+    commands[:, 8] = generator.random(count) < 0.2
+    commands[:, 9] = generator.random(count) < 0.01
+    commands[:, 10] = generator.uniform(0, 0.02, count)
+    commands[:, 11] = generator.random(count) < 0.1
+    return commands
+
+
+def abuse(seed: int, count: int = EACH) -> str:
+    """Send ``count`` random commands to a hand of random parameters; what went wrong, or \"\"."""
+    generator = np.random.default_rng(seed)
+    hand = random_hand(generator, seed % 3 == 0)
+    commands = random_commands(generator, count)
+    code, at = carry_out(hand.memory, hand.table.data, hand._ring, commands)
+    return f"seed {seed}, command {at}: {WRONG[code]}" if code != FINE else ""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=100_000, help="commands in all")
+    parser.add_argument("--seed", type=int, default=1000, help="of the first hand")
+    options = parser.parse_args()
+    bad, begin = 0, time.perf_counter()
+    hands = max(options.count // EACH, 1)
+    for seed in range(options.seed, options.seed + hands):
+        wrong = abuse(seed)
+        if wrong:
+            bad += 1
+            print(wrong, flush=True)
+    seconds = time.perf_counter() - begin
+    print(f"{hands * EACH} commands to {hands} hands in {seconds:.0f} s, {bad} hands went wrong")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

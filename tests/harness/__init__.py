@@ -1,0 +1,1 @@
+"""What several tests share: hands, buses, daemons and terminals to test with."""

@@ -1,0 +1,118 @@
+"""A process that runs many kinds of scene and tells which kernels were compiled or loaded in them.
+
+``python -m tests.harness.warm_scenes FOLDER`` prints one JSON line a scene. FOLDER takes a
+calibration file, and where a stand-in hand's ports are in it, the daemon runs on that, too. Each
+scene runs in a fork of a process that has called no kernel yet, so that none is warm through
+another scene.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from numba.core import event
+
+from daemon.assembly import Daemon
+from daemon.calibration import Calibration, TareStep, now, save_calibration, sensor_of
+from daemon.commands import Refused
+from daemon.profiles import load
+from daemon.settings import Settings
+
+HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+SCENES: dict[str, dict[str, Any]] = {
+    "two fingers": {},
+    "left finger": {"scene": {"fingers": ("left",)}},
+    "sensors without servos": {"servos": {"backend": "none"}},
+    "servos without sensors": {"tactile": {"backend": "none"}},
+    "constant modulus": {"material": {"law": "constant"}},
+    "moments": {"estimator": {"method": "moments"}},
+    "current mode": {"servos": {"mode": "current"}},
+    "position mode": {"servos": {"mode": "position"}},
+    "imperfect sensors": {"simulation": {"tactile_blur": 5e-4, "tactile_jitter": 0.004}},
+    "two-phase grip": {"control": {"law": "two_phase"}},
+    "position grip": {"control": {"law": "position"}},
+}
+SCRIPT: list[tuple[float, dict[str, Any]]] = [
+    (0.1, {"command": "arm"}),
+    (0.1, {"command": "move", "left": 0.1, "right": 0.1}),
+    (0.3, {"command": "grasp", "force": 6.0}),
+    (1.3, {"command": "rotate", "angle": 0.05}),
+    (0.7, {"command": "set", "compliance": 0.01}),
+    (0.2, {"command": "release"}),
+    (0.7, {"command": "tare"}),
+    (0.2, {"command": "stop"}),
+    (0.1, {"command": "clear"}),
+    (0.1, {"command": "status"}),
+]
+
+
+class Watch(event.Listener):
+    """Hears whenever a kernel is compiled or loaded from the cache: both hold up a tick."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def on_start(self, event: Any) -> None:
+        """The compiler is at work; who called it stands in the stack."""
+        frame, names = sys._getframe(), []
+        while frame is not None and len(names) < 40:
+            if "/numba/" not in frame.f_code.co_filename:
+                names.append(f"{Path(frame.f_code.co_filename).name}:{frame.f_code.co_name}")
+            frame = frame.f_back
+        self.heard.append(" < ".join(names[1:5]))
+
+    def on_end(self, event: Any) -> None:
+        """And is done."""
+
+
+def run(settings: Settings) -> dict[str, Any]:
+    """Run the script; what was compiled or loaded before the first tick and after it."""
+    watch = Watch()
+    modes = []
+    with event.install_listener("numba:compiler_lock", watch), Daemon(settings, wire=False) as hand:
+        before = len(watch.heard)
+        for wait, request in SCRIPT:
+            hand.loop.advance(wait)
+            try:
+                hand.loop.command(request)
+            except Refused:
+                pass
+            hand.loop.advance(hand.loop.period)
+            modes.append(hand.loop.state.mode)
+        return {"before": before, "after": watch.heard[before:], "modes": sorted(set(modes))}
+
+
+def calibrated(folder: Path) -> dict[str, Any]:
+    """A scene whose left sensor has a calibration, so that its frames are pressures."""
+    settings = Settings()
+    cells = [[0.0] * settings.tactile.cols for _ in range(settings.tactile.rows)]
+    tare = TareStep(date=now(), zero=cells, noise=1520.0, frames=16)
+    path = folder / "left.json"
+    calibration = Calibration(sensor=sensor_of(settings, 0), date=now(), tare=tare)
+    save_calibration(path, calibration)
+    return {"tactile": {"calibration": (str(path), "")}}
+
+
+def main(folder: Path) -> None:
+    """Run each scene in a fork, then, on ``folder``'s stand-in hand, the daemon over bytes."""
+    sections = {**SCENES, "calibrated sensor": calibrated(folder)}
+    scenes = {
+        name: Settings.model_validate({"loop": {"clock": "virtual"}, **scene})
+        for name, scene in sections.items()
+    }
+    if (folder / "servos").exists():
+        scenes["stand-in hand"] = load(HIL, folder)
+    for name, settings in scenes.items():
+        child = os.fork()
+        if child == 0:
+            print(json.dumps({"scene": name, **run(settings)}), flush=True)
+            os._exit(0)
+        os.waitpid(child, 0)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

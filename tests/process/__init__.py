@@ -1,0 +1,1 @@
+"""Tests that start processes, pseudo-terminals or whole daemons in real time."""

@@ -1,0 +1,155 @@
+"""``softfinger analyse``: recorded frames of every kind become contacts, as the daemon's would."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import messages
+from daemon.records import Frame
+from daemon.settings import Settings
+from kinematics import Fingertip, Material, SensorGrid
+from tests.harness.daemon_process import softfinger
+from tools.analysis.contacts import analyse, write_csv
+from tools.analysis.sources import open_source
+from tools.recordings.errors import RecordingError
+from tools.recordings.writer import RecordingWriter
+
+TIP, PITCH, SCALE = Fingertip(0.020), 0.058 / 44, 4.0
+DEPTHS = np.linspace(0.0, 0.005, 26)
+TILT = 0.1
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """A press to 5 mm at 0.1 rad, without noise but for the counts' rounding."""
+    grid = SensorGrid(rows=44, cols=44, pitch=PITCH)
+    material = Material.table_i()
+    frames = [grid.pressure(TIP, material, d, TILT, 0.0) for d in DEPTHS[1:]]
+    return np.round(np.stack([np.zeros((44, 44)), *frames]) / SCALE).astype(np.uint16)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def check(path: Path) -> None:
+    rows = rows_of(path)
+    assert len(rows) == len(DEPTHS)
+    assert rows[0]["contact"] == "0"
+    for row, d in zip(rows[5:], DEPTHS[5:], strict=True):
+        assert (row["finger"], row["valid"], row["contact"]) == ("left", "1", "1")
+        assert float(row["d_m"]) == pytest.approx(d, abs=2e-5)
+        assert float(row["theta_rad"]) == pytest.approx(TILT, abs=3e-3)
+        assert float(row["force_N"]) > 0.0
+        assert float(row["energy_J"]) > 0.0
+
+
+def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
+    writer = RecordingWriter(path)
+    facts = messages.Facts("0.1.0", settings.model_dump_json(), "", "", "", "")
+    writer.add(messages.SETTINGS, messages.settings_message(1, 1e9, 1.0, facts))
+    sensor = messages.SensorFacts(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
+    for k, data in enumerate(counts):
+        frame = Frame(k + 1, 0.01 * k, 0.01 * k, True, data)
+        message = messages.tactile_message(frame, data, 0, sensor, 1e9 + 0.01 * k)
+        writer.add(messages.TACTILE, message)
+    writer.close()
+
+
+def test_every_kind_of_file_gives_the_same_contacts(counts: np.ndarray, tmp_path: Path) -> None:
+    np.savez(tmp_path / "press.npz", frames=counts, t=np.arange(len(counts)) / 100, d=DEPTHS)
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k, frame in enumerate(counts):
+        np.save(folder / f"frame{k}.npy", frame)
+    lines = ["ROWS 44", "COLS 44", f"ROW_SPACING {PITCH * 1e3} mm", f"COL_SPACING {PITCH * 1e3} mm"]
+    lines += ["SECONDS_PER_FRAME 0.01", "UNITS RAW", "ASCII_DATA @@"]
+    for k, frame in enumerate(counts):
+        lines += [f"Frame {k + 1}", *(",".join(map(str, row)) for row in frame), ""]
+    (tmp_path / "export.asf").write_text("\n".join(lines))
+    save_stream(tmp_path / "run.mcap", counts, Settings())
+    for name in ("press.npz", "frames", "export.asf", "run.mcap"):
+        # The export tells its pitch: a wrong one in the settings must not matter there.
+        pitch = 0.002 if name == "export.asf" else PITCH
+        tactile = Settings().tactile.model_copy(update={"rows": 10, "cols": 10, "pitch": pitch})
+        settings = Settings().model_copy(update={"tactile": tactile})
+        source = open_source(tmp_path / name, settings, None, own=True)
+        output = tmp_path / f"{name}.csv"
+        write_csv(output, analyse(source, lambda done: None))
+        check(output)
+    assert float(rows_of(tmp_path / "press.npz.csv")[10]["d_true_m"]) == DEPTHS[10]
+
+
+def test_from_the_command_line_with_picture(counts: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "press.npz"
+    np.savez(path, frames=counts)
+    done = softfinger("analyse", str(path), "--set", "tactile.noise=20.0")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("26 frames in ")
+    check(tmp_path / "press.npz.contacts.csv")
+    picture = (tmp_path / "press.npz.contacts.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 20_000
+
+
+def test_a_recorded_hand_of_another_material_needs_no_settings(
+    counts: np.ndarray, tmp_path: Path
+) -> None:
+    law = Settings().material.model_copy(update={"law": "constant", "modulus": 1e6})
+    save_stream(tmp_path / "a.mcap", counts, Settings().model_copy(update={"material": law}))
+    own = analyse(open_source(tmp_path / "a.mcap", Settings(), None, own=True), lambda n: None)
+    mine = analyse(open_source(tmp_path / "a.mcap", Settings(), None, own=False), lambda n: None)
+    assert own[0].values["gain"][20] < 0.5 * mine[0].values["gain"][20]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.npz", b"", "No data left in file"),
+        ("a.npz", b"PK\x03\x04junk", "zip"),
+        ("a.mcap", b"\x89MCAP0\r\n", "no tactile frames in it"),
+        ("a.asf", b"hello\n", "a.asf"),
+        ("none.npz", None, "No such file"),
+    ],
+)
+def test_files_that_are_none(tmp_path: Path, name: str, content: bytes | None, reason: str) -> None:
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    done = softfinger("analyse", str(path))
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"analyse: {path}")
+    *before, last = done.stderr.splitlines()
+    assert reason in last
+    assert all("cut short (its end is missing)" in each for each in before)
+
+
+def test_a_frame_of_another_size_is_told(counts: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    save_stream(path, counts[:, :40], Settings())
+    with pytest.raises(RecordingError, match="40 × 44 cells, expected 44 × 44"):
+        analyse(open_source(path, Settings(), None, own=True), lambda n: None)
+
+
+def test_wrong_settings_and_a_missing_extra(tmp_path: Path, counts: np.ndarray) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, frames=counts[:3])
+    done = softfinger("analyse", str(path), "--set", "tip.radius=0")
+    assert done.returncode == 2
+    code = (
+        "import sys; sys.modules['matplotlib'] = None\n"
+        "from tools.cli import main\n"
+        f"sys.exit(main(['analyse', {str(path)!r}]))"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert told.returncode == 0  # the numbers are there
+    assert "pip install '.[plot]'" in told.stderr

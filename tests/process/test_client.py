@@ -1,0 +1,247 @@
+"""The client for programs, against a real daemon and against streams that a daemon never sends."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+
+from daemon import messages
+from daemon.client import (
+    AsyncHand,
+    FingerState,
+    Hand,
+    HandFault,
+    HandState,
+    NoAnswer,
+    NoStream,
+    NotInTime,
+    ObjectState,
+    Refused,
+    to_columns,
+)
+from daemon.client.records import read_event, read_frame, read_state
+from daemon.client.wire import Gaps
+from daemon.records import State
+from tests.conftest import until
+from tests.harness import fake_daemon
+from tests.harness.daemon_process import Running
+from tests.harness.fake_daemon import FakeDaemon
+
+Start = Callable[..., Running]
+Profile = Callable[[str], Path]
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeDaemon]:
+    daemon = FakeDaemon()
+    yield daemon
+    daemon.close()
+
+
+@pytest.fixture
+def hand(fake: FakeDaemon) -> Iterator[Hand]:
+    with Hand(fake.state_address, fake.command_address) as hand:
+        yield hand
+
+
+def test_grasp_turn_and_release_on_a_running_daemon(
+    start: Start, profile: Profile, addresses: tuple[str, str]
+) -> None:
+    start("--config", str(profile("")))
+    with Hand(*addresses, client="notebook") as hand:
+        assert hand.state().mode == "disarmed"
+        with pytest.raises(Refused, match="grasp: not while disarmed; arm first"):
+            hand.grasp(force=5.0)
+        hand.arm()
+        with hand.events(timeout=5.0) as events, hand.frames(timeout=5.0) as frames:
+            hand.grasp(force=5.0)
+            held = hand.wait_for(lambda state: state.mode == "holding")
+            assert held.left.contact
+            assert held.right.contact
+            frame = next(frames)
+            assert frame.counts.shape == (44, 44)
+            assert frame.pressure().sum() > 0.0
+            assert any("grasping" in event.text for event in events)
+        hand.rotate(angle=math.radians(5.0))
+        hand.wait_for(lambda state: abs(state.object.angle - math.radians(5.0)) < 5e-3)
+        states = hand.collect(0.3)
+        columns = to_columns(states)
+        assert np.all(np.diff(columns["seq"]) > 0)
+        assert columns["left.force"].mean() == pytest.approx(5.0, rel=0.1)
+        assert hand.status()["torque"] is True
+        hand.stop()
+        assert hand.wait_for(lambda state: not state.torque).mode == "disarmed"
+
+
+def test_the_same_from_asyncio(start: Start, profile: Profile, addresses: tuple[str, str]) -> None:
+    start("--config", str(profile("")))
+
+    async def session() -> tuple[str, int]:
+        async with AsyncHand(*addresses) as hand:
+            await hand.command("arm")
+            with pytest.raises(Refused, match="expected a number"):
+                await hand.command("grasp", force="much")  # type: ignore[arg-type]
+            await hand.command("grasp", force=5.0)
+            held = await hand.wait_for(lambda state: state.mode == "holding")
+            seen = 0
+            async for frame in hand.frames():
+                seen += frame.counts.size
+                break
+            with pytest.raises(NotInTime, match="mode holding"):
+                await hand.wait_for(lambda state: state.mode == "releasing", timeout=0.2)
+            return held.mode, seen
+
+    assert asyncio.run(session()) == ("holding", 44 * 44)
+
+
+def test_every_field_of_the_wire_is_in_the_records() -> None:
+    message = messages.state_message(
+        State(), messages.Parts(fingers=(True, True), servos=True, sensors=True)
+    )
+    for record, part in (
+        (HandState, message),
+        (FingerState, message["left"]),
+        (ObjectState, message["object"]),
+    ):
+        names = {field.name for field in fields(record)}
+        assert names == set(part)
+    assert read_state(message).left.valid is message["left"]["valid"]
+
+
+def test_a_fault_ends_the_waiting(fake: FakeDaemon, hand: Hand) -> None:
+    hand.state()
+    fake.changes = {"mode": "fault", "fault": "servo 1: overload"}
+    with pytest.raises(HandFault, match="servo 1: overload"):
+        hand.wait_for(lambda state: state.mode == "holding" and not state.fault)
+    assert hand.wait_for(lambda state: state.mode == "fault").fault == "servo 1: overload"
+
+
+def test_waiting_ends_in_time(hand: Hand) -> None:
+    with pytest.raises(NotInTime, match=r"not within 0\.2 s; the last state: mode holding"):
+        hand.wait_for(lambda state: state.mode == "released", timeout=0.2)
+
+
+def test_no_daemon_is_told(addresses: tuple[str, str]) -> None:
+    with Hand(*addresses, timeout=0.1) as hand:
+        with pytest.raises(NoStream, match="is softfinger running"):
+            hand.state()
+        with pytest.raises(NoStream, match=r"no hand/state from tcp://.* within 0\.1 s"):
+            hand.wait_for(lambda state: True, timeout=0.1)
+        with pytest.raises(NoAnswer, match="is softfinger running"):
+            hand.arm()
+
+
+def test_state_is_never_one_that_has_waited(fake: FakeDaemon, hand: Hand) -> None:
+    first = hand.state()
+    before = fake.published
+    until(lambda: fake.published > before + 20)
+    latest = fake.published
+    assert hand.state().seq >= 5 * (latest - 1) > first.seq
+
+
+def test_gaps_are_counted_by_the_step_of_the_topic() -> None:
+    gaps = Gaps()
+    for seq in (5, 10, 16, 30, 36):  # which one of five is up to the sender
+        gaps.take({"seq": seq, "seq_step": 5})
+    assert gaps.lost == 2
+    gaps.take({"seq": 5, "seq_step": 5})  # started again: no loss
+    gaps.take({"seq": 10, "seq_step": 5})
+    assert gaps.lost == 2
+    for finger in ("left", "right"):  # each finger counts for itself
+        for seq in (1, 2, 4):
+            gaps.take({"seq": seq, "finger": finger})
+    assert gaps.lost == 4
+
+
+def test_what_is_told_again_is_news_once_and_fills_gaps() -> None:
+    gaps = Gaps()
+    assert gaps.take({"seq": 5, "again": False})
+    assert [gaps.take({"seq": seq, "again": True}) for seq in (3, 4, 5)] == [True, True, False]
+    assert gaps.take({"seq": 8, "again": False})
+    assert gaps.lost == 2
+    assert gaps.take({"seq": 7, "again": True})
+    assert gaps.lost == 1
+    assert gaps.take({"seq": 1, "again": False})  # another daemon
+    assert gaps.take({"seq": 5, "again": False})
+    assert not gaps.take({"seq": 5, "again": True})
+
+
+def test_frames_are_counted_by_their_number() -> None:
+    gaps = Gaps()
+    for seq, number in ((10, 1), (15, 2), (16, 4)):
+        gaps.take({"seq": seq, "seq_step": 1, "number": number, "finger": "left"})
+    assert gaps.lost == 1
+
+
+def test_another_schema_is_told_once_and_its_known_fields_kept(
+    fake: FakeDaemon, hand: Hand
+) -> None:
+    fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
+    until(lambda: fake.published > 2)
+    with hand.stream(timeout=5.0) as states:
+        with pytest.warns(UserWarning, match=r"schema 7, this client knows 1") as told:
+            state = [next(states), next(states)][-1]
+        assert len(told) == 1
+        assert (state.schema, state.mode, state.overruns) == (7, "holding", 0)
+
+
+def test_what_cannot_be_read_is_counted_and_passed_over(fake: FakeDaemon, hand: Hand) -> None:
+    with hand.stream(timeout=5.0) as states:
+        next(states)
+        for payload in (b"\xc1", b"", msgpack.packb([1]), b"\x91" * 5000):
+            fake.send(b"hand/state", payload)
+        until(lambda: next(states) and states.unreadable == 4)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"rows": 43}, {"rows": -44, "cols": -44}, {"rows": True}, {"data": "text"}, {"cols": None}],
+)
+def test_a_grid_that_is_not_what_it_says(changes: dict[str, object]) -> None:
+    message = {**fake_daemon.frame(0.0, 0), **changes}
+    with pytest.raises(ValueError, match="hand/tactile"):
+        read_frame(message)
+
+
+def test_a_frame_tells_where_its_cells_are_and_what_they_mean() -> None:
+    told = {"pitch_y": 0.002, "centre_x": 1e-4, "unit": "Pa", "scale": 0.5, "calibrated": True}
+    message = {**fake_daemon.frame(0.0, 1), **told, "calibration": "A17 2026"}
+    frame = read_frame(message)
+    assert (frame.finger, frame.valid, frame.unit, frame.calibrated) == ("right", True, "Pa", True)
+    assert (frame.pitch_y, frame.centre, frame.calibration) == (0.002, (1e-4, 0.0), "A17 2026")
+    assert np.array_equal(frame.pressure(), 0.5 * frame.counts)
+
+
+def test_missing_fields_are_not_a_number() -> None:
+    state = read_state({"left": {"force": "much"}, "object": 3})
+    assert math.isnan(state.left.force)
+    assert math.isnan(state.object.width)
+    assert (state.mode, state.seq, state.torque) == ("", 0, False)
+    assert read_event({}).text == ""
+
+
+def test_columns_of_no_states_are_empty() -> None:
+    columns = to_columns([])
+    assert columns["left.force"].shape == (0,)
+    assert "object.angle" in columns
+
+
+def test_fingers_by_name() -> None:
+    state = read_state({"right": {"force": 3.0}})
+    assert state.finger("right").force == 3.0
+    with pytest.raises(ValueError, match="found finger 'thumb'"):
+        state.finger("thumb")
+
+
+def test_importing_the_client_compiles_nothing() -> None:
+    code = "import daemon.client, sys; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

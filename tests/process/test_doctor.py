@@ -1,0 +1,390 @@
+"""`softfinger doctor` and `softfinger scan`: against emulated hands, and its checks one by one."""
+
+from __future__ import annotations
+
+import os
+import resource
+import select
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from daemon.checkup import addresses as sockets
+from daemon.checkup import hand, kernels, machine, mending, ports
+from daemon.checkup.result import Result
+from daemon.commands import CommandServer
+from daemon.profiles import load
+from daemon.servos import registers as reg
+from daemon.servos.scanning import scan
+from daemon.settings import Settings
+from daemon.simulation.emulator import Emulator
+from tools import doctor
+from tools.cli import main
+
+HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+
+
+class Hand:
+    """A stand-in hand in a thread, and the doctor's view of it."""
+
+    def __init__(self, folder: Path, **options: Any) -> None:
+        self.folder = folder
+        self.settings = load(HIL, folder)
+        self.emulator = Emulator(self.settings, folder, **options)
+        ready = threading.Event()
+        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,))
+        self._thread.start()
+        assert ready.wait(60.0)
+
+    def registers(self) -> list[bytes]:
+        """What the servos hold, but for the registers that live."""
+        live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
+        bus = self.emulator._servos.bus
+        memories = [bytes(servo.table.memory) for servo in bus.servos]
+        return [memory[: live.start] + memory[live.stop :] for memory in memories]
+
+    def doctor(self, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, list[str]]:
+        status = main(["doctor", "--config", str(HIL), "--dir", str(self.folder), *words])
+        return status, capsys.readouterr().out.splitlines()
+
+    def close(self) -> None:
+        self.emulator.stop()
+        self._thread.join()
+        self.emulator.close()
+
+
+@pytest.fixture
+def emulated(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
+    made: list[Hand] = []
+
+    def start(**options: Any) -> Hand:
+        made.append(Hand(tmp_path, **options))
+        return made[-1]
+
+    yield start
+    for each in made:
+        each.close()
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Listen for less than on metal, and leave the sockets of this machine alone."""
+    monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
+    monkeypatch.setattr(machine, "_WAKE_UPS", 5)
+    whole = hand.check_servos
+    monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.1, 0.05))
+
+
+def with_status(lines: list[str], status: str) -> list[str]:
+    return [line[7:] for line in lines if line.startswith(status)]
+
+
+def test_factory_new_servos_fail_and_are_mended_only_when_asked(emulated, capsys):
+    hand = emulated(prepared=False)
+    before = hand.registers()
+    status, lines = hand.doctor(capsys)
+    assert status == 1
+    assert hand.registers() == before
+    failed = with_status(lines, "FAIL")
+    assert len(failed) == 4
+    assert "servo 2 (right): return delay is 500 µs, more than 50 µs" in failed
+    assert lines.count("       → softfinger doctor --fix") == 4
+    status, lines = hand.doctor(capsys, "--fix")
+    assert status == 0, lines
+    assert "servo 1 (left): operating mode 3 → 5" in with_status(lines, "fixed")
+    assert sum("current-based position mode" in line for line in with_status(lines, "pass")) == 2
+    assert not any(memory[reg.TORQUE_ENABLE] for memory in hand.registers())
+    before = hand.registers()
+    status, lines = hand.doctor(capsys, "--fix")
+    assert status == 0
+    assert with_status(lines, "fixed") == []
+    assert hand.registers() == before
+
+
+def test_boards_are_listened_to(emulated, capsys):
+    hand = emulated()
+    status, lines = hand.doctor(capsys)
+    assert status == 0, lines
+    for side in ("left", "right"):
+        assert [line for line in lines if f"pass   tactile {side}: 32 × 32 cells, " in line]
+    hand.emulator.tell("left:wrong-size")
+    status, lines = hand.doctor(capsys)
+    assert status == 1
+    assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
+    assert "       → set tactile.rows and tactile.cols" in lines
+
+
+def test_a_missing_port_and_a_missing_servo(emulated, capsys):
+    hand = emulated()
+    hand.emulator.tell("silent=2 right:unplug")
+    status, lines = hand.doctor(capsys)
+    assert status == 1
+    failed = with_status(lines, "FAIL")
+    assert [line for line in failed if "tactile-right: no such file" in line]
+    assert [line for line in failed if line == "servo 2 (right): no answer at 2000000 baud"]
+    assert "note   found: no other servo answers at any rate" in lines
+
+
+def test_servos_at_another_rate_are_found(emulated, capsys):
+    hand = emulated(baud=1_000_000)
+    status, lines = hand.doctor(capsys)
+    assert status == 1
+    assert "note   found: ID 1 at 1000000 baud: XM430-W350, firmware 48" in lines
+    assert (
+        "       → softfinger doctor --fix makes it servo 1 (left): 1000000 → 2000000 baud; "
+        "or set servos.baud = 1000000"
+    ) in lines
+    path = str(hand.folder / "servos")
+    arguments = ["scan", path, "--baud", "2000000", "--baud", "1000000", "--wait", "0.1"]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split(": ", 1)[1] for line in out] == [
+        f"ID {servo} at 1000000 baud: XM430-W350 (number 1020), firmware 48" for servo in (1, 2)
+    ]
+    assert main(["scan", path, "--baud", "57600", "--wait", "0.05"]) == 1
+    assert "no servo answers" in capsys.readouterr().out
+    assert main(["scan", "/dev/does-not-exist"]) == 1
+    assert "no such port" in capsys.readouterr().err
+
+
+def test_the_built_in_hand_has_nothing_to_ask(capsys):
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "note   servos: simulated: no servo to ask" in lines
+    assert [line for line in lines if line.startswith("note   serial ports: ")]
+    assert lines[-1].endswith(" 0 failed")
+
+
+def test_wrong_settings_are_told(tmp_path, capsys):
+    path = tmp_path / "bad.toml"
+    path.write_text("servos.speed = 3\n")
+    assert main(["doctor", "--config", str(path)]) == 2
+    assert "unknown key" in capsys.readouterr().err
+
+
+def test_a_rate_that_the_port_has_not_is_passed_over(emulated):
+    hand = emulated(baud=1_000_000)
+    found = scan(str(hand.folder / "servos"), (-1, 1_000_000), wait=0.1)
+    assert [servo.id for servo in found] == [1, 2]
+
+
+# Ports.
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, str]]:
+    """A pseudo-terminal: its master and its slave's path."""
+    master, slave = os.openpty()
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+def test_ports_that_can_not_be_used(tmp_path):
+    missing = ports.check_port(str(tmp_path / "none"), "servos.port")
+    assert (missing.status, missing.text) == ("FAIL", "no such file or directory")
+    assert "servos.port" in missing.mend
+    dangling = tmp_path / "dangling"
+    dangling.symlink_to(tmp_path / "gone")
+    assert ports.check_port(str(dangling), "servos.port").text == "leads nowhere"
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert ports.check_port(str(plain), "servos.port").text == "is no serial port"
+    assert ports.check_port("/dev/null", "servos.port").text == "is no serial port"
+
+
+def test_a_port_without_permission(monkeypatch, terminal):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    found = ports.check_port(terminal[1], "servos.port")
+    assert found.text == "no permission to open it"
+    assert found.mend.startswith("sudo ")
+
+
+@pytest.mark.parametrize("locked", [True, False])
+def test_who_has_a_port_is_named(terminal, locked):
+    _, path = terminal
+    # The master's owner, this process, counts as no user of it.
+    script = (
+        "import fcntl, os, sys; d = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)\n"
+        f"if {locked}: fcntl.flock(d, fcntl.LOCK_EX)\n"
+        "print('open', flush=True); sys.stdin.read()"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", script, path], **pipes) as other:
+        assert other.stdout.readline() == "open\n"
+        found = ports.check_port(path, "servos.port")
+        other.stdin.close()
+    assert found.status == "FAIL"
+    assert f"in use by process {other.pid} (python" in found.text
+    assert found.mend == f"kill {other.pid}"
+    assert ports.check_port(path, "servos.port").status == "pass"
+
+
+def latency(tmp_path: Path, value: str) -> tuple[str, Path]:
+    """A made-up adapter's path and its place under a made-up /sys/class/tty."""
+    folder = tmp_path / "sys" / "ttyUSB7" / "device"
+    folder.mkdir(parents=True)
+    (folder / "latency_timer").write_text(value)
+    return "/dev/ttyUSB7", tmp_path / "sys"
+
+
+def test_latency_timer_is_judged_and_mended(tmp_path):
+    path, sysfs = latency(tmp_path, "16\n")
+    slow = ports.check_latency_timer(path, 0.004, sysfs)
+    assert slow.failed
+    assert "softfinger doctor --fix" in slow.mend
+    assert ports.check_latency_timer(path, 0.05, sysfs).status == "warn"
+    assert mending.mend_latency_timer(path, sysfs).status == "fixed"
+    assert ports.latency_file(path, sysfs).read_text() == "1"
+    assert ports.check_latency_timer(path, 0.004, sysfs).status == "pass"
+    assert mending.mend_latency_timer(path, sysfs) is None
+    assert ports.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
+
+
+def test_a_latency_timer_that_can_not_be_set_is_told_with_the_command(tmp_path, monkeypatch):
+    path, sysfs = latency(tmp_path, "16\n")
+
+    def refuse(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    found = mending.mend_latency_timer(path, sysfs)
+    assert found.status == "warn"
+    assert found.mend == f"echo 1 | sudo tee {ports.latency_file(path, sysfs)}"
+
+
+# This machine.
+
+
+def test_scheduling_is_tried_and_taken_back(monkeypatch):
+    before = os.sched_getscheduler(0)
+    assert machine.check_scheduling().status in ("pass", "warn")
+    assert os.sched_getscheduler(0) == before
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    found = machine.check_scheduling()
+    assert found.status == "warn"
+    assert "rtprio" in found.mend
+
+
+def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert machine.check_memory_lock(resource.RLIM_INFINITY).status == "pass"
+    assert machine.check_memory_lock(1 << 30).status == "pass"
+    assert "memlock" in machine.check_memory_lock(8 << 20).mend
+    place = tmp_path / "cpu_dma_latency"
+    assert machine.check_idle_states(place).status == "warn"
+    place.touch()
+    assert machine.check_idle_states(place).status == "pass"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "udevadm" in machine.check_idle_states(place).mend
+    source = tmp_path / "source"
+    source.write_text("tsc\n")
+    assert machine.check_clock_source(source).status == "pass"
+    source.write_text("hpet\n")
+    assert machine.check_clock_source(source).status == "warn"
+    assert machine.check_wall_clock(0.0).status == "warn"
+    assert machine.check_wall_clock(2e9).status == "pass"
+    assert machine.check_wake_ups([1e-4] * 9 + [0.1]).status == "pass"
+    assert machine.check_wake_ups([2e-3] * 9).status == "warn"
+    assert len(machine.wake_ups()) == 5
+
+
+def test_kernels_cold_warm_and_stale(tmp_path, monkeypatch):
+    module = tmp_path / "some_kernels.py"
+    text = "from kinematics.kernels import kernel\n\n\n@kernel\ndef twice(x):\n    return {} * x\n"
+    module.write_text(text.format("2.0"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(kernels, "_SENSING", (("some_kernels", "twice"),))
+    scene = Settings.model_validate(
+        {"servos": {"backend": "none"}, "tactile": {"backend": "flexitac"}}
+    )
+
+    def last() -> Result:
+        return kernels.check_kernels(scene)[-1]
+
+    assert last().status == "warn"
+    assert "half a minute" in last().text
+    import some_kernels
+
+    assert some_kernels.twice(np.float64(2.0)) == 4.0
+    assert last().status == "pass"
+    some_kernels.twice._cache._cache_file._source_stamp = "another source's"
+    assert last().status == "warn"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "NUMBA_CACHE_DIR" in kernels.check_kernels(scene)[0].mend
+
+
+def test_mending_compiles_what_the_scene_needs():
+    scene = load(HIL, Path("/nowhere"))
+    assert mending.mend_kernels(scene).status == "fixed"
+    assert [found.status for found in kernels.check_kernels(scene)][-1] == "pass"
+
+
+# Sockets.
+
+
+def profile(addresses: tuple[str, str]) -> Settings:
+    stream, commands = addresses
+    return Settings.model_validate(
+        {"stream": {"address": stream}, "commands": {"address": commands}}
+    )
+
+
+def test_free_and_taken_sockets(addresses, monkeypatch):
+    settings = profile(addresses)
+    assert [each.status for each in check(settings)] == ["pass", "pass"]
+    monkeypatch.setattr("daemon.checkup.addresses._PATIENCE", 0.05)
+    host, port = addresses[0].removeprefix("tcp://").split(":")
+    with socket.create_server((host, int(port))):
+        taken, free = check(settings)
+    assert taken.status == "FAIL"
+    assert "no softfinger daemon" in taken.text
+    assert "stream.address" in taken.mend
+    assert free.status == "pass"
+
+
+def test_a_running_daemon_is_recognised(addresses, context):
+    server = CommandServer(context, addresses[1], 4096)
+    asked = threading.Event()
+
+    def answer() -> None:
+        while not asked.is_set():
+            select.select([server._socket.getsockopt(zmq.FD)], [], [], 0.01)
+            server.serve(lambda request: {"mode": "holding"})
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    _, found = check(profile(addresses))
+    asked.set()
+    thread.join()
+    server.close()
+    assert found.status == "warn"
+    assert "runs here already (holding)" in found.text
+
+
+def check(settings: Settings) -> list[Result]:
+    return sockets.check_addresses(settings)
+
+
+def test_ipc_addresses(tmp_path, context):
+    place = f"ipc://{tmp_path / 'commands'}"
+    assert sockets.why_not_free(place) == ""
+    server = CommandServer(context, place, 4096)
+    assert sockets.why_not_free(place) == "in use"
+    server.close()
+    assert sockets.why_not_free(place) == ""
+    assert "is not there" in sockets.why_not_free("ipc:///nowhere/at/all")
+    assert "expected tcp or ipc" in sockets.why_not_free("udp://1")
+    assert sockets.why_not_free("tcp://127.0.0.1:x") == "has no port number"

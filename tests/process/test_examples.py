@@ -1,0 +1,57 @@
+"""The example programs run as they stand, against a real daemon."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+
+from tests.harness.daemon_process import Running
+
+Start = Callable[..., Running]
+Profile = Callable[[str], Path]
+
+
+def example(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.examples.grasp_and_turn", *words],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_grasp_and_turn(
+    start: Start, profile: Profile, addresses: tuple[str, str], tmp_path: Path
+) -> None:
+    daemon = start("--config", str(profile("")))
+    stream, commands = addresses
+    picture = tmp_path / "picture.png"
+    done = example("--stream", stream, "--commands", commands, "--picture", str(picture))
+    assert (done.returncode, done.stderr) == (0, "")
+    states, lost = map(int, re.findall(r"(\d+) states, (\d+) lost", done.stdout)[0])
+    assert states > 200
+    assert lost == 0
+    force = float(re.findall(r"while holding: ([\d.]+) N", done.stdout)[0])
+    assert force == pytest.approx(8.0, rel=0.05)
+    pixels = imread(picture)[..., :3]
+    assert pixels.shape[:2] == (504, 1080)
+    for colour in ((0, 114, 178), (213, 94, 0), (0, 158, 115)):  # left, right, object
+        near = abs(pixels * 255.0 - colour).max(axis=2) < 25.0
+        assert near.sum() > 300, colour
+    assert daemon.end() == 0
+
+
+def test_without_a_daemon_it_says_so(addresses: tuple[str, str], tmp_path: Path) -> None:
+    stream, commands = addresses
+    picture = tmp_path / "picture.png"
+    done = example("--stream", stream, "--commands", commands, "--picture", str(picture))
+    assert done.returncode == 1
+    assert f"no hand/state from {stream} within 3 s; is softfinger running?" in done.stderr
+    assert not picture.exists()

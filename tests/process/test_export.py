@@ -1,0 +1,120 @@
+"""``softfinger export``: a recording's numbers in the files that others read."""
+
+from __future__ import annotations
+
+import csv
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import messages
+from tests.harness.daemon_process import softfinger
+from tests.process.test_record import written
+from tests.unit.test_contract import flat, sample
+from tools.recordings.reader import Recording
+from tools.recordings.tables import BLOCK, CsvTable, ParquetTable, export
+from tools.recordings.writer import RecordingWriter
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "a.mcap"
+    written(path, BLOCK + 50)
+    return path
+
+
+def test_csv_has_every_field_with_all_its_digits(path: Path, tmp_path: Path) -> None:
+    export(Recording(path), tmp_path, CsvTable, [messages.STATE])
+    with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == BLOCK + 50
+    expected = flat(sample(messages.STATE))
+    assert list(rows[0]) == list(expected)
+    for name, value in expected.items():
+        if name not in ("seq", "timestamp"):
+            told = rows[-1][name]
+            assert told == str(value) if isinstance(value, str) else float(told) == value, name
+    assert [int(row["seq"]) for row in rows] == list(range(BLOCK + 50))
+
+
+def test_parquet_keeps_types_and_frames(path: Path, tmp_path: Path) -> None:
+    import pyarrow.parquet
+
+    topics = [messages.STATE, messages.TACTILE]
+    files = export(Recording(path), tmp_path, ParquetTable, topics)
+    assert {file.name for file in files} == {
+        "hand-state.parquet",
+        "hand-tactile.parquet",
+        "tactile-left.npz",
+        "tactile-right.npz",
+    }
+    table = pyarrow.parquet.read_table(tmp_path / "hand-state.parquet")
+    assert table.num_rows == BLOCK + 50
+    kinds = {"seq": "int64", "left.force": "double", "torque": "bool", "mode": "string"}
+    assert {name: str(table.schema.field(name).type) for name in kinds} == kinds
+    assert table["left.force"][0].as_py() == sample(messages.STATE)["left"]["force"]
+    frames = pyarrow.parquet.read_table(tmp_path / "hand-tactile.parquet")
+    raw = np.load(tmp_path / "tactile-left.npz")
+    assert raw["frames"].shape == (103, 44, 44)
+    assert raw["t"][0] == 0.0
+    left = [k for k, name in enumerate(frames["finger"].to_pylist()) if name == "left"]
+    assert frames["data"][left[5]].as_py() == raw["frames"][5].tobytes()
+
+
+def test_numbers_that_are_none_are_empty_cells(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    message = sample(messages.STATE)
+    message["left"]["force"] = math.nan
+    message["news"] = 3.5  # of a newer daemon
+    writer.add(messages.STATE, message)
+    writer.close()
+    export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [messages.STATE])
+    with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
+        [row] = csv.DictReader(file)
+    assert (row["left.force"], row["news"]) == ("", "3.5")
+
+
+def test_from_the_command_line(path: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ("--out", str(out), "--topics", "state", "--from", "100", "--to", "200")
+    done = softfinger("export", str(path), *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip() == str(out / "hand-state.csv")
+    with (out / "hand-state.csv").open(encoding="utf-8") as file:
+        assert 100 <= len(file.readlines()) - 1 <= 101
+    done = softfinger("export", str(path), "--topics", "dreams")
+    assert done.returncode == 1
+    assert "found topic 'dreams', the recording has hand/state, hand/tactile" in done.stderr
+
+
+def test_what_can_not_be_exported(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    RecordingWriter(empty).close()
+    done = softfinger("export", str(empty))
+    assert done.returncode == 1
+    assert "no messages in it" in done.stderr
+    (tmp_path / "file").write_text("")
+    writer = RecordingWriter(tmp_path / "b.mcap")
+    writer.add(messages.STATE, sample(messages.STATE))
+    writer.close()
+    done = softfinger("export", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "file"))
+    assert done.returncode == 1
+    assert str(tmp_path / "file") in done.stderr
+
+
+def test_a_missing_extra_is_named(path: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.modules['pyarrow'] = None\n"
+        "from tools.cli import main\n"
+        f"sys.exit(main(['export', {str(path)!r}, '--format', 'parquet', '--out', "
+        f"{str(tmp_path / 'out')!r}]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert "pip install '.[parquet]'" in done.stderr

@@ -1,0 +1,106 @@
+"""The glove-style board's framing as pure bytes, and its poll on a real pty."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.simulation.encoders import encode_glove, encoder_for
+from daemon.tactile.glove import GloveDecoder, bits_of
+from tests.conftest import until
+from tests.harness.tactile import Rig
+
+
+def counts(seed: int, rows: int = 3, cols: int = 4):
+    return np.random.default_rng(seed).integers(0, 1024, (rows, cols)).astype(np.uint16)
+
+
+def test_a_frame_is_index_halves_and_newline():
+    data = encode_glove(np.array([[0, 31], [32, 1023]], np.uint16), 2)
+    assert data == bytes([13, 11, 11, 11, 42, 12, 11, 42, 42, 10])
+    decoded = GloveDecoder(2, 2).feed(data, 3.0)
+    assert decoded is not None
+    assert decoded.t == 3.0
+    assert decoded.data.tolist() == [[0, 31], [32, 1023]]
+    assert encode_glove(np.full((1, 1), 60000, np.uint16)) == bytes([11, 42, 42, 10])
+
+
+@pytest.mark.parametrize("full_count", [1023, 4095])
+def test_a_board_sends_all_its_bits(full_count):
+    sent = np.array([[0, 63, 64], [1022, full_count - 1, full_count]], np.uint16)
+    data = encoder_for("glove", full_count).encode(sent, 3, 0.0)
+    decoder = GloveDecoder(2, 3, bits_of(full_count))
+    assert decoder.feed(data, 1.0).data.tolist() == sent.tolist()
+    if full_count == 4095:
+        plain = GloveDecoder(2, 3, bits_of(65535))  # as a profile that doesn't tell
+        assert plain.feed(data, 1.0) is None
+        assert "full_count = 4095" in plain.diagnosis()
+
+
+def test_bytes_behind_a_frame_in_the_same_read_are_told():
+    decoder = GloveDecoder(3, 4)
+    first, second, third = (encode_glove(counts(k), k) for k in range(3))
+    assert decoder.feed(first + second + third[:7], 1.0).behind == 7
+    assert decoder.feed(third[7:], 2.0).behind == 0
+
+
+def test_the_usual_board_has_2050_bytes_a_frame():
+    assert GloveDecoder().frame_bytes == len(encode_glove(counts(1, 32, 32))) == 2050
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    seeds=st.lists(st.integers(0, 99), min_size=1, max_size=5),
+    start=st.integers(0, 25),
+    cuts=st.lists(st.integers(0, 130), max_size=8),
+)
+def test_any_cut_of_a_stream_gives_the_same_frames(seeds, start, cuts):
+    stream = b"".join(encode_glove(counts(seed), k) for k, seed in enumerate(seeds))[start:]
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    whole, pieces = GloveDecoder(3, 4), GloveDecoder(3, 4)
+    last = whole.feed(stream, 0.0)
+    found = [
+        decoded
+        for left, right in itertools.pairwise(edges)
+        if (decoded := pieces.feed(stream[left:right], 0.0)) is not None
+    ]
+    assert pieces.counters() == whole.counters()
+    if last is None:
+        assert not found
+    else:
+        assert np.array_equal(found[-1].data, last.data)
+        assert np.array_equal(last.data, counts(seeds[-1]))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda data: data[:7] + data[8:], "lines of 24 bytes"),
+        (lambda data: data[:7] + b"\x05" + data[8:], "no half of a count"),
+        (lambda data: data[:7] + b"\x2b" + data[8:], "no half of a count"),
+        (lambda data: b"\x03" + data[1:], "no half of a count"),
+    ],
+)
+def test_a_damaged_frame_is_dropped_and_told(spoil, told):
+    decoder = GloveDecoder(3, 4)
+    good = encode_glove(counts(5))
+    assert decoder.feed(good, 0.0) is not None
+    assert decoder.feed(spoil(good), 0.0) is None
+    assert told in decoder.diagnosis()
+    assert decoder.counters()["resyncs"] == 1
+    assert decoder.feed(good, 0.0) is not None
+
+
+def test_the_board_is_asked_for_each_frame_and_again_when_an_answer_is_lost(tmp_path):
+    with Rig("glove", tmp_path, fault="torn=0.5") as rig:
+        rig.sensor.open()
+        first = rig.newest().seq
+        until(lambda: rig.newest().seq >= first + 5)
+        counters = rig.sensor.counters()
+        # It answers requests only: nothing is sent that was not asked for.
+        assert rig.board.sent <= counters["frames"] + counters["resyncs"] + 3
+        assert rig.board.dropped == 0

@@ -1,0 +1,156 @@
+"""Every tool that speaks with a daemon does so with keys, and says so where it lacks them."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon.client import AsyncHand, Hand, NoStream
+from daemon.keys import make_keys
+from tests.conftest import until
+from tests.harness.daemon_process import SOFTFINGER, Running, softfinger
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+from tools.recordings.republish import Wire
+
+Profile = Callable[[str], Path]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    make_keys(tmp_path / "keys", ["alice"])
+    return tmp_path / "keys"
+
+
+@pytest.fixture
+def guarded(profile: Profile, folder: Path, start: Callable[..., Running]) -> Running:
+    """A daemon that lets in the clients of ``folder`` alone."""
+    text = f'access.keys = "{folder}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n'
+    return start("--config", str(profile(text)))
+
+
+def test_tools_with_keys_see_and_command_the_hand(
+    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+) -> None:
+    stream, commands = addresses
+    alice = ("--keys", str(folder / "alice"))
+    there = ("--address", stream, "--duration", "1", "--no-wait")
+    path, shown = tmp_path / "a.mcap", tmp_path / "a.rrd"
+    done = softfinger("record", str(path), *there, *alice)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert Recording(path).counts["hand/state"] > 10
+    done = softfinger("view", "--save", str(shown), *there, *alice)
+    assert done.returncode == 0, done.stderr
+    done = softfinger("send", "arm", "--address", commands, *alice)
+    assert (done.returncode, done.stderr) == (0, "")
+    words = ("--state", stream, "--commands", commands, "--duration", "1.5", "--no-wait")
+    done = softfinger("monitor", "--plain", *words, *alice)
+    assert " armed  left" in done.stdout, done.stderr
+    with Hand(*addresses, keys=folder / "alice") as hand:
+        assert hand.state().mode == "armed"
+        assert hand.status()["torque"] is True
+
+    async def session() -> str:
+        async with AsyncHand(*addresses, keys=folder / "alice") as hand:
+            await hand.command("disarm")
+            return (await hand.wait_for(lambda state: not state.torque)).mode
+
+    assert asyncio.run(session()) == "disarmed"
+    assert guarded.end() == 0
+
+
+def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
+    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+) -> None:
+    stream, commands = addresses
+    path = tmp_path / "b.mcap"
+    tools = [
+        subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
+        for words in (
+            ("record", str(path), "--address", stream, "--no-wait"),
+            ("view", "--save", str(tmp_path / "b.rrd"), "--address", stream, "--no-wait"),
+            ("monitor", "--plain", "--state", stream, "--commands", commands, "--no-wait"),
+            ("send", "status", "--address", commands, "--timeout", "0.5"),
+        )
+    ]
+    for tool in tools:
+        said = tool.communicate(timeout=60)[1]
+        assert tool.returncode in (1, 2), tool.args
+        assert "--keys" in said, tool.args
+    # Keys that can't be read are told before there is a file.
+    path = tmp_path / "c.mcap"
+    done = softfinger("record", str(path), "--address", stream, "--keys", str(tmp_path / "none"))
+    assert done.returncode == 1
+    assert "softfinger keys" in done.stderr
+    assert not path.exists()
+    assert guarded.end() == 0
+
+
+def test_a_daemon_with_keys_records_itself(
+    profile: Profile, folder: Path, start: Callable[..., Running], tmp_path: Path
+) -> None:
+    path = tmp_path / "own.mcap"
+    config = profile(f'access.keys = "{folder}"\n')
+    daemon = start("--config", str(config), "--record", str(path), "--duration", "1")
+    assert daemon.process.wait(60) == 0
+    recording = Recording(path)
+    first = next(message for _, message in recording.messages([b"hand/input"]))
+    assert first["seq"] == 1
+
+
+def test_a_recording_is_replayed_to_holders_of_keys(
+    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    words = ("--address", addresses[0], "--duration", "2", "--keys", str(folder))
+    assert softfinger("record", str(path), *words).returncode == 0
+    assert guarded.end() == 0
+    replay = subprocess.Popen(
+        [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--keys", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        with Hand(*addresses, keys=folder / "alice") as hand, Hand(*addresses) as stranger:
+            assert hand.stream(30.0).next(30.0).mode == "disarmed"
+            with pytest.raises(NoStream):
+                stranger.state(0.3)
+    finally:
+        replay.terminate()
+        out, error = replay.communicate(timeout=30)
+    assert replay.returncode == 0, error
+    assert re.search(r"\d+ of \d+ messages published", out)
+    assert "waiting up to 10 s for a subscriber" in error
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("tcp://0.0.0.0:9999", "other addresses need --keys"),
+        ("tcp://*:9999", "other addresses need --keys"),
+        ("nonsense", "expected tcp://127.0.0.1:PORT"),
+    ],
+)
+def test_nothing_is_replayed_to_other_machines_without_keys(address: str, reason: str) -> None:
+    with pytest.raises(RecordingError, match=reason):
+        Wire(address)
+
+
+def test_late_subscribers_of_a_replay_are_told_settings_and_events_again(
+    addresses: tuple[str, str],
+) -> None:
+    told = {"schema": 1, "seq": 1, "again": False, "timestamp": 1.0, "mono_ns": 5, "settings": "{}"}
+    event = {"schema": 1, "seq": 7, "again": False, "timestamp": 2.0, "text": "b"}
+    with Wire(addresses[0]) as wire, Hand(*addresses) as late:
+        wire.send(b"hand/settings", told)
+        wire.send(b"hand/event", event)
+        with late.events() as events:
+            until(lambda: wire.subscribed(0.01))
+            again = events.next(10.0)
+    assert (again.seq, again.again, again.text) == (7, True, "b")

@@ -1,0 +1,399 @@
+"""The monitor as a person meets it: the real process on a pseudo-terminal, on real sockets."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgpack
+import pytest
+
+from daemon.client import Hand
+from tests.conftest import until
+from tests.harness.daemon_process import Running
+from tests.harness.fake_daemon import FakeDaemon
+from tests.harness.terminal_process import TerminalProcess
+
+NOBODY = "tcp://127.0.0.1:1"  # nothing listens there
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeDaemon]:
+    with FakeDaemon() as fake:
+        yield fake
+
+
+def command(fake: FakeDaemon, *more: str) -> list[str]:
+    where = ["--state", fake.state_address, "--commands", fake.command_address]
+    return [sys.executable, "-m", "tools.monitor", *where, *more]
+
+
+def test_page_shows_the_hand(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake)) as page:
+        fake.send_event("mode", "before the page was there")
+        page.shows("HOLDING", "● live", "LEFT contact", "RIGHT contact", "kPa", "▀" * 22)
+        page.shows("3.21±0.02", "3.31±0.02", "±0.10", "12.34", "24.06", "0.213", "0.350")
+        page.shows("4.98 °", "40.00 mm wide", "tick 500 Hz", "compute 11 µs", "late 3 µs")
+        fake.send_event("mode", "grasping → holding")
+        page.shows("grasping → holding")
+        bright = {page.screen.buffer[y][x].fg for y in range(3, 14) for x in range(22)}
+        assert len(bright) > 10  # the footprint is a hill of many colours
+        fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
+        page.shows("FAULT left: no frame for 0.1 s", "c clears it")
+
+
+@pytest.mark.parametrize("how", ["q", "ctrl-c", "term", "hup", "exception", "duration"])
+def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
+    call = command(fake, *(["--duration", "1.2"] if how == "duration" else []))
+    if how == "exception":
+        call[1:3] = ["-c", BREAKS_AT_THE_TENTH_PAGE]
+    with TerminalProcess(call) as page:
+        page.wait(lambda: termios.tcgetattr(page.slave) != page.attributes)
+        if how != "exception":
+            page.shows("HOLDING")
+            assert not page.is_restored()
+        if how in ("q", "ctrl-c"):
+            page.type(b"q" if how == "q" else b"\x03")
+        elif how in ("term", "hup"):
+            page.process.send_signal(signal.SIGTERM if how == "term" else signal.SIGHUP)
+        assert page.ended() == (1 if how == "exception" else 0)
+        assert page.is_restored()
+        after = page.written[page.written.rfind(b"\x1b[?1049l") :]
+        assert (b"the tenth page" in after) == (how == "exception")  # told on the main screen
+
+
+BREAKS_AT_THE_TENTH_PAGE = """
+import argparse, sys
+from tools import monitor, monitor_page
+whole, count = monitor_page.Page.lines, 0
+def lines(*arguments):
+    global count
+    count += 1
+    if count == 10:
+        raise RuntimeError("the tenth page")
+    return whole(*arguments)
+monitor_page.Page.lines = lines
+parser = argparse.ArgumentParser()
+monitor.add_arguments(parser)
+sys.exit(monitor.run(parser.parse_args()))
+"""
+
+
+def test_signal_ends_it_while_the_terminal_takes_nothing(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING")
+        termios.tcflow(page.slave, termios.TCOOFF)  # as Ctrl-S
+        until_later = fake.published + 50  # several redraws, each with other noise in the maps
+        until(lambda: fake.published >= until_later)
+        page.process.terminate()
+        assert page.ended() == 0
+        assert page.is_restored()
+
+
+def test_suspended_and_continued(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING")
+        page.type(b"\x1a")
+        status = Path(f"/proc/{page.process.pid}/stat")
+        page.wait(lambda: status.read_text().rsplit(")", 1)[1].split()[0] == "T")
+        assert page.is_restored()
+        page.screen.reset()
+        page.process.send_signal(signal.SIGCONT)
+        page.shows("HOLDING", "kPa")
+        page.type(b"q")
+        assert page.ended() == 0
+        assert page.is_restored()
+
+
+def test_stream_stale_lost_and_back(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake)) as page:
+        page.shows("● live")
+        fake.silent.set()
+        page.shows("◐ stale")
+        page.shows("○ lost", "nothing comes any more")
+        fake.silent.clear()
+        page.shows("● live", "HOLDING")
+        assert "nothing comes" not in page.text()
+
+
+def test_keys_command_the_hand(fake: FakeDaemon) -> None:
+    fake.replies["clear"] = {"ok": False, "error": "clear: not while holding"}
+    fake.replies["arm"] = b"not what a reply is"
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING")
+        for key, sent, shown in (
+            (b"g", {"command": "grasp"}, "✓ grasp: ok"),
+            (b"c", {"command": "clear"}, "✗ clear: not while holding"),
+            (b"r", {"command": "release"}, "✓ release: ok"),
+            (b"a", {"command": "arm"}, "✗ arm: an answer that can't be read"),
+            (b"d", {"command": "disarm"}, "✓ disarm: ok"),
+            (b" ", {"command": "stop"}, "✓ stop: ok"),
+        ):
+            page.type(key)
+            page.shows(shown)
+            assert fake.requests[-1] == sent
+        page.type(b"\x1b[C")
+        page.shows("✓ rotate to 10.0°")
+        page.type(b"\x1b[C")  # from the target on, although the object is still at 4.98°
+        page.shows("✓ rotate to 15.0°")
+        page.type(b"\x1bOD")
+        page.shows("✓ rotate to 10.0°")
+        assert [r["command"] for r in fake.requests[-3:]] == ["rotate"] * 3
+        assert fake.requests[-1]["angle"] == pytest.approx(0.17418, abs=1e-4)
+        count = len(fake.requests)
+        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")  # a paste, and keys that are none
+        page.type(b" ")
+        page.shows("✓ stop: ok")
+        assert [r["command"] for r in fake.requests[count:]] == ["stop"]
+
+
+SETTINGS = {"control": {"force_default": 10.0}, "safety": {"force_max": 14.0}}
+
+
+def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake: FakeDaemon) -> None:
+    def asked() -> list[object]:
+        return [each.get("force") for each in fake.requests]
+
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING", "+- 10 N", "grip: goal 10.0 N, object to 5.0°")
+        fake.changes = {"mode": "armed", "goal_force": math.nan, "goal_angle": math.nan}
+        page.shows("ARMED", "+- N")
+        page.type(b"+")
+        page.shows("settings are not known yet")
+        assert "grip:" not in page.text()
+        fake.send(b"hand/settings", msgpack.packb({"settings": json.dumps(SETTINGS)}))
+        page.shows("+- 10 N")
+        page.type(b"++")
+        page.shows("+- 12 N")
+        page.type(b"+")
+        page.shows("+- 12.6 N")  # nine tenths of the force that is a fault
+        page.type(b"-" * 10)
+        page.shows("+- 4 N")  # in smaller steps below 5 N
+        assert fake.requests == []
+        page.type(b"g")
+        page.shows("✓ grasp with 4 N: ok")
+        assert asked() == [4.0]
+        # In a grip they count from what it was told, by whomever, and the hand follows at once.
+        fake.changes = {"goal_force": 9.0}
+        page.shows("HOLDING", "+- 9 N")
+        told = {"command": "grasp", "client": "", "request": '{"force": 7.0}', "ok": True}
+        fake.send(b"hand/command", msgpack.packb(told))
+        page.shows("+- 7 N", "raised from 7.0 N")
+        page.type(b"--")
+        page.shows("✓ grasp with 5 N: ok")
+        assert asked() == [4.0, 6.0, 5.0]
+
+
+def test_named_client(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake, "--client", "bench")) as page:
+        page.shows("HOLDING")
+        page.type(b"g")
+        page.shows("✓ grasp: ok")
+        assert fake.requests == [{"command": "grasp", "client": "bench"}]
+
+
+def test_beside_another_commander_of_a_real_daemon(
+    start: Callable[..., Running], profile: Callable[[str], Path], addresses: tuple[str, str]
+) -> None:
+    stream, commands = addresses
+    daemon = start("--config", str(profile("commands.lease = 60.0\n")))
+    where = ["--state", stream, "--commands", commands]
+    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+        page.shows("DISARMED", "running, disarmed")  # told before the page was there
+        page.shows("compute", "late", "25.0", "°C")
+        with Hand(stream, commands, client="notebook") as hand:
+            hand.arm()
+            page.shows("ARMED", "notebook commands the hand")
+            page.type(b"g")
+            page.shows("✗ grasp: notebook commands the hand (")
+            page.type(b" ")  # stop needs no lease
+            page.shows("✓ stop: ok", "DISARMED")
+        assert daemon.end() == 0
+        page.shows("○ lost")
+
+
+def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:
+    fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING")
+        for n in (1, 2):
+            page.type(b"\x1b[D")
+            page.wait(lambda n=n: len(fake.requests) == n)
+            page.shows("✗ rotate: angle: too much")
+        angles = [request["angle"] for request in fake.requests]
+        assert angles == pytest.approx([-0.00035, -0.00035], abs=1e-4)
+
+
+def test_commands_without_a_daemon() -> None:
+    where = ["--state", NOBODY, "--commands", NOBODY]
+    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+        page.shows("waiting for a daemon", "no stream yet", "—")
+        page.type(b"a" * 12 + b" ")
+        page.shows("stop: no answer")
+        page.type(b"\x1b[C")
+        page.shows("rotate: the object's angle is not known")
+        page.type(b"q")
+        assert page.ended() == 0
+
+
+def test_unreadable_messages_are_counted_and_harmless(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING")
+        fake.send(b"hand/state", b"\xc1")
+        fake.send(b"hand/tactile", msgpack.packb({"finger": "left", "rows": 4, "cols": 4}))
+        page.shows("2 unreadable", "HOLDING")
+        fake.changes = {"mode": 3, "left": "no", "object": None, "overruns": "x", "schema": 9}
+        page.shows("schema 9", "—")
+        fake.changes = {}
+        page.shows("HOLDING", "● live")
+        fake.send_event("odd", "\x1b[2Jescape\x07 and\nnewline")
+        page.shows("[2Jescape  and newline")
+        assert b"\x07" not in page.written
+
+
+def test_resized(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake), 120, 40) as page:
+        page.shows("HOLDING", "▀" * 42)
+        page.resize(60, 20)
+        page.process.send_signal(signal.SIGWINCH)
+        page.shows("needs 80 × 24", "this is 60 × 20")
+        page.type(b" ")
+        page.wait(lambda: fake.requests == [{"command": "stop"}])
+        page.resize(80, 24)
+        page.shows("HOLDING", "q quit")
+
+
+def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
+    with subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as plain:
+        assert plain.stdout is not None
+        lines: list[str] = []
+        while sum(" holding  left" in line for line in lines) < 2:
+            lines.append(plain.stdout.readline().decode())
+            if " holding  left" in lines[-1]:
+                fake.send_event("mode", "grasping → holding", "warning")
+        text = "".join(lines)
+        assert "\x1b" not in text
+        assert "left 1" in text
+        assert "N 3.21 mm" in text
+        assert "goal 10.0 N  object +5.0°" in text
+        assert "tick 500 Hz" in text
+        assert any("warning mode: grasping → holding" in line for line in lines)
+        plain.terminate()
+        assert plain.wait(10.0) == 0
+
+
+def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
+    with subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as plain:
+        assert plain.stdout is not None
+        plain.stdout.readline()
+        plain.stdout.close()
+        assert plain.wait(10.0) == 0
+        assert plain.stderr is not None
+        assert plain.stderr.read() == b""
+
+
+def test_no_wait_without_a_daemon() -> None:
+    where = ["--state", NOBODY, "--commands", NOBODY, "--no-wait"]
+    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+        assert page.ended() == 1
+        assert page.is_restored()
+        assert f"nothing from {NOBODY} within 2 s" in page.written.decode()
+
+
+def test_plain_on_a_terminal(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake, "--plain"), 200, 24) as page:
+        page.shows("holding  left")
+        page.process.terminate()
+        assert page.ended() == 0
+        assert b"\x1b" not in page.written
+
+
+def test_no_wait_ends_with_the_stream(fake: FakeDaemon) -> None:
+    with TerminalProcess(command(fake, "--no-wait")) as page:
+        page.shows("HOLDING")
+        fake.silent.set()
+        assert page.ended() == 0
+        assert page.is_restored()
+        assert b"the stream has ended" in page.written
+
+
+# Beside a daemon
+
+DAEMON = """
+import signal, sys, threading
+from tools.beside import start_beside
+over = threading.Event()
+signal.signal(signal.SIGINT, lambda *_: over.set())
+with start_beside(sys.argv[1], sys.argv[2], on_end=over.set) as page:
+    open(sys.argv[3], "w").write(str(page.process.pid))
+    over.wait(60.0)
+print("ended", over.is_set(), flush=True)
+"""
+
+
+class Beside(TerminalProcess):
+    """A stand-in daemon with the monitor as its child."""
+
+    def __init__(self, fake: FakeDaemon, folder: Path) -> None:
+        file = folder / "pid"
+        addresses = [fake.state_address, fake.command_address]
+        super().__init__([sys.executable, "-c", DAEMON, *addresses, str(file)])
+        self.shows("HOLDING")
+        self.child = int(file.read_text())
+
+    def child_is_gone(self) -> bool:
+        self.pump()
+        try:
+            return Path(f"/proc/{self.child}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+        except FileNotFoundError:
+            return True
+
+
+def test_page_yields_to_the_daemon(fake: FakeDaemon, tmp_path: Path) -> None:
+    with Beside(fake, tmp_path) as page:
+        assert os.getpriority(os.PRIO_PROCESS, page.child) == min(
+            os.getpriority(os.PRIO_PROCESS, page.process.pid) + 5, 19
+        )
+
+
+def test_quitting_the_page_ends_the_daemon(fake: FakeDaemon, tmp_path: Path) -> None:
+    with Beside(fake, tmp_path) as page:
+        page.type(b"\x1a")  # would stop the daemon with the hand stiff: it does nothing here
+        page.type(b"q")
+        assert page.ended() == 0
+        assert page.is_restored()
+        after = page.written[page.written.rfind(b"\x1b[?1049l") :]
+        assert b"ended True" in after
+
+
+def test_interrupt_ends_both(fake: FakeDaemon, tmp_path: Path) -> None:
+    with Beside(fake, tmp_path) as page:
+        page.type(b"\x03")
+        assert page.ended() == 0
+        assert page.is_restored()
+        assert page.child_is_gone()
+
+
+def test_daemon_killed_gives_the_terminal_back(fake: FakeDaemon, tmp_path: Path) -> None:
+    with Beside(fake, tmp_path) as page:
+        page.process.kill()
+        began = time.monotonic()
+        page.wait(page.child_is_gone)
+        assert time.monotonic() - began < 2.0
+        assert page.is_restored()
+
+
+def test_page_killed_gives_the_terminal_back(fake: FakeDaemon, tmp_path: Path) -> None:
+    with Beside(fake, tmp_path) as page:
+        os.kill(page.child, signal.SIGKILL)
+        assert page.ended() == 0
+        assert b"ended True" in page.written
+        assert page.is_restored()

@@ -1,0 +1,312 @@
+"""``softfinger plot``: a recording's pages, what is on them, and recordings that lack something."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.text import Text
+
+from daemon import messages
+from tests.harness.daemon_process import softfinger
+from tests.harness.recorded_hand import record_hand
+from tools import plot
+from tools.analysis import plots, plots_model
+from tools.analysis.plots_data import MODES, Missing, Run, load_run
+from tools.figure_pages import style
+from tools.recordings.reader import Recording
+from tools.recordings.writer import RecordingWriter
+
+DUE = {
+    50: {"command": "arm"},
+    60: {"command": "grasp", "force": 6.0},
+    700: {"command": "rotate", "angle": 0.1},
+    760: {"command": "grasp", "force": 99.0},  # refused: no target
+    1100: {"command": "grasp", "force": 4.0},
+    1450: {"command": "release"},
+}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    record_hand(path, DUE, 3.4)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(path: Path) -> Run:
+    return load_run(Recording(path), -math.inf, math.inf, None)
+
+
+def drawn(run: Run, page: str) -> Figure:
+    with style.settings():
+        figure = plots.PAGES[page](run)
+        figure.draw_without_rendering()
+    return figure
+
+
+def texts(figure: Figure) -> str:
+    return "\n".join(each.get_text() for each in figure.findobj(Text))
+
+
+def lines(figure: Figure, label: str) -> list[np.ndarray]:
+    return [
+        np.array(line.get_data(), float)
+        for axes in figure.axes
+        for line in axes.lines
+        if line.get_label() == label and len(line.get_xdata()) > 0
+    ]
+
+
+Call = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    """``softfinger plot`` in this process: exit status and what it says on standard error."""
+
+    def plotted(*words: object) -> tuple[int, str]:
+        parser = argparse.ArgumentParser()
+        plot.add_arguments(parser)
+        status = plot.run(parser.parse_args([str(word) for word in words]))
+        return status, capsys.readouterr().err
+
+    return plotted
+
+
+def test_command_line_writes_every_page_in_print_quality(path: Path) -> None:
+    done = softfinger("plot", str(path))
+    assert (done.returncode, done.stderr) == (0, "")
+    folder = path.with_name("run.mcap.plots")
+    names = [f"{page}.png" for page in plot.PAGES]
+    assert [Path(line).name for line in done.stdout.splitlines()] == names
+    for name in names:
+        pixels = imread(folder / name)
+        assert pixels.shape[1] >= 1400  # 7 inch at 200 dots
+        ink = (pixels[..., :3].min(axis=2) < 0.9).mean()
+        assert 0.01 < ink < 0.7
+
+
+def test_a_page_by_name_as_svg(path: Path, tmp_path: Path, call: Call) -> None:
+    words = ("--pages", "angle", "timing", "--format", "svg", "--from", 1, "--to", 2)
+    assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
+    files = sorted((tmp_path / "a" / "b").iterdir())
+    assert [each.name for each in files] == ["angle.svg", "timing.svg"]
+    for each in files:
+        assert ElementTree.parse(each).getroot().tag.endswith("svg")
+
+
+def test_help_names_the_pages_there_are() -> None:
+    assert tuple(plot.PAGES) == tuple(plots.PAGES)
+
+
+def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: Run, path: Path) -> None:
+    seq, mode = run.states["seq"], run.modes
+    force, angle = run.target_force(), run.target_angle()
+    gripping = run.gripping
+    assert set(np.unique(force[gripping & (seq < 1100)])) == {6.0}
+    assert set(np.unique(force[gripping & (seq >= 1100)])) == {4.0}
+    assert np.isnan(force[~gripping]).all()
+    assert np.isnan(angle[seq < 700]).all()
+    assert set(np.unique(angle[gripping & (seq >= 700)])) == {0.1}
+    assert np.isnan(angle[mode == MODES.index("releasing")]).all()
+    # A part that begins in the grip knows what was asked for before.
+    part = load_run(Recording(path), 1.8, 2.0, None)
+    assert set(np.unique(part.target_force())) == {6.0}
+    assert set(np.unique(part.target_angle())) == {0.1}
+
+
+def test_time_page_shows_force_at_its_target(run: Run) -> None:
+    figure = drawn(run, "time")
+    said = texts(figure)
+    for part in ("force F [N]", "energy U [mJ]", "displacement d [mm]", "rotating", "goal"):
+        assert part in said
+    (t, force) = lines(figure, "left")[0]
+    at = np.searchsorted(t, 1.35)
+    assert force[at] == pytest.approx(6.0, rel=0.05)
+    assert lines(figure, "goal")[0][1][at] == 6.0
+    assert not lines(figure, "asked for")  # it was what the hand went to
+    assert np.isnan(force[0])  # nothing is drawn where nothing touches
+
+
+def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: Run) -> None:
+    states = dict(run.states)
+    asked = run.target_force()
+    raised = (run.t > 1.3) & (run.t < 1.5)
+    states["goal_force"] = np.where(raised, 1.4 * asked, asked)
+    figure = drawn(replace(run, states=states), "time")
+    (t, goal), (_, wanted) = lines(figure, "goal")[0], lines(figure, "asked for")[0]
+    at = np.searchsorted(t, 1.4)
+    assert (goal[at], wanted[at]) == (pytest.approx(8.4), 6.0)
+    assert np.isnan(wanted[np.searchsorted(t, 1.2)])
+    # Recordings from before the hand told its goal show what it was asked for.
+    states["goal_force"] = np.full_like(asked, np.nan)
+    figure = drawn(replace(run, states=states), "time")
+    assert lines(figure, "asked for")[0][1][at] == 6.0
+
+
+def test_model_page_has_points_on_the_models_curves(run: Run) -> None:
+    figure = drawn(run, "angle")
+    assert "measured over" in texts(figure)
+    force = figure.axes[0]
+    points = np.concatenate([np.asarray(each.get_offsets()) for each in force.collections])
+    depths = np.concatenate([np.asarray(each.get_array()) for each in force.collections])
+    assert run.models is not None
+    model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
+    firm = points[:, 1] > 1.0
+    assert firm.sum() > 100
+    assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.02
+
+
+def test_depths_of_the_curves_are_round_and_span_the_data() -> None:
+    for most in (0.2e-3, 0.9e-3, 4.7e-3, 8e-3, 12e-3):
+        depths = plots_model._depths(np.linspace(0.0, most, 1000)) * 1e3
+        assert 1 <= len(depths) <= 6
+        assert depths[-1] >= 0.99 * most * 1e3
+        assert [float(f"{d:g}") for d in depths] == pytest.approx(list(depths), abs=1e-12)
+
+
+def test_landscape_shows_the_local_minimum_and_the_path(run: Run) -> None:
+    figure = drawn(run, "landscape")
+    (theta, d) = lines(figure, "local minimum over θ")[0]
+    assert np.abs(theta).max() < 0.2  # the paper's claim, found on the table's numbers
+    assert d.max() > 3.0
+    (angle, depth) = lines(figure, "left finger")[0]
+    known = np.isfinite(depth)
+    assert depth[known] == pytest.approx(run.states["left.d"][run.touching("left")] * 1e3)
+    over = lines(figure, "left")[0][1]
+    assert np.nanmin(over) > -1e-9
+    assert np.nanmax(over) > 0.1
+    assert angle[known].max() > 5.0
+
+
+def test_a_deep_landscape_marks_where_the_backing_touches(run: Run) -> None:
+    assert run.models is not None
+    with style.settings():
+        figure = style.new_figure(5, 4)
+        plots_model.draw_map(figure.subplots(), run.models[0].table, 0.012, 0.6)
+        figure.draw_without_rendering()
+    assert "rim of the backing touches" in figure.axes[0].get_legend_handles_labels()[1]
+
+
+def test_error_page_tells_errors_and_how_honest_the_spread_is(run: Run) -> None:
+    figure = drawn(run, "error")
+    said = texts(figure)
+    assert "estimate less truth" in said
+    shares = [float(line.split("% within")[0].split()[-1]) for line in said.splitlines()
+              if "% within 2σ" in line]  # fmt: skip
+    assert len(shares) == 6  # d, θ, F of both fingers
+    assert min(shares) > 80.0
+    (t, error) = lines(figure, "left")[0]  # µm
+    holding = (t > 1.0) & (t < 1.4)
+    assert 0.0 < np.nanstd(error[holding]) < 60.0
+
+
+def test_timing_page_of_a_real_clock_and_of_none(run: Run) -> None:
+    assert "none above 0" in texts(drawn(run, "timing"))  # virtual time costs none
+    rng = np.random.default_rng(5)
+    late = rng.lognormal(-12.0, 1.0, run.t.size)
+    busy = run.states | {"wake_late_s": late, "compute_s": 3.0 * late, "tick_s": 0.002 + late}
+    changed = Run(**{**vars_of(run), "states": busy})
+    figure = drawn(changed, "timing")
+    assert f"median {np.median(late) * 1e6:.3g}" in texts(figure)
+    (table,) = figure.axes[-1].tables
+    cells = [cell.get_text().get_text() for cell in table.get_celld().values()]
+    assert {"p99.9 [µs]", "publish"} <= set(cells)
+    without = Run(**{**vars_of(run), "stats": None})
+    assert len(drawn(without, "timing").axes) == 3
+
+
+def vars_of(run: Run) -> dict[str, object]:
+    return {name: getattr(run, name) for name in Run.__dataclass_fields__}
+
+
+def test_a_gap_in_the_stream_breaks_the_line(run: Run) -> None:
+    keep = (run.t < 1.0) | (run.t > 1.5)
+    states = {name: values[keep] for name, values in run.states.items()}
+    part = Run(**{**vars_of(run), "states": states, "modes": run.modes[keep]})
+    t, force = part.gapped(part.states["left.force"])
+    (at,) = np.flatnonzero(np.isnan(force))
+    assert (round(t[at], 1), round(t[at + 1], 1)) == (1.0, 1.5)
+    assert t.size == keep.sum() + 1
+    assert run.gapped(run.states["left.force"])[0].size == run.t.size
+
+
+def test_pages_are_left_out_with_a_word(tmp_path: Path, call: Call) -> None:
+    path = tmp_path / "a.mcap"
+    record_hand(path, {50: {"command": "arm"}}, 0.5, without=(messages.TRUTH, messages.SETTINGS))
+    status, said = call(path, "--out", tmp_path / "out")
+    assert status == 0
+    drawn = sorted(each.name for each in (tmp_path / "out").iterdir())
+    assert drawn == ["joints.png", "timing.png"]
+    assert "page time left out: no contact in it" in said
+    assert "page error left out: no hand/truth in it" in said
+    status, said = call(path, "--pages", "error", "--out", tmp_path / "none")
+    assert status == 1
+
+
+def test_without_settings_there_is_no_model(path: Path, run: Run) -> None:
+    bare = Run(**{**vars_of(run), "settings": None, "models": None, "why_no_model": "no reason"})
+    for page in ("angle", "landscape"):
+        with pytest.raises(Missing, match="no reason"):
+            plots.PAGES[page](bare)
+    assert "within 2σ" in texts(drawn(bare, "error"))  # d and θ tell theirs by themselves
+
+
+def test_one_finger_alone(tmp_path: Path) -> None:
+    path = tmp_path / "one.mcap"
+    due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 2.0}}
+    one = ('scene.fingers=["left"]', "scene.object_model=false")
+    record_hand(path, due, 2.5, one)
+    run = load_run(Recording(path), -math.inf, math.inf, None)
+    assert run.fingers == ("left",)
+    for page in plots.PAGES:
+        figure = drawn(run, page)
+        assert "right" not in texts(figure).split("\n"), page
+
+
+def test_files_that_are_no_good(tmp_path: Path, path: Path, call: Call) -> None:
+    time = ("--pages", "time", "--out")
+    (tmp_path / "empty.mcap").touch()
+    RecordingWriter(tmp_path / "nothing.mcap").close()
+    for name, reason in (
+        ("empty.mcap", "empty"),
+        ("none.mcap", "No such file"),
+        ("nothing.mcap", "page time left out: no hand/state in it"),
+    ):
+        status, said = call(tmp_path / name, *time, tmp_path / "out")
+        assert status == 1
+        assert reason in said
+    whole = path.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    status, said = call(tmp_path / "cut.mcap", *time, tmp_path / "cut")
+    assert status == 0
+    assert "cut short" in said
+    assert (tmp_path / "cut" / "time.png").exists()
+    (tmp_path / "file").touch()
+    status, said = call(path, *time, tmp_path / "file")
+    assert status == 1
+    assert "File exists" in said
+
+
+def test_without_matplotlib_it_says_what_to_install(path: Path) -> None:
+    code = (
+        "import sys; sys.modules['matplotlib'] = None\n"
+        "from tools.cli import main\n"
+        f"sys.exit(main(['plot', {str(path)!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "pip install '.[plot]'" in done.stderr
+    assert done.stdout == ""

@@ -1,0 +1,172 @@
+"""What the servos do by themselves when the daemon dies, stands still, or loses its port.
+
+Real processes and real bytes: the daemon on the stand-in hand, which tells by its control socket
+what was on the servos' wire and when their bus watchdog stopped them.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.commands import send
+from daemon.settings import ServoSettings
+from daemon.simulation.control_port import send_words
+from tests.conftest import until
+from tests.harness.daemon_process import SOFTFINGER, Running
+
+HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+WATCHDOG = ServoSettings().watchdog
+LATE = 0.25  # s that the stand-in hand's process may be late on a busy machine
+
+
+class Rig:
+    """The stand-in hand, and a daemon on it that can be started again."""
+
+    def __init__(self, folder: Path, addresses: tuple[str, str]) -> None:
+        self.folder = folder / "hand"
+        self.folder.mkdir()
+        self.commands = addresses[1]
+        self.config = folder / "hil.toml"
+        head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'
+        self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
+        words = [*SOFTFINGER, "emulate", "--dir", str(self.folder), "--config", str(HIL)]
+        self.hand = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        self.daemon: Running | None = None
+        assert self.hand.stdout is not None
+        assert self.hand.stdout.readline() == "ready\n"
+
+    def start(self) -> Running:
+        patient = "servos.reply_timeout=0.02"  # the stand-in hand is a process among others
+        words = ("--config", str(self.config), "--dir", str(self.folder), "--set", patient)
+        self.daemon = Running(*words)
+        return self.daemon
+
+    def send(self, name: str, **numbers: float) -> dict[str, Any]:
+        return send(self.commands, {"command": name, **numbers}, timeout=5.0)
+
+    def report(self) -> dict[str, Any]:
+        report: dict[str, Any] = json.loads(send_words(self.folder, "report"))
+        return report
+
+    def stopped(self) -> bool:
+        return all(servo["stopped_by_watchdog"] for servo in self.report()["servos"])
+
+    def stopped_at(self) -> list[float]:
+        """When each servo's watchdog fired, by this process's time.monotonic()."""
+        report = self.report()
+        ahead = report["monotonic"] - report["t"]
+        return [servo["watchdog_fired"]["t"] + ahead for servo in report["servos"]]
+
+    def at_work(self) -> None:
+        """Arm, and be under way when this returns. A busy machine may trip it before."""
+
+        def under_way() -> bool:
+            if self.send("status")["mode"] == "fault":
+                self.send("clear")
+            self.send("arm")
+            self.send("move", left=0.3, right=0.3)
+            servos = self.report()["servos"]
+            return all(each["torque"] and not each["stopped_by_watchdog"] for each in servos)
+
+        until(under_way)
+
+    def works(self) -> None:
+        """From disarmed: arm, go somewhere, be there. A busy machine may trip it on the way."""
+        until(lambda: self.goes_to(-0.1) and self.goes_to(0.1))
+        for servo in self.report()["servos"]:
+            assert not servo["stopped_by_watchdog"]
+            assert servo["torque_on"]["far"] == 0, "torque went on with a goal elsewhere"
+        assert self.send("disarm")["ok"]
+        until(lambda: not any(servo["torque"] for servo in self.report()["servos"]))
+
+    def goes_to(self, target: float) -> bool:
+        mode = self.send("status")["mode"]
+        if mode == "fault":
+            self.send("clear")
+        elif mode == "disarmed":
+            self.send("arm")
+        if not self.send("move", left=target, right=target)["ok"]:
+            return False
+        while (mode := self.send("status")["mode"]) == "moving":
+            pass
+        angles = [servo["q"] for servo in self.report()["servos"]]
+        return mode == "armed" and angles == pytest.approx([target, target], abs=0.05)
+
+    def cleared(self) -> bool:
+        reply = self.send("clear")
+        return bool(reply["ok"] or "not while disarmed" in reply["error"])
+
+    def close(self) -> None:
+        if self.daemon is not None and self.daemon.process.poll() is None:
+            self.daemon.process.kill()
+        if self.daemon is not None:
+            self.daemon.process.wait()
+            assert self.daemon.process.stderr is not None
+            self.daemon.process.stderr.close()
+        self.hand.terminate()
+        self.hand.wait(timeout=20)
+        assert self.hand.stdout is not None
+        self.hand.stdout.close()
+
+
+@pytest.fixture
+def rig(tmp_path: Path, addresses: tuple[str, str]) -> Iterator[Rig]:
+    rig = Rig(tmp_path, addresses)
+    yield rig
+    rig.close()
+
+
+def stops_in_time(rig: Rig, lose: Callable[[], None]) -> None:
+    begin = time.monotonic()
+    lose()
+    done = time.monotonic()
+    until(rig.stopped)
+    for fired in rig.stopped_at():
+        assert fired > begin, "it was stopped before"
+        assert fired < done + WATCHDOG + LATE
+
+
+def test_servos_stop_by_themselves_and_the_hand_works_again(rig: Rig) -> None:
+    # Killed: nothing is left that could say anything to the servos.
+    daemon = rig.start()
+    rig.at_work()
+    stops_in_time(rig, daemon.process.kill)
+    daemon.process.wait()
+    assert daemon.process.stderr is not None
+    daemon.process.stderr.close()
+    daemon = rig.start()
+    status = rig.send("status")
+    assert (status["mode"], status["torque"], status["fault"]) == ("disarmed", False, "")
+    assert rig.stopped(), "starting touches nothing"
+    send_words(rig.folder, "forget")
+    rig.works()
+
+    # Stopped for longer than the watchdog allows, then continued.
+    rig.at_work()
+    stops_in_time(rig, lambda: daemon.process.send_signal(signal.SIGSTOP))
+    daemon.process.send_signal(signal.SIGCONT)
+    until(lambda: rig.send("status")["mode"] == "fault")
+    assert rig.send("status")["fault_name"] in ("servos.bus", "servos.silent")
+    until(rig.cleared)
+    send_words(rig.folder, "forget")
+    rig.works()
+
+    # Unplugged, and plugged in again.
+    rig.at_work()
+    stops_in_time(rig, lambda: send_words(rig.folder, "unplug"))
+    until(lambda: rig.send("status")["mode"] == "fault")
+    assert rig.send("status")["fault_name"] == "servos.bus"
+    assert not rig.send("clear")["ok"], "nothing is there to be cleared"
+    send_words(rig.folder, "plug")
+    until(rig.cleared)
+    send_words(rig.folder, "forget")
+    rig.works()
+    assert daemon.end() == 0

@@ -1,0 +1,170 @@
+"""The servo bus on a pseudo-terminal: the wire's time, rates, links, and coming and going."""
+
+from __future__ import annotations
+
+import os
+import select
+import termios
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import serial
+
+from daemon.simulation import protocol
+from daemon.simulation.protocol import BROADCAST, frame
+from daemon.simulation.pty_bus import PASSAGE, PtyServoBus
+from daemon.simulation.servo_bus import ServoBus
+from tests.harness.servos import make_bus
+
+PING = frame(1, protocol.PING)
+PONG = 14
+
+
+class Wire:
+    """A paced bus on a clock of its own, and a client's end of it."""
+
+    def __init__(self, bus: ServoBus, baud: int, **options: float) -> None:
+        self.t = 1.0
+        bus.advance(self.t)
+        self.port = PtyServoBus(bus, baud=baud, clock=lambda: self.t, **options)
+        self.client = serial.Serial(self.port.path, baud or 57600, timeout=0)
+
+    def send(self, data: bytes) -> None:
+        self.client.write(data)
+        assert select.select([self.port], [], [], 5)[0]
+        self.port.service(self.t)
+
+    def received(self) -> bytes:
+        """What is there now: the pseudo-terminal passes bytes on a moment after they were sent."""
+        data = b""
+        while select.select([self.client], [], [], 0.05)[0]:
+            data += self.client.read(4096)
+        return data
+
+    def when(self, seconds: float) -> bytes:
+        """Let time pass, serving at every event that is due in it."""
+        end = self.t + seconds
+        while (due := self.port.next_event()) <= end:
+            self.t = max(due, self.t + 1e-7)
+            self.port.service(self.t)
+        self.t = end
+        self.port.service(end)
+        return self.received()
+
+    def close(self) -> None:
+        self.client.close()
+        self.port.close()
+
+
+@pytest.fixture
+def wires() -> Iterator[list[Wire]]:
+    made: list[Wire] = []
+    yield made
+    for wire in made:
+        wire.close()
+
+
+def test_replies_take_the_wires_time_and_the_return_delay(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
+    wire.send(PING)
+    byte = 10 / 57600
+    due = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
+    assert wire.when(due - 1e-5) == b""
+    assert len(wire.when(2e-5)) == PONG
+
+
+def test_replies_of_a_group_follow_each_other(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
+    wire.send(frame(BROADCAST, protocol.PING))
+    byte = 10 / 57600
+    first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
+    assert len(wire.when(first + 1e-5)) == PONG
+    second = PONG * byte + 500e-6
+    assert wire.when(second - 3e-5) == b""
+    assert len(wire.when(5e-5)) == PONG
+
+
+def test_the_wire_carries_one_thing_at_a_time(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
+    write = frame(BROADCAST, protocol.WRITE, b"\x41\x00\x01")
+    wire.send(write)
+    wire.send(PING)
+    due = (len(write) + len(PING) + PONG) * 10 / 57600 + 500e-6 - 2 * PASSAGE
+    assert wire.when(due - 1e-5) == b""
+    assert len(wire.when(2e-5)) == PONG
+
+
+def test_an_adapters_latency_timer_holds_replies(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 57600, spin=0.0, latency=0.016))
+    wire.send(PING)
+    assert wire.when(1.0080 - wire.t - 1e-4) == b""  # 1.008 = 63 × 16 ms
+    assert len(wire.when(2e-4)) == PONG
+
+
+def test_a_late_reply_is_late_even_unpaced(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 0, spin=0.0))
+    wire.port.bus.fault("late=1", wire.t)
+    wire.send(PING)
+    assert wire.when(0.009) == b""
+    assert len(wire.when(0.002)) == PONG
+
+
+def test_another_rate_is_met_with_silence_and_the_right_one_answered(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
+    for baud, answers in ((1_000_000, 0), (57600, PONG), (4_000_000, 0), (57600, PONG)):
+        wire.client.baudrate = baud
+        assert wire.port.client_baud() == baud
+        wire.send(PING)
+        assert len(wire.when(0.02)) == answers
+
+
+def test_unpaced_answers_at_any_rate_at_once(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 0, spin=0.0))
+    for baud in (9600, 4_000_000):
+        wire.client.baudrate = baud
+        wire.send(PING)
+        assert len(wire.received()) == PONG
+
+
+def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 0, spin=0.0))
+    wire.client.close()
+    for _ in range(3):
+        # Not through pyserial: a client that sets nothing finds the terminal raw.
+        end = os.open(wire.port.path, os.O_RDWR | os.O_NOCTTY)
+        assert not termios.tcgetattr(end)[tty.LFLAG] & (termios.ECHO | termios.ICANON)
+        os.write(end, PING)
+        assert select.select([wire.port], [], [], 5)[0]
+        wire.port.service(wire.t)
+        assert select.select([end], [], [], 5)[0]
+        assert len(os.read(end, 100)) == PONG
+        os.close(end)
+
+
+def test_a_client_that_never_reads_does_not_hold_the_bus_up(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 0, spin=0.0))
+    request = frame(1, protocol.READ, b"\x00\x00\x93\x00")
+    for _ in range(400):  # far more than a terminal holds
+        wire.send(request)
+    assert wire.port.bus.packets == 400
+
+
+def test_the_link_is_made_replaced_and_taken_away(tmp_path: Path) -> None:
+    link = tmp_path / "servos"
+    link.symlink_to("/dev/pts/stale")
+    port = PtyServoBus(make_bus(), link)
+    assert port.path == str(link)
+    assert link.resolve().exists()
+    port.unplug()
+    assert port.fileno() == -1
+    assert not link.is_symlink()
+    port.service(1.0)  # the servos go on
+    port.plug()
+    assert link.is_symlink()
+    other = PtyServoBus(make_bus(), link)
+    port.close()
+    assert link.is_symlink()  # it belongs to the other one now
+    other.close()
+    assert not link.is_symlink()

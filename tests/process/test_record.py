@@ -1,0 +1,420 @@
+"""Recordings: everything that was published is in them, whatever happens to the recorder."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from daemon import contract, messages
+from daemon.client import Hand
+from tests.conftest import until
+from tests.harness.daemon_process import SOFTFINGER, Running, softfinger
+from tests.harness.fake_daemon import FakeDaemon, frame, state
+from tests.unit.test_contract import flat, sample
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+from tools.recordings.recover import recover
+from tools.recordings.writer import CHUNK, RecordingWriter
+
+Profile = Callable[[str], Path]
+TOPICS = tuple(contract.TOPICS)
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeDaemon]:
+    daemon = FakeDaemon()
+    yield daemon
+    daemon.close()
+
+
+def record(*words: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*SOFTFINGER, "record", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, error = process.communicate(timeout=60)
+    return process.returncode, out, error
+
+
+def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
+    """A recording of ``count`` states with frames between them, and what went into it."""
+    sent: list[tuple[bytes, dict[str, Any]]] = []
+    for k in range(count):
+        sent.append((messages.STATE, {**sample(messages.STATE), "seq": k, "timestamp": 1e9 + k}))
+        if k % 10 == 0:
+            sent.append((messages.TACTILE, {**frame(k / 25, k % 20 // 10), "timestamp": 1e9 + k}))
+    writer = RecordingWriter(path)
+    writer.attach("settings", "application/json", b"{}")
+    for topic, message in sent:
+        writer.add(topic, dict(message))
+    writer.close()
+    return sent
+
+
+def test_what_is_read_is_what_was_published(tmp_path: Path) -> None:
+    sent = written(tmp_path / "a.mcap")
+    recording = Recording(tmp_path / "a.mcap")
+    read = list(recording.messages())
+    assert read == sent
+    # The same types too, so that it can go out on the wire again, byte for byte.
+    for (_, before), (_, after) in zip(sent, read, strict=True):
+        assert {key: type(value) for key, value in before.items()} == {
+            key: type(after[key]) for key in before
+        }
+    assert not recording.truncated
+    assert recording.duration == 399.0
+    assert recording.count(messages.STATE) == 400
+    assert recording.counts["hand/tactile/left"] == 20
+    assert recording.attachments == {"settings": b"{}"}
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path: Path, topic: bytes) -> None:
+    from mcap.reader import make_reader
+
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path)
+    writer.add(topic, sample(topic))
+    writer.close()
+    [(told, message)] = Recording(path).messages()
+    assert told == topic
+    golden = msgpack.unpackb(messages.pack(sample(topic)))
+    assert message == golden
+    with path.open("rb") as file:
+        [(schema, channel, raw)] = make_reader(file).iter_messages()
+    assert schema is not None
+    assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+    described = json.loads(schema.data)["properties"]
+    assert set(json.loads(raw.data)) == set(described)
+    assert raw.log_time == int(golden["timestamp"] * 1e9)
+
+
+def test_numbers_that_are_none_come_back_as_such(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    message = sample(messages.STATE)
+    message["left"]["force"] = math.nan
+    message["tick_s"] = math.inf
+    writer.add(messages.STATE, message)
+    writer.add(messages.STATE, {"seq": 2**70, "left": {1, 2}})
+    writer.close()
+    assert writer.unfit == 1
+    [(_, read)] = Recording(tmp_path / "a.mcap").messages()
+    assert math.isnan(read["left"]["force"])
+    assert math.isnan(read["tick_s"])  # JSON has no infinity either
+
+
+def test_a_part_in_time_and_by_topic(tmp_path: Path) -> None:
+    sent = written(tmp_path / "a.mcap", 2000)  # several chunks
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.chunks > 3
+    part = [each for each in sent if 499.5 <= each[1]["timestamp"] - 1e9 <= 600.5]
+    assert list(recording.messages(start=499.5, end=600.5)) == part
+    seen: list[int] = []
+    frames = list(recording.messages([messages.TACTILE], progress=seen.append))
+    assert frames == [each for each in sent if each[0] == messages.TACTILE]
+    assert seen == sorted(seen)
+
+
+def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path: Path) -> None:
+    sent = written(tmp_path / "whole.mcap", 3000)
+    whole = (tmp_path / "whole.mcap").read_bytes()
+    path = tmp_path / "cut.mcap"
+    rng = np.random.default_rng(1)
+    longest = 0
+    for cut in [9, 40, len(whole) - 1, *rng.integers(50, len(whole), 12)]:
+        path.write_bytes(whole[:cut])
+        recording = Recording(path)
+        assert recording.truncated
+        read = list(recording.messages())
+        assert read == sent[: len(read)]
+        longest = max(longest, len(read))
+        count, damage = recover(path)
+        assert (count, bool(damage)) == (len(read), True)
+        closed = Recording(path)
+        assert not closed.truncated
+        assert list(closed.messages()) == read
+    assert longest > 2000
+    assert recover(path) == (len(read), "")  # a sound one is left alone
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
+
+
+def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path: Path) -> None:
+    written(tmp_path / "whole.mcap", 300)
+    whole = (tmp_path / "whole.mcap").read_bytes()
+    path = tmp_path / "bent.mcap"
+    rng = np.random.default_rng(2)
+    whole_again = 0
+    for _ in range(300):
+        bent = bytearray(whole)
+        for place in rng.integers(0, len(whole), 3):
+            bent[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bent)
+        with contextlib.suppress(RecordingError):
+            recording = Recording(path)
+            read = list(recording.messages())
+            whole_again += len(read) == 330 and not recording.truncated
+    assert whole_again < 150
+
+
+def test_files_that_are_no_recording(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    for content, reason in ((b"", "empty"), (b"seq,d\n1,2\n", "not an MCAP file")):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=reason):
+            Recording(path)
+    with pytest.raises(RecordingError, match="No such file"):
+        Recording(tmp_path / "none.mcap")
+    with pytest.raises(RecordingError, match="is there already"):
+        RecordingWriter(path)
+    from mcap.writer import Writer
+
+    with (tmp_path / "other.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="x")
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(RecordingError, match="profile 'ros2', expected 'softfinger'"):
+        Recording(tmp_path / "other.mcap")
+
+
+def test_recording_a_running_daemon_loses_nothing(
+    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str], tmp_path: Path
+) -> None:
+    start("--config", str(profile("")), "--set", "stream.state_rate=500")
+    path = tmp_path / "run.mcap"
+    process = record(path, "--address", addresses[0])
+    until(path.exists)
+    with Hand(*addresses) as hand:
+        hand.collect(0.5)
+        hand.arm()
+        hand.collect(0.5)
+    process.send_signal(signal.SIGINT)
+    status, out, error = ended(process)
+    assert (status, error) == (0, "")
+    assert "lost on the way: none" in out
+    recording = Recording(path)
+    assert not recording.truncated
+    seqs = [m["seq"] for _, m in recording.messages([messages.STATE])]
+    assert len(seqs) > 300
+    assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
+    kinds = {message["kind"] for _, message in recording.messages([messages.EVENT])}
+    assert "mode" in kinds
+    assert recording.count(messages.TACTILE) > 20
+
+
+@pytest.mark.parametrize("padding", [0, 20_000])
+def test_a_killed_recorder_leaves_a_file_that_can_be_closed(
+    fake: FakeDaemon, tmp_path: Path, padding: int
+) -> None:
+    """Chunks that take seconds to fill are written all the same."""
+    path = tmp_path / "run.mcap"
+    fake.changes = {"padding": "x" * padding}
+    process = record(path, "--address", fake.state_address)
+    until(lambda: path.exists() and path.stat().st_size > 3000)
+    process.kill()
+    ended(process)
+    recording = Recording(path)
+    assert recording.truncated
+    assert recording.total > CHUNK // 30_000
+    assert ended(record(path, "--recover"))[0] == 0
+    closed = Recording(path)
+    assert not closed.truncated
+    assert closed.total == recording.total
+
+
+def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(
+    fake: FakeDaemon, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    fake.changes = {"padding": os.urandom(10_000).hex()}  # can't be compressed away
+
+    def small_disk() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
+
+    process = subprocess.Popen(
+        [*SOFTFINGER, "record", str(path), "--address", fake.state_address],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=small_disk,
+    )
+    status, _, error = ended(process)
+    assert status == 1
+    assert "File too large" in error
+    assert "--recover" in error
+    assert Recording(path).total > 10
+
+
+def test_ctrl_c_ends_it_with_its_account(fake: FakeDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    process = record(path, "--address", fake.state_address)
+    until(lambda: fake.published > 30)
+    until(path.exists)
+    process.send_signal(signal.SIGINT)
+    status, out, error = ended(process)
+    assert (status, error) == (0, "")
+    assert "messages written" in out
+    assert not Recording(path).truncated
+
+
+def test_what_was_sent_before_the_end_is_written(
+    addresses: tuple[str, str], context: zmq.Context[Any], tmp_path: Path
+) -> None:
+    publisher = context.socket(zmq.XPUB)
+    publisher.setsockopt(zmq.SNDHWM, 0)
+    publisher.bind(addresses[0])
+    path = tmp_path / "run.mcap"
+    process = record(path, "--address", addresses[0], "--topics", "state")
+    assert publisher.poll(20_000)
+    assert publisher.recv() == b"\x01hand/state"
+    message = sample(messages.STATE)
+    for k in range(5000):
+        publisher.send(messages.STATE, zmq.SNDMORE)
+        publisher.send(messages.pack({**message, "seq": k}))
+    process.send_signal(signal.SIGTERM)
+    status, out, _ = ended(process)
+    assert status == 0
+    assert "5000 messages written; lost on the way: none" in out
+    seqs = [read["seq"] for _, read in Recording(path).messages()]
+    assert seqs == list(range(5000))
+
+
+def test_split_files_follow_each_other(fake: FakeDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    process = record(
+        path, "--address", fake.state_address, "--split-time", "0.4", "--duration", "1.5"
+    )
+    assert ended(process)[0] == 0
+    files = [path, tmp_path / "run-2.mcap", tmp_path / "run-3.mcap"]
+    seqs = [m["seq"] for file in files for _, m in Recording(file).messages([messages.STATE])]
+    assert seqs == sorted(set(seqs))
+    assert len(seqs) > 60
+
+
+def test_from_and_to_cut_the_stream(fake: FakeDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    process = record(path, "--address", fake.state_address, "--from", "0.3", "--to", "0.8")
+    assert ended(process)[0] == 0
+    assert 0.3 < Recording(path).duration < 0.52
+
+
+def test_no_daemon_is_waited_for_or_not(addresses: tuple[str, str], tmp_path: Path) -> None:
+    process = record(tmp_path / "a.mcap", "--address", addresses[0], "--no-wait")
+    status, _, error = ended(process)
+    assert status == 1
+    assert f"nothing from {addresses[0]} within 2 s" in error
+    process = record(tmp_path / "b.mcap", "--address", addresses[0])
+    assert process.stderr is not None
+    assert "waiting for a stream" in process.stderr.readline()
+    process.send_signal(signal.SIGTERM)
+    assert ended(process)[0] == 0
+    assert not list(tmp_path.iterdir())  # nothing came, and nothing is in the next one's way
+
+
+def test_garbage_on_the_stream_is_counted_and_left_out(fake: FakeDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    process = record(path, "--address", fake.state_address, "--duration", "1")
+    until(path.exists)
+    for _ in range(60):
+        before = fake.published
+        until(lambda before=before: fake.published > before)
+        fake.send(b"hand/state", b"\xc1")
+        fake.send(b"hand/else", msgpack.packb([1]))
+    status, out, _ = ended(process)
+    assert status == 0
+    assert "could not be read and were left out" in out
+
+
+@pytest.mark.parametrize("missing", ["mcap", "orjson", "zstandard"])
+def test_a_missing_extra_is_named(tmp_path: Path, missing: str) -> None:
+    code = (
+        f"import sys; sys.modules[{missing!r}] = None\n"
+        "from tools.cli import main\n"
+        f"sys.exit(main(['record', {str(tmp_path / 'a.mcap')!r}]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert "pip install '.[record]'" in done.stderr
+
+
+def test_fake_states_are_of_the_contract() -> None:
+    """What these tests publish is what a daemon would."""
+    assert set(flat(state(0.0, 1))) == set(flat(sample(messages.STATE)))
+
+
+def test_topics_by_name(fake: FakeDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    words = ("--address", fake.state_address, "--duration", "0.5", "--topics", "hand/tactile")
+    assert ended(record(path, *words))[0] == 0
+    assert set(Recording(path).counts) == {"hand/tactile/left", "hand/tactile/right"}
+    status, _, error = ended(record(tmp_path / "b.mcap", "--topics", "dreams"))
+    assert status == 2
+    assert "found topic 'dreams', expected one of state, tactile" in error
+
+
+def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path: Path) -> None:
+    """A daemon that runs for hours tells a recorder its first events and settings again."""
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path)
+    old = {"schema": 1, "seq": 1, "again": True, "timestamp": 1.7e9 - 7200.0, "mono_ns": 5}
+    writer.add(b"hand/settings", dict(old))
+    for k in range(3):
+        writer.add(b"hand/state", {"schema": 1, "seq": k, "timestamp": 1.7e9 + 0.25 * k})
+    writer.add(b"hand/event", {**old, "seq": 2})
+    writer.close()
+    recording = Recording(path)
+    assert (recording.start, recording.duration) == (pytest.approx(1.7e9), pytest.approx(0.5))
+    kept = [message for topic, message in recording.messages() if b"state" not in topic]
+    assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2  # as it was told
+    lonely = RecordingWriter(tmp_path / "b.mcap")
+    lonely.add(b"hand/settings", dict(old))
+    lonely.close()
+    assert Recording(tmp_path / "b.mcap").count(b"hand/settings") == 1
+
+
+def test_a_damaged_chunk_is_told_and_left_out_and_recovered(
+    tmp_path: Path, addresses: tuple[str, str]
+) -> None:
+    path = tmp_path / "bent.mcap"
+    sent = written(path, 3000)
+    assert Recording(path).check()
+    bent = bytearray(path.read_bytes())
+    place = len(bent) // 2
+    bent[place : place + 4] = bytes(each ^ 0x55 for each in bent[place : place + 4])
+    path.write_bytes(bent)
+    told: list[str] = []
+    recording = Recording(path, told.append)
+    read = list(recording.messages())
+    assert not recording.truncated
+    assert len(told) == 1
+    assert "damaged (" in told[0]
+    assert 1000 < len(read) < len(sent)
+    assert read[0] == sent[0]
+    assert read[-1] == sent[-1]  # what comes behind it is there
+    fast = ("--no-wait", "--speed", "1e6", "--address", addresses[0])
+    for words in (("export", "--topics", "state"), ("replay", *fast)):
+        done = softfinger(words[0], str(path), *words[1:])
+        assert "damaged (" in done.stderr, words
+    assert recover(path)[0] == len(read)
+    assert Recording(path).check()

@@ -1,0 +1,213 @@
+"""Recordings replayed: on the wire as they were, and through today's code to the same states."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from daemon import messages
+from daemon.profiles import load
+from daemon.records import Frame
+from tests.conftest import until
+from tests.harness.daemon_process import SOFTFINGER, softfinger
+from tests.harness.recorded_hand import Messages, Script, published
+from tests.unit.test_contract import sample
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+from tools.recordings.recomputed import Comparison, recompute
+from tools.recordings.writer import RecordingWriter
+
+Profile = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
+    """All that a grasp, a turn, a refused command and a stop publish."""
+    script = Script(
+        {
+            50: {"command": "arm"},
+            51: {"command": "grasp", "force": 6.0},
+            750: {"command": "move", "left": 0.1},  # refused while it holds
+            800: {"command": "rotate", "angle": 0.1},
+            1100: {"command": "stop"},
+        }
+    )
+    folder = tmp_path_factory.mktemp("sockets")
+    sent = published(folder, script, 2.3, ("stream.state_rate=500",))
+    states = [message for topic, message in sent if topic == messages.STATE]
+    assert states[-1]["mode"] == "disarmed"
+    assert script.refused == 1
+    return sent
+
+
+def record(path: Path, taken: Messages) -> Recording:
+    writer = RecordingWriter(path)
+    for topic, message in taken:
+        writer.add(topic, _copy(message))
+    writer.close()
+    return Recording(path)
+
+
+def _copy(message: dict[str, Any]) -> dict[str, Any]:
+    copied: dict[str, Any] = msgpack.unpackb(messages.pack(message))
+    return copied
+
+
+def test_the_same_inputs_give_the_same_states_to_the_last_bit(
+    taken: Messages, tmp_path: Path
+) -> None:
+    result = recompute(record(tmp_path / "a.mcap", taken))
+    assert result.from_start
+    assert result.ticks == result.states == 1150
+    assert result.fields > 40
+    assert (result.missing_ticks, result.missing_frames) == (0, 0)
+    assert result.differences == {}
+
+
+def test_other_settings_show_where_they_first_matter(taken: Messages, tmp_path: Path) -> None:
+    recording = record(tmp_path / "a.mcap", taken)
+    used = load(changes=["loop.clock=virtual", "stream.state_rate=500", "control.force_gain=0.5"])
+    result = recompute(recording, used)
+    assert "left.goal_current" in result.differences
+    assert "left.q" not in result.differences  # what came from outside is as it was
+    different = result.differences["left.goal_current"]
+    assert different.first_tick > 50  # not before it was armed
+    assert different.worst > 1e-3
+    assert different.recorded != different.recomputed
+
+
+def test_a_changed_reading_is_found(taken: Messages, tmp_path: Path) -> None:
+    bent = [(topic, _copy(message)) for topic, message in taken]
+    for topic, message in bent:
+        if topic == messages.INPUT and message["seq"] == 400:
+            message["left"]["q"] += 1e-9
+    result = recompute(record(tmp_path / "a.mcap", bent))
+    assert result.differences["left.q"].count == 1
+    assert result.differences["left.q"].first_tick == 400
+    assert min(each.first_tick for each in result.differences.values()) == 400
+
+
+def test_what_lacks_in_a_recording_is_told(taken: Messages, tmp_path: Path) -> None:
+    def without(topic: bytes) -> Recording:
+        path = tmp_path / f"{topic.decode().replace('/', '-')}.mcap"
+        return record(path, [each for each in taken if each[0] != topic])
+
+    with pytest.raises(RecordingError, match="no hand/settings in it"):
+        recompute(without(messages.SETTINGS))
+    with pytest.raises(RecordingError, match="no hand/input in it"):
+        recompute(without(messages.INPUT))
+    blind = recompute(without(messages.TACTILE))
+    assert blind.missing_frames > 100
+    assert blind.differences
+    late = recompute(record(tmp_path / "late.mcap", taken[:1] + taken[2000:]))
+    assert not late.from_start
+    some = [each for k, each in enumerate(taken) if each[0] != messages.INPUT or k % 7]
+    assert recompute(record(tmp_path / "some.mcap", some)).missing_ticks > 10
+    thinned = [(topic, {**message}) for topic, message in taken]
+    for topic, message in thinned:
+        if topic == messages.TACTILE:
+            message["seq_step"] = 4
+    with pytest.raises(RecordingError, match="one of 4 frames was published"):
+        recompute(record(tmp_path / "thinned.mcap", thinned))
+    other = load(changes=["tactile.rows=32", "tactile.cols=32"])
+    with pytest.raises(RecordingError, match="44 × 44 cells, the settings' sensors 32 × 32"):
+        recompute(record(tmp_path / "other.mcap", taken), other)
+
+
+def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
+    profile: Profile, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    words = ("--duration", "3", "--set", "task.name=demo", "--record", str(path))
+    done = softfinger("run", "--config", str(profile("")), *words)
+    assert done.returncode == 0, done.stderr
+    assert "lost on the way: none" in done.stderr
+    output = tmp_path / "comparison.json"
+    done = softfinger("replay", str(path), "--recompute", "--json", str(output))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "identical to the last bit" in done.stdout
+    compared = json.loads(output.read_text())
+    assert compared["from_start"]
+    assert compared["ticks"] > 1000
+    # Other settings on the command line differ, with their first place.
+    other = tmp_path / "other.toml"
+    other.write_text(profile("estimator.free_gain = false\n", "base.toml").read_text())
+    done = softfinger("replay", str(path), "--recompute", "--config", str(other))
+    assert done.returncode == 3
+    assert "left.force" in done.stdout
+
+
+def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
+    profile: Profile, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_text("mine")
+    done = softfinger("run", "--config", str(profile("")), "--record", str(path))
+    assert done.returncode == 1
+    assert "is there already; nothing is written over it" in done.stderr
+    assert path.read_text() == "mine"
+
+
+@pytest.fixture
+def played(tmp_path: Path) -> tuple[Path, Messages]:
+    sent: Messages = []
+    for k in range(100):
+        state = {**sample(messages.STATE), "seq": k, "timestamp": 1e9 + 0.01 * k}
+        sent.append((messages.STATE, state))
+    counts = np.ones((4, 5), np.uint16)
+    assert Frame(1, 0.0, 0.0, True, counts).valid
+    sent.append((messages.TACTILE, {**sample(messages.TACTILE), "timestamp": 1e9 + 0.5}))
+    path = tmp_path / "a.mcap"
+    record(path, sent)
+    return path, sent
+
+
+def test_messages_go_out_as_they_were(
+    played: tuple[Path, Messages], addresses: tuple[str, str], context: zmq.Context[Any]
+) -> None:
+    path, sent = played
+    socket = context.socket(zmq.SUB)
+    socket.setsockopt(zmq.SUBSCRIBE, b"")
+    socket.connect(addresses[0])
+    process = subprocess.Popen(
+        [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--speed", "20"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    came: list[list[bytes]] = []
+    until(lambda: (socket.poll(10) and came.append(socket.recv_multipart()), len(came) == 101)[1])
+    assert [(topic, msgpack.unpackb(payload)) for topic, payload in came] == sent
+    assert [payload for _, payload in came] == [messages.pack(message) for _, message in sent]
+    assert "101 of 101 messages published" in process.communicate(timeout=30)[0]
+
+
+def test_a_part_at_its_own_pace(
+    played: tuple[Path, Messages], addresses: tuple[str, str], tmp_path: Path
+) -> None:
+    words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
+    done = softfinger("replay", str(played[0]), *words)
+    assert done.stdout.startswith(("20 of", "21 of"))
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [(b"", "empty"), (b"\x89MCAP0\r\n", "cut short"), (b"t,d\n", "not an MCAP file")],
+)
+def test_files_that_are_no_recording(tmp_path: Path, content: bytes, reason: str) -> None:
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(content)
+    done = softfinger("replay", str(path), "--no-wait", "--recompute")
+    assert done.returncode == 1
+    assert reason in done.stderr
+
+
+def test_nothing_compared_is_no_sameness() -> None:
+    assert Comparison().states == 0

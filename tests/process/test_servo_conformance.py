@@ -1,0 +1,326 @@
+"""What every servo backend owes, in each operating mode: the simulated one and Dynamixel on a pty.
+
+The same tests run over both; a backend that joins them is added to ``RIGS``.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.clock import Clock, RealClock, VirtualClock
+from daemon.commands import Refused
+from daemon.records import Goal, Reading
+from daemon.servos import make_servos
+from daemon.servos import registers as reg
+from daemon.servos.base import ServoError, Servos
+from daemon.servos.modes import NUMBERS, current_toward
+from daemon.settings import ServoSettings, Settings
+from daemon.simulation.free_joints import FreeJoints
+from daemon.simulation.hand import SimulatedHand
+from daemon.simulation.servo_bus import ServoBus
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+from kinematics.table import ContactTable
+from tests.harness.servos import RunningBus
+
+COUNT = 2 * math.pi / 4096
+CURRENT_UNIT = 2.69e-3
+TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
+MODES = tuple(NUMBERS)
+BOUNDED = ("current-based position", "current")
+
+
+class Rig(Protocol):
+    """A backend over something that moves."""
+
+    servos: Servos
+    clock: Clock
+
+    def torque(self) -> list[bool]:
+        """Whether each motor is driven, by the other side's own account."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+class SimulatedRig:
+    """The simulated backend on a virtual clock."""
+
+    def __init__(self, **sections: Any) -> None:
+        settings = Settings.model_validate({"material": {"law": "constant"}, **sections})
+        self.clock: Clock = VirtualClock()
+        self._hand = SimulatedHand(settings, table=TABLE)
+        made = make_servos(settings, self.clock, self._hand)
+        assert made is not None
+        self.servos = made
+
+    def torque(self) -> list[bool]:
+        from daemon.simulation import layout
+
+        self._hand.advance(self.clock.now())
+        return [bool(on) for on in self._hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2]]
+
+    def close(self) -> None:
+        self.servos.close()
+
+
+class DynamixelRig:
+    """The Dynamixel backend, through SDK and pyserial, on an emulated bus in a thread."""
+
+    def __init__(self, servos: dict[str, Any] | None = None, **sections: Any) -> None:
+        chosen = {"backend": "dynamixel", "reply_timeout": 0.25, **(servos or {})}
+        settings = Settings.model_validate({"servos": chosen, **sections})
+        now = time.monotonic()
+        bus = ServoBus.from_settings(settings, FreeJoints(2, now), t=now)
+        self._running = RunningBus(bus)
+        self.clock: Clock = RealClock()
+        port = settings.servos.model_copy(update={"port": self._running.path})
+        made = make_servos(settings.model_copy(update={"servos": port}), self.clock, None)
+        assert made is not None
+        self.servos = made
+
+    def torque(self) -> list[bool]:
+        return [bool(self._running.memory(i)[reg.TORQUE_ENABLE]) for i in (0, 1)]
+
+    def close(self) -> None:
+        self.servos.close()
+        self._running.close()
+
+
+RIGS: dict[str, Callable[..., Rig]] = {"simulated": SimulatedRig, "dynamixel": DynamixelRig}
+
+
+@pytest.fixture(params=RIGS)
+def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Rig]]:
+    """Makes rigs of one backend, which end with the test."""
+    made: list[Rig] = []
+
+    def start(mode: str = MODES[0], **sections: Any) -> Rig:
+        servos = {"mode": mode, "watchdog": 0.5, **sections.pop("servos", {})}
+        made.append(RIGS[request.param](servos=servos, **sections))
+        return made[-1]
+
+    yield start
+    for each in made:
+        each.close()
+
+
+def ticks(rig: Rig, goal: Goal, seconds: float) -> list[Reading]:
+    """Read and write as the loop does; every reading."""
+    readings = []
+    deadline, end = rig.clock.now(), rig.clock.now() + seconds
+    while deadline < end:
+        rig.clock.sleep_until(deadline)
+        reading = Reading()
+        rig.servos.read(reading)
+        assert reading.valid
+        readings.append(reading)
+        rig.servos.write(goal)
+        deadline = max(deadline + 0.002, rig.clock.now())
+    return readings
+
+
+def armed(rig: Rig) -> Reading:
+    rig.servos.connect()
+    rig.servos.set_torque(True)
+    reading = Reading()
+    rig.servos.read(reading)
+    return reading
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_connect_leaves_the_hand_limp_and_reads(make, mode):
+    rig = make(mode)
+    rig.servos.connect()
+    assert rig.torque() == [False, False]
+    first, second = ticks(rig, Goal(q=[0.3, 0.3], current=[1.0, 1.0]), 0.004)[:2]
+    assert first.q == second.q == [0.0, 0.0]  # a goal while torque is off moves nothing
+    assert first.current == [0.0, 0.0]
+    assert second.t >= first.t
+    assert first.alert == 0
+    assert rig.torque() == [False, False]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_torque_on_holds_where_the_joints_are(make, mode):
+    rig = make(mode)
+    before = armed(rig)
+    assert rig.torque() == [True, True]
+    after = ticks(rig, Goal(q=list(before.q), current=[0.5, 0.5]), 0.1)[-1]
+    assert after.q == pytest.approx(before.q, abs=1.5 * COUNT)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_joints_go_to_their_goals_with_the_right_signs(make, mode):
+    rig = make(mode)
+    armed(rig)
+    goal = Goal(q=[0.08, -0.12], current=[0.5, 0.5])
+    readings = ticks(rig, goal, 0.6)
+    assert readings[-1].q == pytest.approx(goal.q, abs=0.01)
+    fastest = [max((r.dq[i] for r in readings), key=abs) for i in (0, 1)]
+    assert fastest[0] > 0.2
+    assert fastest[1] < -0.2
+    pushed = [max((r.current[i] for r in readings), key=abs) for i in (0, 1)]
+    assert pushed[0] * fastest[0] > 0.0
+    assert pushed[1] * fastest[1] > 0.0
+
+
+@pytest.mark.parametrize("mode", BOUNDED)
+def test_the_bound_on_the_current_holds_on_every_way(make, mode):
+    rig = make(mode)
+    armed(rig)
+    bound = 0.1
+    readings = ticks(rig, Goal(q=[0.1, -0.3], current=[bound, bound]), 0.3)
+    currents = [abs(current) for reading in readings for current in reading.current]
+    assert 0.5 * bound < max(currents) <= bound + CURRENT_UNIT
+
+
+def test_position_mode_takes_the_current_it_needs(make):
+    rig = make("position")
+    armed(rig)
+    readings = ticks(rig, Goal(q=[0.08, -0.3], current=[0.0, 0.0]), 0.4)
+    assert readings[-1].q == pytest.approx([0.08, -0.3], abs=0.01)
+
+
+@pytest.mark.parametrize("mode", BOUNDED)
+def test_no_current_no_motion(make, mode):
+    rig = make(mode)
+    armed(rig)
+    readings = ticks(rig, Goal(q=[0.1, -0.3], current=[0.0, 0.0]), 0.1)
+    assert readings[-1].q == pytest.approx([0.0, 0.0], abs=1.5 * COUNT)
+    assert max(abs(current) for r in readings for current in r.current) <= CURRENT_UNIT
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_torque_off_and_close_let_go(make, mode):
+    rig = make(mode)
+    armed(rig)
+    goal = Goal(q=[0.05, -0.05], current=[0.5, 0.5])
+    ticks(rig, goal, 0.1)
+    rig.servos.set_torque(False)
+    assert rig.torque() == [False, False]
+    assert ticks(rig, goal, 0.1)[-1].current == pytest.approx([0.0, 0.0], abs=CURRENT_UNIT)
+    rig.servos.set_torque(True)
+    assert rig.torque() == [True, True]
+    rig.servos.close()
+    assert rig.torque() == [False, False]
+    rig.servos.close()
+    with pytest.raises(ServoError, match="not connected"):
+        rig.servos.set_torque(True)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_values_are_whole_counts(make, mode):
+    rig = make(mode)
+    armed(rig)
+    for reading in ticks(rig, Goal(q=[0.05, -0.05], current=[0.3, 0.3]), 0.05):
+        for value, unit in [(reading.q, COUNT), (reading.current, CURRENT_UNIT)]:
+            counts = [each / unit for each in value]
+            assert counts == pytest.approx([round(count) for count in counts], abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_finger_that_is_not_in_the_scene_stays_zero(make, mode):
+    rig = make(mode, scene={"fingers": ("right",)})
+    armed(rig)
+    reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
+    assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0
+    assert reading.q[1] == pytest.approx(-0.1, abs=0.01)
+    assert rig.torque() == [False, True]
+
+
+def test_counters_are_there_and_zero(make):
+    rig = make()
+    armed(rig)
+    counters = rig.servos.counters()
+    assert counters["timeouts"] == counters["crc"] == 0
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_model_that_senses_no_current_can_do_position_mode_alone(make, mode):
+    rig = make(mode, servos={"model": "XL430-W250"})
+    if mode != "position":
+        with pytest.raises(ServoError, match=f"XL430-W250 has no {mode} mode"):
+            rig.servos.connect()
+        return
+    armed(rig)
+    assert ticks(rig, Goal(q=[0.08, -0.1]), 0.5)[-1].q == pytest.approx([0.08, -0.1], abs=0.01)
+
+
+# What the daemon does with them.
+
+
+def virtual(mode: str) -> Settings:
+    return Settings.model_validate(
+        {"loop": {"clock": "virtual"}, "servos": {"mode": mode}, "material": {"law": "constant"}}
+    )
+
+
+@pytest.mark.parametrize("mode", BOUNDED)
+def test_the_daemon_grasps(mode):
+    with Daemon(virtual(mode), wire=False) as daemon:
+        loop = daemon.loop
+        loop.advance(0.1)
+        loop.command({"command": "arm"})
+        loop.advance(0.1)
+        loop.command({"command": "grasp", "force": 8.0})
+        loop.advance(3.0)
+        assert (loop.state.mode, loop.state.fault) == ("holding", "")
+        assert [c.force for c in loop.state.contacts] == pytest.approx([8.0, 8.0], rel=0.05)
+        loop.command({"command": "release"})
+        loop.advance(1.5)
+        assert loop.state.mode == "armed"
+        assert loop.state.reading.q == pytest.approx([0.0, 0.0], abs=0.03)
+
+
+def test_nothing_is_grasped_in_position_mode_but_the_joints_move():
+    with Daemon(virtual("position"), wire=False) as daemon:
+        loop = daemon.loop
+        loop.advance(0.1)
+        loop.command({"command": "arm"})
+        loop.advance(0.1)
+        with pytest.raises(Refused, match="nothing bounds the current"):
+            loop.command({"command": "grasp", "force": 8.0})
+        loop.command({"command": "move", "left": 0.05, "right": -0.1})
+        loop.advance(1.0)
+        assert loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)
+
+
+# Current mode's own loop, and what position mode checks.
+
+
+def test_the_loop_of_current_mode():
+    servos = ServoSettings(stiffness=10.0, damping=0.5)
+    assert current_toward(servos, 0.1, 2.0, 0.0, 0.0) == pytest.approx(1.0)
+    assert current_toward(servos, 0.1, 2.0, 0.0, 1.0) == pytest.approx(0.5)
+    assert current_toward(servos, 0.1, 0.3, 0.0, 0.0) == 0.3
+    assert current_toward(servos, -9.0, -0.3, 0.0, 0.0) == -0.3
+
+
+def test_position_limits_that_the_joint_does_not_fit_in_are_told():
+    rig = DynamixelRig(servos={"mode": "position"})
+    try:
+        rig._running.call(lambda: rig._running.servo(1).table.set(reg.MAX_POSITION_LIMIT, 2100))
+        with pytest.raises(ServoError, match=r"servo 2 .*limits are 0 … 2100, the joint needs"):
+            rig.servos.connect()
+        rig._running.call(lambda: rig._running.servo(1).table.set(reg.MAX_POSITION_LIMIT, 4095))
+        rig.servos.connect()
+        assert sum("nothing bounds its current" in n for n in rig.servos.notices) == 2
+    finally:
+        rig.close()
+
+
+@pytest.mark.parametrize("mode", BOUNDED)
+def test_each_joints_own_current_limit_binds(make, mode):
+    rig = make(mode, servos={"current_limit": (0.15, 0.08)})
+    armed(rig)
+    readings = ticks(rig, Goal(q=[0.1, -0.3], current=[1.0, 1.0]), 0.2)
+    for finger, limit in enumerate((0.15, 0.08)):
+        greatest = max(abs(reading.current[finger]) for reading in readings)
+        assert 0.6 * limit < greatest <= limit + CURRENT_UNIT

@@ -1,0 +1,107 @@
+"""Temperature, supply and hardware errors of the servos, from the wire to the limits' table."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.clock import RealClock, VirtualClock
+from daemon.records import Reading
+from daemon.servos import make_servos
+from daemon.servos.base import Servos
+from daemon.servos.models import by_name
+from daemon.servos.simulated import SimulatedServos
+from daemon.settings import Settings
+from daemon.simulation.servo_health import THERMAL_RISE, THERMAL_TIME
+from tests.conftest import until
+from tests.harness.servos import RunningBus
+
+
+@pytest.fixture
+def bus() -> Iterator[RunningBus]:
+    bus = RunningBus()
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def servos(bus: RunningBus) -> Iterator[Servos]:
+    settings = Settings.model_validate(
+        {"servos": {"backend": "dynamixel", "port": bus.path, "reply_timeout": 0.25}}
+    )
+    servos = make_servos(settings, RealClock(), None)
+    assert servos is not None
+    servos.connect()
+    yield servos
+    servos.close()
+
+
+def read(servos: Servos, reading: Reading) -> Reading:
+    servos.read(reading)
+    return reading
+
+
+def test_temperature_and_supply_come_with_the_joints(bus: RunningBus, servos: Servos) -> None:
+    reading = read(servos, Reading())
+    assert reading.valid
+    assert reading.temperature == [25.0, 25.0]
+    assert reading.voltage == pytest.approx([12.75, 12.75], abs=0.06)
+    bus.call(lambda: setattr(bus.servo(1).health, "temperature", 55.0))
+    bus.call(lambda: setattr(bus.servo(0).health, "voltage", 11.0))
+    start = time.monotonic()
+    until(lambda: read(servos, reading).temperature[1] > 54.0, 2.0)
+    assert time.monotonic() - start > 0.1, "not with every read"
+    assert reading.voltage[0] == pytest.approx(11.0)
+    assert reading.temperature[0] == 25.0
+
+
+def test_both_kinds_of_read_give_the_same_joints(bus: RunningBus, servos: Servos) -> None:
+    wide = read(servos, Reading())
+    narrow = read(servos, Reading())
+    assert wide.temperature[0] > 0.0
+    assert narrow.temperature[0] == 0.0
+    assert narrow.q == pytest.approx(wide.q, abs=0.002)
+    assert servos.counters()["timeouts"] == 0
+
+
+def test_an_alert_tells_which_hardware_error_it_is(bus: RunningBus, servos: Servos) -> None:
+    reading = read(servos, Reading())
+    assert reading.hardware == [0, 0]
+    bus.fault("overload=2")
+    until(lambda: read(servos, reading).alert, 2.0)
+    assert reading.alert == 0b10
+    assert reading.hardware == [0, 1 << 5]
+
+
+class Loaded:
+    """A hand that stands, with 2 A through its left joint."""
+
+    q = dq = np.zeros(2)
+    current = np.array([2.0, 0.0])
+
+    def advance(self, t: float) -> None: ...
+
+    def hold_torque_until(self, t: float) -> None: ...
+
+    def drive(self, *_: Any) -> None: ...
+
+
+def test_simulated_servos_warm_with_their_current() -> None:
+    clock, hand = VirtualClock(), Loaded()
+    servos = SimulatedServos(Settings(), hand, clock)  # type: ignore[arg-type]
+    servos.connect()
+    reading = read(servos, Reading())
+    assert reading.temperature == [25.0, 25.0]
+    assert reading.voltage == pytest.approx([12.75, 12.75], abs=0.06)
+    for _ in range(2000):
+        clock.sleep_until(clock.now() + 0.1)
+        servos.read(reading)
+    share = 2.0 / by_name(Settings().servos.model).stall_current
+    risen = THERMAL_RISE * share**2 * (1.0 - math.exp(-clock.now() / THERMAL_TIME))
+    assert reading.temperature[0] == pytest.approx(25.0 + risen, abs=1.0)
+    assert reading.temperature[1] == 25.0

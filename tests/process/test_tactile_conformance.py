@@ -1,0 +1,161 @@
+"""What every tactile backend must do, whatever it reads."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from daemon.records import Frame
+from daemon.tactile.base import TactileError
+from tests.harness.tactile import BACKENDS, COLS, ROWS, SERIAL, Rig, image
+
+
+@pytest.fixture(params=BACKENDS)
+def rig(request, tmp_path):
+    with Rig(request.param, tmp_path) as made:
+        yield made
+
+
+def test_open_brings_a_first_good_frame(rig):
+    assert rig.sensor.latest() is None
+    rig.sensor.open()
+    frame = rig.newest()
+    assert isinstance(frame, Frame)
+    assert frame.valid
+    assert frame.seq >= 1
+    assert frame.data.shape == (ROWS, COLS)
+    assert frame.data.dtype == np.uint16
+    assert frame.t_sample <= frame.t_arrival <= rig.clock.now() + 1e-6
+
+
+def test_a_frame_stays_the_same_object_until_a_newer_one_and_is_never_written_again(rig):
+    rig.sensor.open()
+    first = rig.newest()
+    kept = first.data.copy()
+    later = rig.wait(lambda frame: frame.seq >= first.seq + 5)
+    assert later is not first
+    assert later.t_arrival > first.t_arrival
+    assert later.t_sample > first.t_sample
+    assert np.array_equal(first.data, kept)
+    if rig.backend in ("simulated", "replay"):  # no time passes here by itself
+        assert rig.sensor.latest() is later
+
+
+def test_numbers_and_times_only_rise(rig):
+    rig.sensor.open()
+    seen = [rig.newest()]
+    while len(seen) < 12:
+        seen.append(rig.wait(lambda frame: frame is not seen[-1]))
+    assert (np.diff([frame.seq for frame in seen]) > 0).all()
+    assert (np.diff([frame.t_sample for frame in seen]) >= 0).all()
+    # Frames that were read in one go have come at the same time.
+    assert (np.diff([frame.t_arrival for frame in seen]) >= 0).all()
+
+
+def test_counts_are_told_as_plain_numbers(rig):
+    rig.sensor.open()
+    rig.wait(lambda frame: frame.seq >= 4)
+    counters = rig.sensor.counters()
+    assert counters["frames"] >= 3
+    assert {"resyncs", "skipped_bytes"} <= set(counters)
+    assert all(type(value) is int for value in counters.values())
+
+
+def test_close_ends_everything_and_may_come_again(rig):
+    rig.sensor.close()
+    rig.sensor.open()
+    rig.sensor.close()
+    rig.sensor.close()
+    assert not [t for t in threading.enumerate() if t.name.startswith("tactile")]
+    frame = rig.sensor.latest()
+    if rig.backend not in SERIAL:
+        rig.clock.sleep_until(rig.clock.now() + 1.0)
+    assert rig.sensor.latest() is frame
+
+
+@pytest.mark.parametrize("backend", [*SERIAL, "replay"])
+def test_it_opens_again_after_close(backend, tmp_path):
+    with Rig(backend, tmp_path) as rig:
+        rig.sensor.open()
+        rig.sensor.close()
+        rig.sensor.open()
+        seq = rig.newest().seq
+        assert rig.wait(lambda frame: frame.seq > seq).valid
+
+
+@pytest.mark.parametrize("backend", [*SERIAL, "replay"])
+def test_counts_are_those_that_were_sent_row_by_row(backend, tmp_path):
+    with Rig(backend, tmp_path) as rig:
+        rig.sensor.open()
+        for _ in range(5):
+            seq = rig.newest().seq
+            frame = rig.wait(lambda frame, seq=seq: frame.seq > seq)
+            assert any(np.array_equal(frame.data, image(k)) for k in range(160))
+
+
+@pytest.mark.parametrize("backend", [*SERIAL, "replay"])
+def test_another_grid_is_told_with_both_sizes(backend, tmp_path):
+    with pytest.raises(TactileError, match=r"16 × 32"), Rig(backend, tmp_path, rows=16) as rig:
+        rig.sensor.open()
+
+
+@pytest.mark.parametrize("backend", SERIAL)
+def test_torn_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
+    with Rig(backend, tmp_path, fault="torn=0.3") as rig:
+        rig.sensor.open()
+        wrong = 0
+        while rig.sensor.counters()["resyncs"] < 4:
+            frame = rig.wait(lambda frame: True)
+            wrong += not any(np.array_equal(frame.data, image(k)) for k in range(160))
+        assert wrong == 0
+        assert rig.sensor.counters()["skipped_bytes"] > 0
+
+
+@pytest.mark.parametrize("backend", SERIAL)
+def test_a_board_that_falls_silent_leaves_the_last_frame(backend, tmp_path):
+    with Rig(backend, tmp_path, fault="silent@0.2") as rig:
+        rig.sensor.open()
+        rig.wait(lambda frame: rig.images.number > 60)  # 40 of them were sent
+        last = rig.newest()
+        number = rig.images.number
+        rig.wait(lambda frame: rig.images.number > number + 10)
+        assert rig.newest() is last
+        assert last.valid
+
+
+@pytest.mark.parametrize("backend", SERIAL)
+def test_a_frozen_board_goes_on_with_numbers_and_times_and_one_image(backend, tmp_path):
+    with Rig(backend, tmp_path, fault="frozen@0.2") as rig:
+        rig.sensor.open()
+        rig.wait(lambda frame: rig.images.number > 60)
+        first = rig.newest()
+        later = rig.wait(lambda frame: frame.seq >= first.seq + 3)
+        assert later.t_sample > first.t_sample
+        assert later.valid
+        assert np.array_equal(later.data, first.data)
+
+
+# The glove-style board does so too, after 40 unanswered requests of 0.1 s each.
+@pytest.mark.parametrize("backend", ["flexitac", "cobs"])
+def test_a_board_that_changes_its_grid_ends_in_an_invalid_frame(backend, tmp_path):
+    with Rig(backend, tmp_path, fault="wrong-size@0.2") as rig:
+        rig.sensor.open()
+        last = rig.wait(lambda frame: not frame.valid)
+        assert last.data.shape == (ROWS, COLS)
+        assert str(ROWS * COLS // 4) in rig.sensor.error or "16 × 16" in rig.sensor.error
+        assert rig.sensor.latest() is last
+
+
+@pytest.mark.parametrize("backend", SERIAL)
+def test_an_unplugged_board_ends_in_an_invalid_frame_with_the_old_data(backend, tmp_path):
+    with Rig(backend, tmp_path) as rig:
+        rig.sensor.open()
+        before = rig.wait(lambda frame: frame.seq >= 3)
+        rig.unplug()
+        last = rig.wait(lambda frame: not frame.valid)
+        assert last.seq > before.seq
+        assert last.t_arrival >= before.t_arrival
+        assert rig.sensor.counters()["port_lost"] == 1
+        assert "port is gone" in rig.sensor.error

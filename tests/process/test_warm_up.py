@@ -1,0 +1,39 @@
+"""No kernel is compiled, nor loaded from the cache, in a running loop: all are warm before it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.warm_scenes import HIL, SCENES
+
+
+def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path: Path) -> None:
+    emulate = [*SOFTFINGER, "emulate", "--dir", str(tmp_path), "--config", str(HIL)]
+    with subprocess.Popen(emulate, stdout=subprocess.PIPE, text=True) as hand:
+        try:
+            assert hand.stdout is not None
+            assert hand.stdout.readline() == "ready\n"
+            done = subprocess.run(
+                [sys.executable, "-m", "tests.harness.warm_scenes", str(tmp_path)],
+                capture_output=True, text=True, check=True, timeout=240,
+            )  # fmt: skip
+        finally:
+            hand.terminate()
+    told: dict[str, dict[str, Any]] = {}
+    for line in done.stdout.splitlines():
+        scene = json.loads(line)
+        told[scene["scene"]] = scene
+    assert set(told) == {*SCENES, "calibrated sensor", "stand-in hand"}
+    for name, scene in told.items():
+        assert scene["before"] > 10, f"{name}: the watch heard nothing of the warm-up"
+        assert scene["after"] == [], name
+        servos = name != "sensors without servos"
+        blind = name in ("servos without sensors", "position mode")
+        wanted = {"disarmed"} | ({"armed"} if servos else set())
+        wanted |= {"grasping", "holding", "releasing"} if servos and not blind else set()
+        assert wanted <= set(scene["modes"]), name

@@ -1,0 +1,1 @@
+"""Soaks: each module a program, of which the tests run a little."""

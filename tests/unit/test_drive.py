@@ -1,0 +1,175 @@
+"""Torque on and off, whatever the servos answer, and who may ask for it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from daemon.assembly import Daemon
+from daemon.commands import CommandServer, Refused
+from daemon.servos.base import ServoError
+from daemon.settings import Settings
+from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
+
+
+def test_a_goal_that_is_no_number_is_a_fault_though_a_command_was_refused_for_it(
+    make: Make,
+) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    daemon.loop.state.goal.q[0] = math.nan
+    daemon.loop._safety.bound(daemon.loop.state)
+    assert "a goal was no number" in refusal(daemon, "grasp")
+    daemon.loop.advance(daemon.loop.period)
+    assert daemon.loop.state.fault_name == "goal.number"
+    command(daemon, "clear")
+
+
+def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert daemon.loop.servos is not None
+
+    def failing(reading: Any) -> None:
+        reading.valid = False
+
+    daemon.loop.servos.read = failing  # type: ignore[method-assign]
+    advance_to(daemon, "fault", 0.2)
+    assert "no good reading" in daemon.loop.state.fault
+    with pytest.raises(Refused, match="clear: servos: no good reading"):
+        command(daemon, "clear")
+
+
+def test_torque_that_can_not_be_turned_off_is_told_once_and_tried_again(make: Make) -> None:
+    daemon = make()
+    events: list[tuple[str, str, str]] = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    servos = daemon.loop.servos
+    assert servos is not None
+    really, tries = servos.set_torque, []
+
+    def failing(on: bool) -> None:
+        tries.append(on)
+        if len(tries) < 4:
+            raise ServoError("no answer")
+        really(on)
+
+    servos.set_torque = failing  # type: ignore[method-assign]
+    command(daemon, "stop")
+    daemon.loop.advance(1.2)
+    assert daemon.loop.state.torque, "torque was not turned off, and the state says it was"
+    daemon.loop.advance(1.0)
+    assert not daemon.loop.state.torque
+    assert tries == [False] * 4
+    assert [text for _, kind, text in events if kind == "servos"] == [
+        "torque could not be turned off: no answer"
+    ]
+
+
+def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
+    daemon = make()
+    servos = daemon.loop.servos
+    assert servos is not None
+    really, tries = servos.set_torque, []
+
+    def failing(on: bool) -> None:
+        tries.append(on)
+        if on:
+            raise ServoError("overload")
+        really(on)
+
+    servos.set_torque = failing  # type: ignore[method-assign]
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("fault", "overload")
+    assert not daemon.loop.state.torque
+    assert tries == [True, False]
+
+
+def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make: Make) -> None:
+    daemon = grasped(make(), 6.0)
+    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process stood still
+    advance_to(daemon, "fault", 0.1)
+    assert "watchdog" in daemon.loop.state.fault
+    daemon.loop.advance(0.2)
+    command(daemon, "clear")
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.1, right=-0.1)
+    advance_to(daemon, "armed", 3.0)
+    assert daemon.hand is not None
+    assert daemon.hand.q.tolist() == pytest.approx([-0.1, -0.1], abs=0.04)
+
+
+def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> None:
+    daemon = make()
+    assert daemon.loop.servos is not None
+    for name in ("stop", "disarm"):
+        daemon.loop.servos.set_torque(True)  # as another program may have done
+        command(daemon, name)
+        daemon.loop.advance(daemon.loop.period)
+        assert daemon.hand is not None
+        assert not torque_of(daemon).any()
+        assert not daemon.loop.state.torque
+
+
+def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
+    make: Make, context: zmq.Context[Any]
+) -> None:
+    daemon = make()
+    server = CommandServer(context, "inproc://commands", 200)
+    daemon.loop._server = server
+    client = context.socket(zmq.DEALER)
+    client.connect("inproc://commands")
+    client.send(msgpack.packb({"command": "arm"}))
+    daemon.loop.stop()
+    daemon.loop.advance(5 * daemon.loop.period)
+    assert daemon.loop.state.mode == "disarmed"
+    assert "before a stop" in msgpack.unpackb(client.recv(zmq.NOBLOCK))["error"]
+    client.send(msgpack.packb({"command": "arm"}))
+    daemon.loop.advance(daemon.loop.period)
+    assert daemon.loop.state.mode == "armed"
+    client.close()
+    server.close()
+
+
+def test_arm_waits_until_a_failing_torque_off_has_worked(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    servos = daemon.loop.servos
+    assert servos is not None
+    really = servos.set_torque
+    answers = iter([ServoError("no answer"), None])
+
+    def failing_once(on: bool) -> None:
+        answer = next(answers)
+        if answer is not None:
+            raise answer
+        really(on)
+
+    servos.set_torque = failing_once  # type: ignore[method-assign]
+    command(daemon, "stop")
+    daemon.loop.advance(0.1)
+    with pytest.raises(Refused, match="arm: torque could not be turned off yet"):
+        command(daemon, "arm")
+    daemon.loop.advance(0.6)
+    servos.set_torque = really  # type: ignore[method-assign]
+    command(daemon, "arm")
+
+
+def test_arm_is_refused_before_the_servos_were_read() -> None:
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
+    with Daemon(settings, wire=False) as daemon:
+        assert daemon.loop.servos is not None
+        daemon.loop.servos.read = lambda reading: None  # type: ignore[method-assign]
+        daemon.loop.advance(0.01)
+        with pytest.raises(Refused, match="arm: servos: no good reading yet"):
+            command(daemon, "arm")

@@ -1,0 +1,362 @@
+"""The simulated hand: where it balances, what its servos do, its scenes and its time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daemon.settings import Settings, SettingsError
+from daemon.simulation import layout
+from daemon.simulation.hand import SimulatedHand
+from kinematics.fingers import HandGeometry
+from kinematics.grasp import Grasp
+from tests.harness.plant import (
+    BOUNDED,
+    CONSTANT,
+    CURRENT,
+    LOSSLESS,
+    MODULUS,
+    PAPER,
+    POSITION,
+    TABLE_I,
+    WIDTH,
+    make,
+    place,
+    run,
+    settled,
+)
+
+# Balance.
+
+
+def test_symmetric_grasp_settles_where_the_theory_puts_it():
+    hand = make(table_friction=0.0, joint_friction=0.0)
+    grasp = Grasp(HandGeometry(), PAPER, WIDTH)
+    for d, degrees, normal in [
+        (0.002, 8.6269265587, 3.8421597806),
+        (0.004, 10.0786581078, 15.4013956785),
+    ]:
+        expected = grasp.forces(grasp.symmetric(d))
+        settled(hand, (0.9, 0.9), float(expected.torque[0]) / CONSTANT, 6.0)
+        np.testing.assert_allclose(hand.d, d, rtol=1e-6)
+        np.testing.assert_allclose(np.degrees(hand.q), degrees, rtol=1e-8)
+        np.testing.assert_allclose(hand.normal, normal, rtol=1e-6)
+        np.testing.assert_allclose(hand.tangential, 0, atol=1e-6 * normal)
+
+
+@pytest.mark.parametrize(("degrees", "gain"), [(1, 1.520), (5, 1.5076)])
+def test_quasi_static_steering_gain(degrees, gain):
+    hand = make(table_friction=0.0, joint_friction=0.0, tip_friction=50.0)
+    grasp = Grasp(HandGeometry(), PAPER, WIDTH)
+    start = grasp.symmetric(0.004)
+    place(hand, start.q, start.pose)
+    hand.shear[:] = start.shear
+    # The joints held stiffly and turned slowly, so that only they and the tips' energy decide.
+    hand.memory[layout.POSITION_GAIN] = 1e5
+    hand.memory[layout.RATE_GAIN] = 1e3
+    hand.memory[layout.CURRENT_LIMIT] = 1e3
+    hand.memory[layout.STALL_CURRENT] = 1e3
+    delta = math.radians(degrees)
+    for share in np.linspace(0, 1, 400):
+        for joint, sign in ((0, 1), (1, -1)):
+            hand.drive(joint, POSITION, True, start.q[joint] + sign * share * delta, 0.0)
+        run(hand, 0.002)
+    run(hand, 0.2)
+    turned = hand.q[0] - start.q[0]
+    assert turned == pytest.approx(delta, rel=1e-2)
+    assert hand.object_pose[2] / turned == pytest.approx(gain, abs=2e-3)
+
+
+def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
+    hand = make(gravity=(0.0, -9.80665))
+    run(hand, 0.1)
+    t = hand.t
+    np.testing.assert_allclose(hand.object_pose[1], 0.08 - 0.5 * 9.80665 * t * t, rtol=1e-12)
+    assert hand.object_velocity[1] == pytest.approx(-9.80665 * t)
+    held = make(gravity=(0.0, -9.80665), object_mass=0.3)
+    grasp = Grasp(HandGeometry(), PAPER, WIDTH)
+    start = grasp.symmetric(0.004)
+    place(held, start.q, start.pose)
+    settled(held, (0.9, 0.9), 0.7, 1.0)
+    # The tips' push and shear in y carry the weight to 1 %, and nothing slips.
+    along = held.tangential * np.cos(held.object_pose[2]) * [-1, 1]
+    assert abs(along.sum()) == pytest.approx(0.3 * 9.80665, rel=0.01)
+    place_before = held.object_pose[1]
+    run(held, 1.0)
+    assert held.object_pose[1] == pytest.approx(place_before, abs=1e-5)
+    slippery = make(gravity=(0.0, -9.80665), object_mass=0.3, tip_friction=0.05)
+    place(slippery, start.q, start.pose)
+    settled(slippery, (0.9, 0.9), 0.7, 1.0)
+    assert slippery.object_pose[1] == pytest.approx(0.03, abs=1e-3)  # on the palm
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
+    hand = make(tip_friction=friction, table_friction=0.0)
+    settled(hand, (0.9, 0.9), 0.5, 1.0)
+    place_held = hand.object_pose[1]
+    push = 0.0
+    while hand.object_pose[1] < place_held + 0.006:
+        push += 0.01
+        hand.push(0.0, push)
+        run(hand, 0.005)
+        ratio = np.abs(hand.tangential) / hand.normal
+        assert (ratio <= friction * (1 + 1e-9)).all()
+    # Both tips slip, at Coulomb's bound; only inertia is left of the push.
+    np.testing.assert_allclose(ratio, friction, rtol=1e-6)
+    assert push == pytest.approx(2 * friction * hand.normal.mean(), rel=0.15)
+
+
+def test_a_dropped_object_comes_to_rest_on_the_palm():
+    for angle in (0.0, 0.4):
+        hand = make(gravity=(0.0, -9.80665), object_angle=angle, palm=0.01)
+        energy = hand.energy()
+        highest = 0.0
+        for _ in range(2000):
+            run(hand, 0.001)
+            later = hand.energy()
+            assert later <= energy + 1e-12
+            energy = later
+            if hand.t > 0.15:
+                highest = max(highest, np.abs(hand.object_velocity[1]))
+        # Flat on a face, the weight on two corners' springs of 1e5 N/m; a tip it leans on may
+        # still be creeping away.
+        half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
+        sunk = 0.1 * 9.80665 / 2e5
+        assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=5e-7)
+        assert np.abs(hand.object_velocity[1:]).max() < 1e-6
+    assert highest > 0.01  # the tilted one rocked before it lay still
+
+
+def test_a_push_onto_the_palm_is_borne_by_it():
+    hand = make(palm=0.045, object_mass=0.02)
+    hand.push(0.0, -20.0)
+    run(hand, 0.5)
+    assert hand.object_pose[1] == pytest.approx(0.045 + 0.03 - 20.0 / 2e5, rel=1e-6)
+    assert hand.object_pose[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_collision_keeps_momentum_and_energy():
+    hand = make(object_mass=0.05, **LOSSLESS)
+    place(hand, (0.0, 0.0), (-0.005, 0.08, 0.0), velocity=(-0.5, 0.0, 0.0))
+    start = hand.energy()
+    assert start == pytest.approx(0.5 * 0.05 * 0.25)
+    impulse = 0.0
+    while hand.t < 0.05:
+        before = hand.normal[0]
+        hand.advance(hand.t + 1.5 * hand.step)
+        impulse += 0.5 * (before + hand.normal[0]) * hand.step
+    assert hand.force[0] == 0.0
+    assert hand.object_velocity[0] > 0.3
+    assert 0.05 * (hand.object_velocity[0] + 0.5) == pytest.approx(impulse, rel=1e-3)
+    # The finger takes L N dt, with the object's face upright all the while.
+    assert hand.memory[layout.JOINT_INERTIA] * hand.dq[0] == pytest.approx(
+        -0.080 * impulse, rel=3e-3
+    )
+    assert hand.energy() == pytest.approx(start, rel=1e-3)
+
+
+# Servos.
+
+
+def test_position_moves_are_well_damped_and_bounded_by_the_goal_current():
+    hand = make()
+    place(hand, (-0.2, -0.2), (0.0, 0.3, 0.0))
+    for joint in range(2):
+        hand.drive(joint, BOUNDED, True, 0.1, 0.4)
+    highest = 0.0
+    while hand.t < 1.0:
+        run(hand, 0.002)
+        assert np.abs(hand.current).max() <= 0.4 + 1e-12
+        if hand.t < 0.02:
+            continue
+        highest = max(highest, hand.q.max())
+    assert highest < 0.1 + 0.01 * 0.3  # overshoot below 1 % of the move
+    np.testing.assert_allclose(hand.q, 0.1, atol=0.01)
+
+
+def test_goal_current_is_reached_a_tenth_of_a_radian_away():
+    hand = make()
+    hand.memory[layout.JOINTS_HELD] = 1.0
+    for joint, away in ((0, 0.1), (1, -0.1)):
+        hand.drive(joint, BOUNDED, True, away, 1.0)
+    run(hand, 0.02)
+    np.testing.assert_allclose(hand.current, [1.0, -1.0], rtol=1e-6)
+
+
+def test_modes_torque_and_electrics():
+    hand = make(joint_friction=0.0, joint_damping=0.0)
+    place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
+    hand.drive(0, CURRENT, True, 0.0, 0.2)
+    run(hand, 0.001)
+    assert hand.current[0] == pytest.approx(0.2 * (1 - math.exp(-1)), rel=0.02)
+    run(hand, 0.010)
+    assert hand.current[0] == pytest.approx(0.2, rel=0.05)
+    assert hand.dq[0] > 0
+    assert hand.dq[1] == 0.0
+    hand.drive(0, CURRENT, False, 0.0, 0.2)
+    run(hand, 0.02)
+    assert abs(hand.current[0]) < 1e-6
+    with pytest.raises(ValueError, match="mode 16"):
+        hand.drive(0, 16, True, 0.0, 0.1)
+    with pytest.raises(ValueError, match="finite"):
+        hand.drive(0, BOUNDED, True, math.nan, 0.1)
+
+
+def test_end_stops_and_no_load_speed_bound_the_joints():
+    hand = make()
+    place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
+    for joint in range(2):
+        hand.drive(joint, CURRENT, True, 0.0, (3.0, -3.0)[joint])
+    fastest = 0.0
+    while hand.t < 2.0:
+        run(hand, 0.002)
+        fastest = max(fastest, np.abs(hand.dq).max())
+    assert fastest < hand.memory[layout.NO_LOAD_SPEED]
+    # 5.4 N·m on 500 N·m/rad, behind the clearance of 0.05 rad.
+    assert 1.05 < hand.q[0] < 1.07
+    assert -0.57 < hand.q[1] < -0.55
+
+
+def test_torque_goes_off_by_itself_at_the_time_set():
+    hand = make()
+    place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
+    hand.drive(0, BOUNDED, True, 0.5, 0.3)
+    hand.hold_torque_until(0.05)
+    run(hand, 0.049)
+    assert hand.current[0] == pytest.approx(0.3)
+    run(hand, 0.011)
+    assert hand.current[0] < 1e-3
+
+
+# Scenes.
+
+
+def test_one_finger_alone_has_the_object_fixed():
+    settings = Settings.model_validate({"scene": {"fingers": ("right",)}})
+    hand = SimulatedHand(settings, table=PAPER)
+    pose = hand.object_pose.copy()
+    settled(hand, (0.9, 0.9), 0.5)
+    np.testing.assert_array_equal(hand.object_pose, pose)
+    assert hand.force[1] > 5.0
+    assert hand.force[0] == 0.0
+    assert hand.d[0] == 0.0
+
+
+def test_scripted_compression_presses_both_tips_in_turn_to_eight_millimetres():
+    settings = Settings.model_validate(
+        {"servos": {"backend": "none"}, "simulation": {"compression_speed": 0.01}}
+    )
+    hand = SimulatedHand(settings, table=PAPER)
+    deepest = np.full(2, -1.0)
+    both = 0
+    for _ in range(4 * 1900):
+        run(hand, 0.001)
+        deepest = np.maximum(deepest, hand.d)
+        both += int((hand.d > 0).all())
+    np.testing.assert_allclose(deepest, 0.008, atol=2e-5)
+    np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
+    assert both == 0
+    # F = πE d²/cos θ at each instant.
+    run(hand, 1.7)
+    d = hand.d[0]
+    assert d > 0.004
+    assert hand.force[0] == pytest.approx(math.pi * MODULUS * d * d / math.cos(hand.theta[0]))
+
+
+def test_without_servos_and_script_the_joints_stay():
+    settings = Settings.model_validate(
+        {"servos": {"backend": "none"}, "simulation": {"compression_speed": 0.0}}
+    )
+    hand = SimulatedHand(settings, table=PAPER)
+    hand.push(0.5, 0.0)
+    run(hand, 1.0)
+    np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
+    # Friction's rest is viscous, so that it creeps to where the tip bears the whole push.
+    assert hand.force[1] == pytest.approx(0.5, rel=0.1)
+
+
+def test_tips_roll_over_the_ends_of_the_object():
+    hand = make(object_height=0.02)
+    geometry = HandGeometry()
+    tip = geometry.tips((0.15, 0.15))[0]
+    for height in np.linspace(0.05, 0.11, 25):
+        place(hand, (0.15, 0.15), (0.0, height, 0.0))
+        # The rectangle's point nearest to the tip's centre.
+        point = np.array([-0.02, np.clip(tip[1], height - 0.01, height + 0.01)])
+        way = point - tip
+        distance = np.hypot(*way)
+        assert hand.d[0] == pytest.approx(0.020 - distance, abs=1e-15)
+        angle = math.atan2(way[1], way[0]) + 0.15
+        assert hand.theta[0] == pytest.approx(angle, abs=1e-12)
+        assert (hand.force[0] > 0) == (distance < 0.020)
+
+
+def test_object_turned_by_a_right_angle_is_touched_on_its_other_faces():
+    hand = make()
+    place(hand, (0.05, 0.05), (0.0, 0.08, 0.5 * math.pi))
+    geometry = HandGeometry()
+    expected = geometry.contacts((0.05, 0.05), (0.0, 0.08, 0.0), 0.060)
+    np.testing.assert_allclose(hand.d, expected.d, atol=1e-12)
+    np.testing.assert_allclose(hand.theta, expected.theta, atol=1e-12)
+
+
+# Time.
+
+
+def test_advance_is_idempotent_and_split_ways_are_bit_identical():
+    hands = [make(TABLE_I) for _ in range(3)]
+    for hand in hands:
+        for joint in range(2):
+            hand.drive(joint, BOUNDED, True, 0.6, 0.4)
+    hands[0].advance(1.0)
+    for k in range(1, 501):
+        hands[1].advance(k * 0.002)
+        hands[1].advance(k * 0.002 - 0.001)
+    generator = np.random.default_rng(1)
+    for t in np.sort(generator.uniform(0, 1, 300)):
+        hands[2].advance(float(t))
+    hands[2].advance(1.0)
+    before = hands[0].memory.copy()
+    hands[0].advance(0.5)
+    np.testing.assert_array_equal(hands[0].memory[: layout.STATE], before[: layout.STATE])
+    for hand in hands:
+        assert hand.t == pytest.approx(1.0)
+        np.testing.assert_array_equal(hand.memory[: layout.STATE], before[: layout.STATE])
+
+
+def test_samples_stand_at_the_frames_instants_between_sub_steps():
+    settings = Settings.model_validate({"tactile": {"rate": 130.0}})
+    hand = SimulatedHand(settings, start=5.0, table=PAPER)
+    finer = SimulatedHand(settings, start=5.0, table=PAPER, step=1.0 / 130.0 / 64)
+    for h in (hand, finer):
+        for joint in range(2):
+            h.drive(joint, BOUNDED, True, 0.6, 0.4)
+        h.advance(5.15)
+    assert hand.samples == finer.samples == 20
+    for number in range(hand.samples - 5, hand.samples):
+        row, exact = hand.sample(number), finer.sample(number)
+        assert row[layout.SAMPLE_T] == number / 130.0
+        # A tick's motion is 1e-4 rad and 4e-6 m: a sample that isn't interpolated is off by that.
+        np.testing.assert_allclose(row[2:4], exact[2:4], atol=8e-7)
+        np.testing.assert_allclose(row[4:6], exact[4:6], atol=1e-5)
+    with pytest.raises(LookupError):
+        hand.sample(hand.samples)
+    with pytest.raises(LookupError):
+        hand.sample(0)
+
+
+def test_sub_step_divides_the_millisecond_and_shrinks_with_stiffness():
+    steps = [make(object_mass=mass).step for mass in (10.0, 0.1, 0.01, 1e-4)]
+    for step in steps:
+        assert 1e-3 / step == pytest.approx(round(1e-3 / step), abs=1e-9)
+    assert steps[0] == steps[1] == 0.25e-3
+    assert steps[1] > steps[2] > steps[3] == 0.05e-3
+    assert make(object_mass=0.01, modulus_scale=4.0).step < steps[2]
+
+
+def test_unknown_servo_is_a_settings_error():
+    with pytest.raises(SettingsError, match=r"servos\.model"):
+        SimulatedHand(Settings.model_validate({"servos": {"model": "XM999"}}), table=PAPER)

@@ -1,0 +1,331 @@
+"""The whole pipeline on the virtual clock: what the hand does when it is commanded."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.commands import Refused
+from daemon.messages import Parts, pack, state_message
+from daemon.records import Frame
+from daemon.settings import Settings
+from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
+
+
+def test_starts_disarmed_with_torque_off_and_does_not_move(make: Make) -> None:
+    daemon = make()
+    state = daemon.loop.state
+    before = list(state.reading.q)
+    daemon.loop.advance(1.0)
+    assert (state.mode, state.torque, state.fault) == ("disarmed", False, "")
+    assert daemon.hand is not None
+    assert not torque_of(daemon).any()
+    assert state.reading.q == pytest.approx(before, abs=1e-3)
+
+
+def test_arming_does_not_move_the_hand(make: Make) -> None:
+    daemon = make()
+    before = list(daemon.loop.state.reading.q)
+    command(daemon, "arm")
+    daemon.loop.advance(1.0)
+    assert daemon.loop.state.torque
+    assert daemon.loop.state.reading.q == pytest.approx(before, abs=0.005)
+
+
+@pytest.mark.parametrize("profile", [{}, {"material": {"law": "constant"}}])
+def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(
+    make: Make, profile: dict[str, Any]
+) -> None:
+    daemon = grasped(make(**profile), 10.0)
+    state = daemon.loop.state
+    assert daemon.hand is not None
+    for _ in range(100):
+        daemon.loop.advance(0.1)
+        assert (state.mode, state.fault) == ("holding", "")
+        for finger, contact in enumerate(state.contacts):
+            assert daemon.hand.force[finger] == pytest.approx(10.0, rel=0.02)
+            assert contact.force == pytest.approx(daemon.hand.force[finger], rel=0.03)
+
+
+def test_rotate_turns_the_object_to_the_angle_and_keeps_the_grip(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    assert daemon.hand is not None
+    for angle in (0.14, -0.14, 0.0):
+        command(daemon, "rotate", angle=angle)
+        advance_to(daemon, "holding", 5.0)
+        daemon.loop.advance(1.0)
+        assert daemon.loop.state.object.angle == pytest.approx(angle, abs=math.radians(0.2))
+        assert daemon.hand.object_pose[2] == pytest.approx(angle, abs=math.radians(0.2))
+        assert all(c.force == pytest.approx(8.0, rel=0.1) for c in daemon.loop.state.contacts)
+    assert daemon.loop.state.object.width == pytest.approx(0.040, abs=1e-4)
+
+
+def test_release_opens_the_hand_and_lets_go(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    command(daemon, "release")
+    advance_to(daemon, "armed", 3.0)
+    state = daemon.loop.state
+    assert not any(contact.contact for contact in state.contacts)
+    assert state.reading.q == pytest.approx([0.0, 0.0], abs=0.04)
+    assert all(contact.force == 0.0 for contact in state.contacts)
+
+
+def test_move_goes_where_it_is_told_within_the_limits(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.2, right=-0.3)
+    advance_to(daemon, "armed", 3.0)
+    assert daemon.loop.state.reading.q == pytest.approx([-0.2, -0.3], abs=0.04)
+    with pytest.raises(Refused, match=r"move: left: found 5 rad, expected -0\.5 to 1"):
+        command(daemon, "move", left=5.0)
+
+
+def test_stop_turns_torque_off_at_the_same_tick(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    command(daemon, "stop")
+    daemon.loop.advance(daemon.loop.period)
+    assert (daemon.loop.state.mode, daemon.loop.state.torque) == ("disarmed", False)
+    assert daemon.hand is not None
+    assert not torque_of(daemon).any()
+    daemon.loop.advance(0.2)
+    assert abs(daemon.hand.current).max() < 1e-3
+
+
+def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:
+    # The fingers end before their tips meet.
+    daemon = make(simulation={"object_shape": "none"}, hand={"q_max": (0.3, 0.3)})
+    events: list[tuple[str, str, str]] = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    command(daemon, "arm")
+    command(daemon, "grasp", force=5.0)
+    advance_to(daemon, "armed", 10.0)
+    assert any(kind == "grasp" for _, kind, _ in events)
+
+
+def test_too_much_force_latches_a_fault_that_waits_for_clear(make: Make) -> None:
+    daemon = make(safety={"force_max": 6.0}, control={"contact_force": 0.2})
+    command(daemon, "arm")
+    command(daemon, "grasp", force=5.0)
+    advance_to(daemon, "holding", 3.0)
+    assert daemon.hand is not None
+    # Something squeezes the fingers together, harder than the limit allows.
+    daemon.loop._control._grip.retarget(9.0)
+    advance_to(daemon, "fault", 3.0)
+    state = daemon.loop.state
+    assert "above 6 N" in state.fault
+    assert not state.torque
+    with pytest.raises(Refused, match="clear the fault first"):
+        command(daemon, "arm")
+    daemon.loop.advance(1.0)
+    command(daemon, "clear")
+    daemon.loop.advance(0.1)
+    assert (state.mode, state.fault) == ("disarmed", "")
+    command(daemon, "arm")
+
+
+def test_frames_that_stop_coming_latch_a_fault(make: Make) -> None:
+    daemon = grasped(make(), 5.0)
+    perception = daemon.loop.perceptions[1]
+    frozen = perception.frame
+
+    class Silent:
+        def latest(self) -> Any:
+            return frozen
+
+        def close(self) -> None: ...
+
+    perception.sensor = Silent()  # type: ignore[assignment]
+    goal = None
+    finish = daemon.clock.now() + 0.5
+    while daemon.loop.state.mode != "fault":
+        assert daemon.clock.now() < finish
+        daemon.loop.advance(daemon.loop.period)
+        if daemon.clock.now() - perception.frame.t_arrival > 4.5 * 0.01:  # type: ignore[union-attr]
+            held = list(daemon.loop.state.goal.current)
+            goal = held if goal is None else goal
+            # The grip damps its joints on: that is less than a count of current.
+            assert held == pytest.approx(goal, abs=2.5e-3), "goals moved on without frames"
+    assert goal is not None
+    assert daemon.loop.state.fault.startswith("tactile: no frame for 0.1")
+    assert not daemon.loop.state.torque
+
+
+@pytest.mark.parametrize("rate", [25.0, 100.0])
+def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(
+    make: Make, rate: float
+) -> None:
+    daemon = grasped(make(tactile={"rate": rate}), 8.0)
+    command(daemon, "rotate", angle=0.26)
+    daemon.loop.advance(0.1)
+    assert daemon.hand is not None
+    for perception in daemon.loop.perceptions:
+        last = perception.sensor.latest()
+        perception.sensor.latest = lambda last=last: last  # type: ignore[method-assign]
+    until_held = (daemon.settings.safety.frame_age_hold + 1.0) / rate
+    daemon.loop.advance(until_held)
+    assert daemon.loop._safety.limited["tactile.late"]
+    begun = daemon.hand.object_pose[2]
+    daemon.loop.advance(1.0)
+    assert daemon.loop.state.fault_name == "tactile.silent", "and no tip went past its limits"
+    turned = daemon.hand.object_pose[2]
+    assert turned < 0.26 + 0.01
+    assert turned - begun < 0.1
+
+
+def blinded(daemon: Daemon, counts: int) -> None:
+    """From now on all cells of both sensors read ``counts``."""
+    for perception in daemon.loop.perceptions:
+        really = perception.sensor.latest
+
+        def latest(really: Callable[[], Frame | None] = really) -> Frame | None:
+            frame = really()
+            if frame is not None:
+                frame.data[:] = counts
+            return frame
+
+        perception.sensor.latest = latest  # type: ignore[method-assign]
+
+
+def test_saturated_sensors_latch_a_fault_and_drive_nothing(make: Make) -> None:
+    daemon = grasped(make(tactile={"full_count": 30_000}), 8.0)
+    before = list(daemon.loop.state.goal.current)
+    blinded(daemon, 30_000)
+    advance_to(daemon, "fault", 0.3)
+    assert daemon.loop.state.fault.startswith("tactile: no sound estimate for")
+    assert daemon.loop.state.goal.current == pytest.approx(before, rel=0.2)
+    with pytest.raises(Refused, match="clear: tactile: no sound estimate"):
+        command(daemon, "clear")
+
+
+def test_blind_sensors_end_the_grip_without_pressing_harder(make: Make) -> None:
+    daemon = grasped(make(), 5.0)
+    assert daemon.hand is not None
+    blinded(daemon, 0)
+    advance_to(daemon, "armed", 0.5)
+    daemon.loop.advance(1.0)
+    assert daemon.hand.force.max() < 5.5
+
+
+def test_tare_is_refused_while_something_touches(make: Make) -> None:
+    daemon = grasped(make(), 5.0)
+    command(daemon, "release")
+    advance_to(daemon, "armed", 3.0)
+    command(daemon, "tare")
+    with pytest.raises(Refused, match="grasp: tare is still at work"):
+        command(daemon, "grasp")
+    daemon.loop.advance(0.3)
+    command(daemon, "grasp", force=5.0)
+    advance_to(daemon, "holding", 3.0)
+    command(daemon, "disarm")
+    daemon.loop.advance(0.02)
+    with pytest.raises(Refused, match="tare: something touches a tip"):
+        command(daemon, "tare")
+
+
+def test_the_state_tells_what_the_grip_goes_to(make: Make) -> None:
+    daemon = make()
+    goal = daemon.loop.state.goal
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert math.isnan(goal.force)
+    command(daemon, "grasp", force=8.0)
+    daemon.loop.advance(0.01)
+    assert goal.force == 8.0
+    assert math.isnan(goal.angle)
+    advance_to(daemon, "holding", 5.0)
+    command(daemon, "rotate", angle=0.1)
+    daemon.loop.advance(0.01)
+    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
+    assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
+    # More than was asked for, since a load would make the tips slip.
+    assert daemon.hand is not None
+    for k in range(1, 101):
+        daemon.hand.push(0.0, 0.12 * k, 0.0)
+        daemon.loop.advance(0.02)
+    assert 9.0 < goal.force <= 18.0
+    daemon.loop.advance(1.0)
+    felt = [contact.force for contact in daemon.loop.state.contacts]
+    assert sum(felt) / 2.0 == pytest.approx(goal.force, rel=0.03)
+    command(daemon, "release")
+    daemon.loop.advance(0.01)
+    assert math.isnan(goal.force)
+    assert math.isnan(goal.angle)
+
+
+def test_an_angle_beyond_the_grip_is_refused(make: Make) -> None:
+    daemon = grasped(make(), 8.0)
+    with pytest.raises(Refused, match=r"found 0\.6 rad, expected -0\.\d\d to 0\.\d\d in this grip"):
+        command(daemon, "rotate", angle=0.6)
+    found = re.search(r"to (0\.\d+)", refusal(daemon, "rotate", angle=2.0))
+    assert found is not None
+    command(daemon, "rotate", angle=0.95 * float(found[1]))
+    daemon.loop.advance(4.0)
+    assert daemon.loop.state.fault == ""
+
+
+def run_recorded(make: Make, seed: int) -> list[bytes]:
+    daemon = make(simulation={"seed": seed})
+    recorded = []
+    script = {
+        10: ("arm", {}),
+        30: ("grasp", {"force": 7.0}),
+        900: ("rotate", {"angle": 0.1}),
+        1500: ("release", {}),
+    }
+    for tick in range(2000):
+        if tick in script:
+            name, numbers = script[tick]
+            command(daemon, name, **numbers)
+        daemon.loop.advance(daemon.loop.period)
+        recorded.append(pack(state_message(daemon.loop.state, Parts.of(daemon.settings))))
+    return recorded
+
+
+def test_two_runs_with_one_seed_are_the_same_to_the_bit(make: Make) -> None:
+    assert run_recorded(make, 3) == run_recorded(make, 3)
+    assert run_recorded(make, 3)[1500:] != run_recorded(make, 4)[1500:]
+
+
+def test_tare_removes_a_standing_offset(make: Make) -> None:
+    daemon = make()
+    for perception in daemon.loop.perceptions:
+        really = perception.sensor.latest
+
+        def latest(
+            really: Callable[[], Frame | None] = really,
+            seen: set[int] = set(),  # noqa: B006
+        ) -> Frame | None:
+            frame = really()
+            if frame is not None and frame.seq not in seen:
+                seen.add(frame.seq)
+                frame.data += 300  # 1.2 kPa everywhere
+            return frame
+
+        perception.sensor.latest = latest  # type: ignore[method-assign]
+    command(daemon, "tare")
+    daemon.loop.advance(0.5)
+    grasped(daemon, 6.0)
+    daemon.loop.advance(1.0)
+    assert daemon.hand is not None
+    assert daemon.loop.state.contacts[0].force == pytest.approx(daemon.hand.force[0], rel=0.05)
+
+
+def test_a_tare_of_full_sensors_leaves_the_zero_and_is_told() -> None:
+    events = []
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
+    with Daemon(settings, wire=False, on_event=lambda *event: events.append(event)) as daemon:
+        daemon.loop.advance(0.3)
+        perception = daemon.loop.perceptions[1]
+        before = perception._estimator.saturation
+        blinded(daemon, settings.tactile.full_count)
+        command(daemon, "tare")
+        daemon.loop.advance(0.5)
+        assert not perception.taring
+        assert perception._estimator.saturation == before
+    text = "right sensor's zero stays: most cells are full where nothing presses"
+    assert events.count(("warning", "tare", text)) == 1

@@ -1,0 +1,325 @@
+"""The page as text, without a terminal: sizes, hostile streams, states, keys."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.cells import cell_len
+from rich.segment import Segment
+
+from tests.harness import fake_daemon
+from tools.feed import HISTORY_STEP, Feed
+from tools.feed_sockets import Reply
+from tools.monitor_page import Page
+from tools.terminal import Keys
+
+
+def fed(now: float = 0.0) -> Feed:
+    feed = Feed()
+    for k in range(50):
+        give(feed, b"hand/state", fake_daemon.state(0.02 * k, k) | {"mono_ns": 20_000_000 * k}, now)
+    for side in (0, 1):
+        give(feed, b"hand/tactile", fake_daemon.frame(1.0, side), now)
+    return feed
+
+
+def give(feed: Feed, topic: bytes, record: object, now: float = 0.0) -> None:
+    feed.take([topic, msgpack.packb(record)], now)
+
+
+def shown(feed: Feed, now: float = 0.0, width: int = 80, height: int = 24, **more: Any) -> str:
+    reply = more.pop("reply", None)
+    lines = Page(feed, "tcp://127.0.0.1:9872", **more).lines(width, height, now, reply)
+    return check(lines, width, height)
+
+
+def check(lines: Sequence[Sequence[Segment]], width: int, height: int) -> str:
+    texts = ["".join(segment.text for segment in line) for line in lines]
+    assert [cell_len(text) for text in texts] == [width] * height
+    assert all(text.isprintable() for text in texts)
+    return "\n".join(texts)
+
+
+@pytest.mark.parametrize("size", [(80, 24), (81, 25), (100, 30), (120, 40), (200, 24), (80, 90)])
+def test_fills_the_terminal_exactly(size: tuple[int, int]) -> None:
+    text = shown(fed(), width=size[0], height=size[1])
+    for part in ("HOLDING", "LEFT contact", "RIGHT", "joint", "overruns", "events", "q quit"):
+        assert part in text
+
+
+def test_maps_grow_with_the_terminal() -> None:
+    pixels = [shown(fed(), width=w, height=h).count("▀") for w, h in ((80, 24), (120, 40))]
+    assert pixels[1] > 3 * pixels[0]
+
+
+@pytest.mark.parametrize("size", [(79, 24), (80, 23), (30, 8), (1, 1), (12, 3)])
+def test_too_small_says_so(size: tuple[int, int]) -> None:
+    text = shown(fed(), width=size[0], height=size[1])
+    assert size[0] < 30 or f"this is {size[0]} × {size[1]}" in text
+
+
+def test_units() -> None:
+    text = shown(fed())
+    assert "3.21±0.02  3.31±0.02 mm" in text
+    assert "12.34      12.34      mJ" in text
+    assert "24.06      25.21      °" in text
+    assert "12.0       12.0       ms" in text
+
+
+def test_nothing_known_shows_dashes() -> None:
+    text = shown(Feed())
+    assert "waiting for a daemon" in text
+    assert text.count("—") >= 22
+    assert "nan" not in text
+
+
+def test_a_missing_finger_is_marked() -> None:
+    feed = fed()
+    state = fake_daemon.state(1.0, 100)
+    state["right"]["valid"] = False
+    give(feed, b"hand/state", state)
+    text = shown(feed)
+    assert "right —" in text
+    assert "left —" not in text
+
+
+def test_counts_where_the_scale_is_not_told() -> None:
+    feed = fed()
+    frame = fake_daemon.frame(1.0, 0)
+    del frame["scale"]
+    give(feed, b"hand/tactile", frame)
+    assert "counts" in shown(feed)
+    assert "kPa" not in shown(feed)
+
+
+def test_numbers_of_any_size_keep_the_columns() -> None:
+    feed = fed()
+    for value in (1e12, -1e12, 123456.0, -99.99, 1e-30, math.inf, math.nan):
+        state = fake_daemon.state(1.0, 200)
+        for name in ("left", "right"):
+            state[name] = {
+                key: value if isinstance(old, float) else old for key, old in state[name].items()
+            }
+        state |= {"tick_s": value, "compute_s": value, "overruns": value}
+        state["object"] = {"valid": True, "angle": value, "width": value}
+        give(feed, b"hand/state", state)
+        lines = shown(feed).splitlines()
+        assert any(line[23:].startswith("force   ") and line[54:56] == "N " for line in lines)
+
+
+def test_long_and_wide_texts_are_cut() -> None:
+    feed = fed()
+    give(feed, b"hand/event", fake_daemon.event(1, "kind" * 9, "手指 force ÷ " * 40, "error"))
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"fault": "過 " * 90, "mode": "m" * 99})
+    text = shown(feed, reply=Reply(0.0, False, "grasp: " + "長い " * 60))
+    assert "…" in text
+    assert "✗ grasp" in text
+    assert "c clears it" in text
+
+
+def test_status_follows_the_age() -> None:
+    feed = fed()
+    assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
+    slow = Feed()
+    for k in range(100):  # one state a second: a pause of 2 s is no loss
+        give(slow, b"hand/state", fake_daemon.state(k, k) | {"mono_ns": k * 10**9}, float(k))
+    assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
+
+
+def test_statistics_of_the_last_second() -> None:
+    feed = Feed()
+    for k in range(300):
+        late = 900e-6 if k == 250 else 3e-6 if k >= 150 else 1.0
+        state = fake_daemon.state(0.01 * k, k) | {"wake_late_s": late, "tick_s": 1.0 / 400.0}
+        give(feed, b"hand/state", state, 0.01 * k)
+    tick = feed.statistics(2.995)
+    assert tick.rate == pytest.approx(400.0)
+    assert tick.messages == pytest.approx(100.0, abs=1.0)
+    assert (tick.late, tick.late_max) == (3e-6, 900e-6)
+
+
+def test_a_new_daemon_begins_a_new_story() -> None:
+    feed = Feed()
+    for k in range(10):
+        give(feed, b"hand/state", fake_daemon.state(0.0, 1000 + k), 1.1 * HISTORY_STEP * k)
+    assert len(feed.history) == 9
+    give(feed, b"hand/state", fake_daemon.state(0.0, 1), 3.0)
+    assert not feed.history
+    assert feed.statistics(3.0).messages == 1.0
+
+
+STATS = {
+    "schema": 1,
+    **{part: {"p50": 12e-6, "p99": 34e-6, "p999": 40e-6, "max": 561e-6} for part in
+       ("wake", "compute", "bus", "publish")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6, math.inf])
+def test_quantiles_of_all_ticks_fit_beside_each_other(factor: float) -> None:
+    feed = fed()
+    slow = {
+        part: {share: factor * value for share, value in times.items()}
+        for part, times in STATS.items()
+        if isinstance(times, dict)
+    }
+    give(feed, b"hand/stats", STATS | slow)
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"overruns": 123456})
+    (line,) = [each for each in shown(feed).splitlines() if " tick " in each]
+    assert "overruns 123456" in line
+    if factor < 1e5:
+        assert {1.0: "late 12/34/561 µs", 1e3: "compute 12ms/34ms/561ms  late"}[factor] in line
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"overruns": 7})
+    if factor == 1.0:
+        assert "  p50/p99/max  compute 12/34/561  late 12/34/561 µs" in shown(feed)
+        assert "compute 12 µs p99 34 max 561  late 12 µs p99 34 max" in shown(feed, width=90)
+
+
+def test_temperature_of_a_servo() -> None:
+    feed = fed()
+    state = fake_daemon.state(1.0, 99)
+    state["left"]["temperature"], state["right"]["temperature"] = 0.0, 71.5
+    give(feed, b"hand/state", state)
+    (line,) = [each for each in shown(feed).splitlines() if "servo" in each]
+    assert line.split()[line.split().index("servo") :][:4] == ["servo", "—", "71.5", "°C"]
+    warned = json.dumps({"safety": {"temperature_warn": 70.0}, "commands": {"lease": 5.0}})
+
+    def style_of_the_hot_one() -> object:
+        lines = Page(feed, "").lines(80, 24, 0.0, None)
+        return next(part.style for each in lines for part in each if "71.5" in part.text)
+
+    before = style_of_the_hot_one()
+    give(feed, b"hand/settings", {"settings": warned})
+    assert style_of_the_hot_one() != before
+
+
+def told(seq: int, when: float, text: str, again: bool = False) -> dict[str, Any]:
+    return fake_daemon.event(seq, "mode", text) | {"timestamp": when, "again": again}
+
+
+TEXTS = ["first", "second", "third"]
+
+
+def test_events_told_again_are_shown_once_and_in_their_order() -> None:
+    feed = Feed()
+    give(feed, b"hand/event", told(3, 103.0, "third"))  # between subscription and telling again
+    for seq in (1, 2, 3):
+        give(
+            feed, b"hand/event", told(seq, 100.0 + seq, ("first", "second", "third")[seq - 1], True)
+        )
+    assert [event.text for event in feed.events] == TEXTS
+    assert [event.text for event in feed.news()] == ["third", "first", "second"]
+    assert feed.news() == []
+    for seq in (1, 2):  # a daemon that was started anew counts from 1 again
+        give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
+        give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
+    assert [event.text for event in feed.events][3:] == ["anew 1", "anew 2"]
+
+
+def test_who_commands_is_told_while_the_lease_lasts() -> None:
+    feed = fed()
+    give(feed, b"hand/settings", {"settings": json.dumps({"commands": {"lease": 5.0}})})
+    carried_out = {"command": "grasp", "client": "note\x1bbook", "ok": True, "error": ""}
+    give(feed, b"hand/command", carried_out, 0.0)
+    assert "note book commands the hand" in shown(feed, 4.9)
+    assert "commands the hand" not in shown(feed, 5.1)
+    give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)  # needs none, takes none
+    assert "commands the hand" not in shown(feed, 6.1)
+    give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
+    assert "commands the hand" not in shown(feed, 7.1)  # that may be this page itself
+    refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
+    give(feed, b"hand/command", refused, 8.0)
+    assert "refused   grasp: arm first (to note book)" in shown(feed, 8.0)
+
+
+@pytest.mark.parametrize("keys", [True, False])
+def test_long_reasons_are_shown_in_full_at_the_least_size(keys: bool) -> None:
+    feed = fed()
+    fault = "left: no sound tactile frame for 0.31 s while gripping, more than 0.3 s: torque is off"
+    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"mode": "fault", "fault": fault})
+    why = "clear: left: no sound tactile frame for 12.42 s while gripping, more than 0.3 s allowed"
+    text = shown(feed, reply=Reply(0.0, False, why), keys=keys)
+    flat = " ".join(text.split())
+    assert fault in flat
+    assert ("c clears it" if keys else "softfinger send clear") in flat
+    assert f"✗ {why[:60]}" in flat
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+FIELDS = ["schema", "seq", "mode", "fault", "tick_s", "left", "right", "object", "level", "text"]
+FIELDS += ["timestamp", "mono_ns", "finger", "rows", "cols", "scale", "data", "kind"]
+FIELDS += ["settings", "command", "client", "ok", "error", "again", "wake", "compute"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(
+                [
+                    *(b"hand/state", b"hand/tactile", b"hand/event", b"else"),
+                    *(b"hand/stats", b"hand/command", b"hand/settings"),
+                ]
+            ),
+            st.dictionaries(st.sampled_from(FIELDS), VALUES, max_size=8) | VALUES,
+        ),
+        max_size=4,
+    ),
+    st.lists(st.lists(st.binary(max_size=20), max_size=4), max_size=3),
+)
+def test_no_stream_breaks_the_page(
+    records: list[tuple[bytes, object]], garbage: list[list[bytes]]
+) -> None:
+    feed = Feed()
+    for topic, record in records:
+        give(feed, topic, record)
+    for message in garbage:
+        feed.take(message, 0.0)
+    shown(feed)
+    give(feed, b"hand/state", fake_daemon.state(1.0, 2**63))
+    assert "HOLDING" in shown(feed)
+
+
+def test_a_frame_that_lies_about_its_size_is_skipped() -> None:
+    feed = Feed()
+    good = fake_daemon.frame(0.0, 0, size=8)
+    for change in ({"rows": 9}, {"cols": -8, "rows": -8}, {"rows": True}, {"finger": "thumb"}):
+        give(feed, b"hand/tactile", good | change)
+    assert (feed.skipped, feed.frames) == (4, {})
+    give(feed, b"hand/tactile", good)
+    assert feed.frames["left"].grid().shape == (8, 8)
+
+
+def test_keys() -> None:
+    keys = Keys()
+    assert keys.decode(b"ag \x1b[C\x1bOD\x1b[A\x1b[1;5Cq\xc3\xa9\x07") == [
+        *("a", "g", " "),
+        *("right", "left", "q"),
+    ]
+    assert keys.decode(b"\x1b") == []
+    assert keys.decode(b"[") == []
+    assert keys.decode(b"D") == ["left"]  # a sequence in three reads
+    keys.decode(b"\x1b")
+    keys.settle()
+    assert keys.decode(b"g") == ["g"]  # a lone Escape has nothing to do with the next key
+    assert keys.decode(b"a\x1b[200~go") == ["a"]
+    assert keys.decode(b"go\x1b[20") == []
+    assert keys.decode(b"1~q") == ["q"]

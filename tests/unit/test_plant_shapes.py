@@ -1,0 +1,385 @@
+"""The simulated object's shapes, tips on each other, and the palm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daemon.clock import VirtualClock
+from daemon.settings import Settings, Simulation
+from daemon.simulation import layout
+from daemon.simulation.hand import SimulatedHand
+from daemon.simulation.shapes import shape_of
+from daemon.tactile.simulated import SimulatedTactile
+from kinematics.fingers import HandGeometry
+from tests.harness.plant import (
+    BOUNDED,
+    CONSTANT,
+    LOSSLESS,
+    MODULUS,
+    PAPER,
+    TABLE_I,
+    make,
+    place,
+    run,
+    settled,
+)
+
+RADIUS = 0.020
+GRAVITY = 9.80665
+HAND = HandGeometry()
+
+
+def shape(**simulation):
+    return shape_of(Simulation(**simulation))
+
+
+# Shapes.
+
+
+def test_gyration_and_lever_of_the_shapes():
+    square = shape(object_width=0.04, object_height=0.04)
+    assert square.gyration == pytest.approx(0.04 / math.sqrt(6))
+    # (√2 + asinh 1)/6 of the side.
+    assert square.lever == pytest.approx(0.04 * (math.sqrt(2) + math.asinh(1)) / 6, rel=1e-4)
+    disc = shape(object_shape="disc", object_radius=0.03)
+    assert (disc.gyration, disc.lever) == pytest.approx((0.03 / math.sqrt(2), 0.02))
+    flat = shape(object_shape="wedge", object_taper=0.0)
+    np.testing.assert_allclose(flat.corners, shape().corners)
+    assert flat.gyration == pytest.approx(shape().gyration)
+
+
+def test_a_wedge_stands_about_its_centre_of_mass():
+    wedge = shape(object_shape="wedge", object_taper=0.6)
+    # Faces narrow away from the palm, 0.6 rad apart, and are 40 mm apart at half the height.
+    normals = wedge.edges()[:, layout.EDGE_NORMAL_X : layout.EDGE_NORMAL_Y + 1]
+    assert math.acos(-normals[1] @ normals[3]) == pytest.approx(0.6)
+    np.testing.assert_allclose(normals[1], [math.cos(0.3), math.sin(0.3)])
+    sides = wedge.corners[[0, 3]].mean(axis=0), wedge.corners[[1, 2]].mean(axis=0)
+    assert sides[1][0] - sides[0][0] == pytest.approx(0.04)
+    # Points drawn in its bounding box, those inside kept.
+    generator = np.random.default_rng(1)
+    low, high = wedge.corners.min(axis=0), wedge.corners.max(axis=0)
+    points = generator.uniform(low, high, (400_000, 2))
+    for edge in wedge.edges():
+        points = points[(points - edge[:2]) @ edge[2:4] < 0]
+    np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-4)
+    distances = np.hypot(*points.T)
+    assert wedge.lever == pytest.approx(distances.mean(), rel=3e-3)
+    assert wedge.gyration == pytest.approx(math.sqrt((distances**2).mean()), rel=3e-3)
+    assert wedge.half_width == pytest.approx(0.02 - sides[0][1] * -math.tan(0.3), rel=1e-9)
+
+
+def nearest_by_brute_force(corners, point):
+    """Nearest of many points of the outline."""
+    share = np.linspace(0, 1, 20_001)[:, None]
+    ends = np.roll(corners, -1, axis=0)
+    outline = np.concatenate(
+        [(1 - share) * p + share * q for p, q in zip(corners, ends, strict=True)]
+    )
+    away = outline - point
+    return away[np.hypot(*away.T).argmin()]
+
+
+def test_tips_touch_the_nearest_point_of_a_wedge():
+    hand = make(object_shape="wedge", object_taper=0.5, object_height=0.03)
+    corners = shape(object_shape="wedge", object_taper=0.5, object_height=0.03).corners
+    kinds = set()
+    for height in np.linspace(0.04, 0.12, 33):
+        for angle in (-0.4, 0.0, 0.7, 2.5):
+            place(hand, (0.15, 0.10), (0.0, height, angle))
+            tip = HAND.tips((0.15, 0.10))[0] - [0.0, height]
+            c, s = math.cos(angle), math.sin(angle)
+            way = nearest_by_brute_force(corners, np.array([[c, s], [-s, c]]) @ tip)
+            way = np.array([[c, -s], [s, c]]) @ way
+            assert hand.d[0] == pytest.approx(RADIUS - np.hypot(*way), abs=1e-8)
+            theta = math.remainder(math.atan2(way[1], way[0]) + 0.15 - hand.theta[0], math.tau)
+            assert theta == pytest.approx(0, abs=1e-3)
+            kinds.add(min(np.hypot(*(tip - way_)) for way_ in corners) < 0.02)
+    assert kinds == {True, False}
+
+
+def test_a_disc_is_touched_towards_its_centre():
+    hand = make(object_shape="disc", object_radius=0.025)
+    for height in np.linspace(0.06, 0.10, 9):
+        place(hand, (0.1, 0.12), (0.002, height, 1.0))
+        away = np.array([0.002, height]) - HAND.tips((0.1, 0.12))[0]
+        assert hand.d[0] == pytest.approx(RADIUS + 0.025 - np.hypot(*away), abs=1e-15)
+        assert hand.theta[0] == pytest.approx(math.atan2(away[1], away[0]) + 0.1, abs=1e-14)
+
+
+def springs_on_a_cylinder(d, theta, curved):
+    """Force and energy of the tip's springs under a cylinder's face, over those under a plane."""
+    away = RADIUS - d + curved
+    centre = away * np.array([math.sin(theta), math.cos(theta)])
+    x = np.linspace(-RADIUS, min(RADIUS, centre[0] + curved), 50_001)
+    face = centre[1] - np.sqrt(np.maximum(curved**2 - (x - centre[0]) ** 2, 0.0))
+    inside = np.sqrt(np.maximum(RADIUS**2 - x * x, 0.0)) > face
+    low, high = x[inside][[0, -1]]
+    t, weight = np.polynomial.legendre.leggauss(120)
+    t, weight = 0.5 * math.pi * t, 0.5 * math.pi * weight
+    x = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(t)
+    weight = weight * 0.5 * (high - low) * np.cos(t)
+    q = centre[1] - np.sqrt(curved**2 - (x - centre[0]) ** 2)
+    square = RADIUS**2 - x * x
+    b = np.sqrt(np.maximum(square - q * q, 0.0))
+    angle = np.arctan2(b, q)
+    force = (2 * b - 2 * q * angle) @ weight
+    energy = 0.5 * ((square + 2 * q * q) * angle - 3 * q * b) @ weight
+    c = math.cos(theta)
+    return force / (math.pi * d * d / c), energy / (math.pi * d**3 / (3 * c * c))
+
+
+@pytest.mark.parametrize(
+    ("curved", "upright", "tilted"), [(10.0, 1e-3, 1e-3), (0.04, 0.02, 0.023), (0.02, 0.01, 0.045)]
+)
+def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upright, tilted):
+    share = make(object_shape="disc", object_radius=curved).memory[layout.SHARE]
+    for d in (0.001, 0.004, 0.008):
+        assert springs_on_a_cylinder(d, 0.0, curved) == pytest.approx((share,) * 2, rel=upright)
+        assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
+            (share,) * 2, rel=tilted
+        )
+    # To leading order it is exact.
+    assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
+
+
+def test_what_the_two_contacts_tell_of_a_wedge_and_a_disc():
+    for taper in (0.2, -0.3):
+        hand = make(object_shape="wedge", object_taper=taper)
+        place(hand, (0.2, 0.17), (0.001, 0.08, 0.05))
+        angle, width, disagreement = HAND.object_from_contacts(hand.q, hand.d, hand.theta)
+        assert angle == pytest.approx(0.05, abs=1e-12)  # the bisector of the faces
+        assert disagreement == pytest.approx(-taper, abs=1e-12)  # and the angle between them
+        tips = HAND.tips(hand.q) - hand.object_pose[:2]
+        assert width == pytest.approx(0.040 - taper * tips[:, 1].mean(), abs=1.5e-3)
+    hand = make(object_shape="disc", object_radius=0.02)
+    place(hand, (0.19, 0.19), (0.0, 0.0788, 0.7))
+    angle, width, disagreement = HAND.object_from_contacts(hand.q, hand.d, hand.theta)
+    # A disc has no angle: it is that of the line between the contacts.
+    assert (angle, disagreement) == pytest.approx((0, 0), abs=0.05)
+    assert width == pytest.approx(0.04, abs=1e-4)
+
+
+def test_a_disc_is_grasped_and_rolls_between_the_tips():
+    hand = make(TABLE_I, object_shape="disc", object_radius=0.02)
+    settled(hand, (0.9, 0.9), 0.4)
+    assert hand.force == pytest.approx([hand.force.mean()] * 2, rel=0.05)
+    assert hand.force.min() > 3
+    before = hand.object_pose.copy()
+    # One finger forward, one back: a disc rolls, moved on and turned.
+    torques = np.array([0.5, 0.36])
+    for joint in range(2):
+        hand.drive(joint, BOUNDED, True, 0.9, float(torques[joint]))
+    run(hand, 0.15)
+    moved = hand.object_pose - before
+    assert abs(moved[2]) > 0.02
+    assert moved[0] > 0.001
+
+
+def test_what_a_disc_presses_on_a_sensor_is_its_force():
+    settings = Settings.model_validate(
+        {
+            "simulation": {"object_shape": "disc", "tactile_noise": 0.0},
+            "material": {"law": "constant"},
+        }
+    )
+    clock = VirtualClock()
+    hand = SimulatedHand(settings, table=PAPER)
+    sensor = SimulatedTactile(settings, hand, clock, 0)
+    sensor.open()
+    for joint in range(2):
+        hand.drive(joint, BOUNDED, True, 0.9, 0.4)
+    clock.sleep_until(2.0)
+    frame = sensor.latest()
+    assert frame is not None
+    cell = settings.tactile.pitch**2 * settings.tactile.pascal_per_count
+    assert frame.data.sum() * cell == pytest.approx(hand.force[0], rel=0.01)
+
+
+# Tips on each other.
+
+
+def test_tips_press_each_other_as_each_a_plane_midway():
+    hand = make(object_shape="none", joint_friction=0.0)
+    settled(hand, (0.9, 0.9), 0.5, 4.0)
+    q = float(hand.q[0])
+    assert hand.q[1] == pytest.approx(q, abs=1e-9)
+    assert hand.mutual.tolist() == [1.0, 1.0]
+    # The plane stands at x = 0: each tip as deep as it reaches past it, tilted by its finger.
+    d = RADIUS - (HAND.half_separation - HAND.finger_length * math.sin(q))
+    np.testing.assert_allclose(hand.d, d, atol=1e-12)
+    np.testing.assert_allclose(hand.theta, [q, -q], atol=1e-12)
+    np.testing.assert_allclose(hand.force, math.pi * MODULUS * d * d / math.cos(q), rtol=1e-9)
+    # At rest each joint bears L cos q of ∂U/∂d, its tip's ∂U/∂θ, and what the stuck shears hold.
+    m, row, other = hand.memory, layout.MUTUAL, layout.MUTUAL + layout.TIP_ROW
+    by_d = float(hand.normal[0] + hand.tangential[0] * math.tan(q))
+    by_shear = sum(m[r + layout.ALONG_T] * m[r + layout.JT] for r in (row, other))
+    torque = by_d * HAND.finger_length * math.cos(q) + m[row + layout.ALONG_THETA] + by_shear
+    assert torque == pytest.approx(CONSTANT * 0.5, rel=1e-6)
+
+
+def test_mutual_forces_are_the_gradient_of_both_tips_energy():
+    hand = make(TABLE_I, object_shape="none", tip_friction=500.0)
+    generator = np.random.default_rng(5)
+    step = 1e-7
+
+    def at(q, shears):
+        hand.memory[layout.MUTUAL_SHEAR : layout.MUTUAL_SHEAR + 2] = shears
+        place(hand, q, (0.0, 0.08, 0.0))
+        rows = hand.memory[layout.MUTUAL : layout.MUTUAL + 2 * layout.TIP_ROW]
+        return hand.energy(), hand.memory[layout.FORCES : layout.FORCES + 2].copy(), rows.copy()
+
+    for _ in range(100):
+        q = generator.uniform(0.42, 0.5, 2)
+        shears = generator.uniform(-1e-3, 1e-3, 2)
+        _, forces, rows = at(q, shears)
+        assert hand.d[0] > 0.001
+        move = generator.normal(size=2)
+        rolled = np.array([rows[i * layout.TIP_ROW + layout.JT :][:2] @ move for i in range(2)])
+        high = at(q + step * move, shears + step * rolled)[0]
+        low = at(q - step * move, shears - step * rolled)[0]
+        assert -forces @ move == pytest.approx((high - low) / (2 * step), rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3, 50.0])
+def test_tips_that_collide_keep_energy_and_part_again(friction):
+    hand = make(**{**LOSSLESS, "object_shape": "none", "tip_friction": friction})
+    place(hand, (0.36, 0.33), (0.0, 0.08, 0.0), (1.5, 1.2))
+    start, met = hand.energy(), 0.0
+    while hand.t < 0.3:
+        energy = hand.energy()
+        hand.advance(hand.t + 1.5 * hand.step)
+        assert hand.energy() < energy * (1 + 1e-5)
+        met = max(met, hand.d[0])
+    assert met > 0.002
+    assert hand.d[0] < 0.0
+    assert hand.dq.max() < 0.0
+    if (
+        friction != 0.3
+    ):  # without friction, or without slip, nothing is lost but what the shear held
+        assert hand.energy() == pytest.approx(start, rel=0.05)
+
+
+def test_sensors_feel_the_other_tip():
+    settings = Settings.model_validate(
+        {
+            "simulation": {"object_shape": "none", "tactile_noise": 0.0},
+            "material": {"law": "constant"},
+        }
+    )
+    clock = VirtualClock()
+    hand = SimulatedHand(settings, table=PAPER)
+    sensors = [SimulatedTactile(settings, hand, clock, finger) for finger in range(2)]
+    for sensor in sensors:
+        sensor.open()
+    for joint in range(2):
+        hand.drive(joint, BOUNDED, True, 0.9, 0.3)
+    clock.sleep_until(2.0)
+    cell = settings.tactile.pitch**2 * settings.tactile.pascal_per_count
+    for finger, sensor in enumerate(sensors):
+        frame = sensor.latest()
+        assert frame is not None
+        assert frame.data.sum() * cell == pytest.approx(hand.force[finger], rel=0.01)
+        assert hand.force[finger] > 3
+
+
+def test_an_object_keeps_the_tips_apart_until_it_is_gone():
+    hand = make()
+    settled(hand, (0.9, 0.9), 0.4, 1.0)
+    assert hand.mutual.tolist() == [0.0, 0.0]
+    held = hand.q.copy()
+    place(hand, hand.q, (0.0, 0.4, 0.0))
+    run(hand, 1.0)
+    assert hand.mutual.tolist() == [1.0, 1.0]
+    assert (hand.q > held + 0.1).all()
+
+
+# The palm.
+
+
+@pytest.mark.parametrize("scene", ["rectangle", "disc"])
+def test_an_object_slides_on_the_palm_with_coulomb_friction(scene):
+    friction = 0.2
+    hand = make(
+        object_shape=scene,
+        object_radius=0.03,
+        palm=0.05,
+        palm_friction=friction,
+        gravity=(0.0, -GRAVITY),
+    )
+    sunk = 0.1 * GRAVITY / (1e5 if scene == "disc" else 2e5)
+    place(hand, (-0.5, -0.5), (-0.02, 0.08 - sunk, 0.0), velocity=(0.3, 0.0, 0.0))
+    run(hand, 0.03)
+    spin = 0.0 if scene == "rectangle" else -friction * GRAVITY * 2 / 0.03 * 0.03
+    assert hand.object_velocity[0] == pytest.approx(0.3 - friction * GRAVITY * 0.03, rel=0.02)
+    assert hand.object_velocity[2] == pytest.approx(spin, rel=0.05, abs=0.3)
+    run(hand, 0.17)
+    # The rectangle has come to rest after v²/2μg, the disc rolls at two thirds of the speed.
+    rolling = 0.0 if scene == "rectangle" else 0.3 * 2 / 3
+    assert hand.object_velocity[0] == pytest.approx(rolling, abs=2e-3)
+    assert hand.object_velocity[2] * 0.03 == pytest.approx(-rolling, abs=2e-3)
+    if scene == "rectangle":
+        way = 0.3**2 / (2 * friction * GRAVITY)
+        assert hand.object_pose[0] + 0.02 == pytest.approx(way, rel=0.06)  # it rocks a little
+
+
+def test_an_object_sticks_to_the_palm_below_friction_and_slides_above():
+    for push, slides in ((0.9, False), (1.1, True)):
+        hand = make(palm=0.05, palm_friction=0.5, gravity=(0.0, -GRAVITY), object_height=0.02)
+        place(hand, (-0.5, -0.5), (0.0, 0.06, 0.0))
+        run(hand, 0.3)
+        hand.push(push * 0.5 * 0.1 * GRAVITY, 0.0)
+        run(hand, 0.1)
+        at = hand.object_pose[0]
+        run(hand, 0.15)
+        assert (hand.object_pose[0] - at > 1e-3) == slides
+        if not slides:
+            assert hand.object_pose[0] == pytest.approx(at, abs=1e-9)
+
+
+def test_a_disc_rolls_down_an_incline():
+    slope = 0.2
+    hand = make(
+        object_shape="disc",
+        object_radius=0.03,
+        palm=0.05,
+        palm_friction=0.5,
+        table_friction=0.0,
+        gravity=(GRAVITY * math.sin(slope), -GRAVITY * math.cos(slope)),
+    )
+    place(hand, (-0.5, -0.5), (-0.02, 0.08, 0.0))
+    run(hand, 0.12)
+    speed = hand.object_velocity[0]
+    run(hand, 0.05)
+    assert (hand.object_velocity[0] - speed) / 0.05 == pytest.approx(
+        2 / 3 * GRAVITY * math.sin(slope), rel=0.01
+    )
+    assert hand.object_velocity[0] == pytest.approx(-0.03 * hand.object_velocity[2], rel=0.01)
+
+
+# What goes wrong is told.
+
+
+def test_a_long_wedge_whose_faces_meet_is_refused():
+    from daemon.contradictions import contradictions
+
+    def found(**simulation):
+        settings = Settings.model_validate({"simulation": {"object_shape": "wedge", **simulation}})
+        return contradictions(settings, None, set())
+
+    assert found(object_taper=1.1) == []
+    assert "object_taper" in found(object_taper=1.2)[0]
+    assert "object_taper" in found(object_taper=0.5, object_height=0.3)[0]
+
+
+def test_scenes_pay_only_for_what_they_have():
+    # Neither rows of the palm nor of tips on each other enter the matrix of a grasp.
+    hand = make()
+    settled(hand, (0.9, 0.9), 0.4, 1.0)
+    assert hand.memory[layout.COUPLED] == 0.0
+    assert hand.memory[layout.MUTUAL_NEAR] == 0.0
+    # Where the joints' friction turns over, a step may be cut by some 1e-8 J.
+    assert hand.memory[layout.GUARDED] < 5

@@ -1,0 +1,521 @@
+"""Bounds on goals, the rows of the table one by one, and when they are told or latch."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from daemon.limits import ROWS
+from daemon.modes import Mode
+from daemon.prediction import Held
+from daemon.records import Contact, Frame, Goal, State
+from daemon.safety import Safety
+from daemon.settings import Safety as Limits
+from daemon.settings import Settings
+
+SETTINGS = Settings()
+ROOT = Path(__file__).parents[2]
+
+
+class Sensor:
+    """What the rows see of a sensor."""
+
+    def __init__(self, finger: int) -> None:
+        self.finger = finger
+        self.frame: Frame | None = None
+
+    def give(self, t: float, data: Any) -> None:
+        seq = 1 if self.frame is None else self.frame.seq + 1
+        self.frame = Frame(seq, t, t, True, np.array(data, np.uint16))
+
+
+def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> Safety:
+    return Safety(SETTINGS, has_servos, has_sensors, **parts)
+
+
+def sound(mode: Mode = Mode.HOLDING) -> State:
+    """A state with nothing wrong, at 5 s."""
+    state = State(t=5.0, mode=mode, torque=True, seq=10)
+    state.reading.t = 5.0
+    state.reading.valid = True
+    state.reading.temperature = [40.0, 40.0]
+    state.reading.voltage = [12.0, 12.0]
+    state.contacts = [
+        Contact(
+            seq=1,
+            t=4.99,
+            t_arrival=5.0,
+            t_sound=5.0,
+            valid=True,
+            contact=True,
+            d=0.004,
+            theta=0.1,
+            theta_std=1e-3,
+            force=5.0,
+        )
+        for _ in range(2)
+    ]
+    state.object.valid = True
+    state.object.width = 0.04
+    state.goal = goal((0.0, 0.0), (0.3, 0.3))
+    return state
+
+
+def goal(q: tuple[float, float], current: tuple[float, float]) -> Goal:
+    return Goal(valid=True, q=list(q), current=list(current))
+
+
+def later(state: State, dt: float) -> None:
+    """Time goes on, and everything is as fresh as it was."""
+    state.t += dt
+    state.reading.t += dt
+    state.seq += 1
+    for contact in state.contacts:
+        contact.t_sound += dt
+        contact.t_arrival += dt
+
+
+def levers(lever: float) -> Held:
+    held = Held()
+    held.lever = [lever, lever]
+    return held
+
+
+def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
+    """The fault after so many seconds of this state; every row has had its turn."""
+    found = None
+    for _ in range(max(round(seconds / 0.002), len(ROWS)) + len(ROWS)):
+        found = judge.judge(state)
+        later(state, 0.002)
+    return ("", "") if found is None else (found.name, found.text)
+
+
+def test_a_sound_state_has_no_cause_and_no_warning() -> None:
+    judge = safety(held=levers(0.08))
+    state = sound()
+    state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
+    assert judged(judge, state, 3.0) == ("", "")
+    assert judge.warnings == []
+    assert judge.cause(state) == ""
+
+
+# --- goals ------------------------------------------------------------------------------------
+
+
+def bounded(judge: Safety, state: State, wanted: Goal) -> Goal:
+    state.goal = wanted
+    state.seq += 1
+    judge.bound(state)
+    return state.goal
+
+
+def test_goals_are_bounded_by_joint_and_current_limits() -> None:
+    judge, state = safety(), sound()
+    for _ in range(1000):  # as long as the step and the slew take
+        found = bounded(judge, state, goal((9.0, -9.0), (5.0, -0.2)))
+    assert found.valid
+    assert found.q == [SETTINGS.hand.q_max[0], SETTINGS.hand.q_min[1]]
+    assert found.current == [SETTINGS.safety.current_max, 0.0]
+    assert set(judge.limited) == {"goal.angle", "goal.current", "goal.step", "goal.slew"}
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_goal_that_is_no_number_is_not_sent_and_is_a_fault(bad: float) -> None:
+    for each in (goal((bad, 0.0), (0.1, 0.1)), goal((0.0, 0.0), (0.1, bad))):
+        judge, state = safety(), sound()
+        assert not bounded(judge, state, each).valid
+        found = judge.judge(state)
+        assert found is not None
+        assert found.name == "goal.number"
+
+
+def test_a_far_goal_goes_there_at_its_speed_and_a_near_one_at_once() -> None:
+    judge, state = safety(), sound()
+    limits, dt = SETTINGS.safety, 1.0 / SETTINGS.loop.rate
+    assert bounded(judge, state, goal((0.4, -0.4), (0.0, 0.0))).q == [0.4, -0.4]
+    reached = [bounded(judge, state, goal((1.0, 0.0), (0.0, 0.0))).q[0] for _ in range(5)]
+    step = limits.goal_speed * dt
+    assert reached == pytest.approx([limits.goal_reach + (i + 1) * step for i in range(5)])
+
+
+def test_in_position_mode_no_goal_jumps() -> None:
+    settings = Settings.model_validate({"servos": {"mode": "position"}})
+    judge, state = Safety(settings, True, True), sound()
+    step = settings.safety.goal_speed / settings.loop.rate
+    assert bounded(judge, state, goal((0.4, 0.0), (0.0, 0.0))).q[0] == pytest.approx(step)
+
+
+def test_a_goal_current_rises_slowly_from_nothing_and_falls_at_once() -> None:
+    judge, state = safety(), sound()
+    rise = SETTINGS.safety.current_rate / SETTINGS.loop.rate
+    for k in (1, 2, 3):
+        assert bounded(judge, state, goal((0, 0), (0.5, 0.0))).current[0] == pytest.approx(k * rise)
+    assert bounded(judge, state, goal((0, 0), (0.05, 0.0))).current[0] == 0.05
+    state.seq += 5  # torque was off meanwhile
+    assert bounded(judge, state, goal((0, 0), (0.5, 0.0))).current[0] == pytest.approx(rise)
+
+
+@given(st.lists(st.tuples(*[st.floats(width=32) for _ in range(6)]), min_size=1, max_size=20))
+@hypothesis_settings(max_examples=200, deadline=None)
+def test_no_goal_leaves_its_limits_whatever_is_asked(asked: list[tuple[float, ...]]) -> None:
+    judge, state, hand, limits = safety(), sound(), SETTINGS.hand, SETTINGS.safety
+    last = [0.0, 0.0]
+    for a, b, c, d, q1, q2 in asked:
+        state.reading.q = [max(min(q, 1.0), -0.5) if math.isfinite(q) else 0.0 for q in (q1, q2)]
+        found = bounded(judge, state, goal((a, b), (c, d)))
+        if not found.valid:
+            assert not all(map(math.isfinite, (a, b, c, d)))
+            return
+        for i in range(2):
+            assert hand.q_min[i] <= found.q[i] <= hand.q_max[i]
+            assert 0.0 <= found.current[i] <= limits.current_max
+            assert found.current[i] <= last[i] + limits.current_rate / SETTINGS.loop.rate + 1e-12
+        last = list(found.current)
+
+
+def test_nothing_but_safety_writes_a_goal() -> None:
+    callers = []
+    for path in (ROOT / "daemon").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Attribute)
+                and node.func.attr == "write"
+                and isinstance(node.func.value, ast.Name | ast.Attribute)
+                and "servos" in ast.unparse(node.func.value)
+            ):
+                callers.append(path.name)
+    assert callers == ["safety.py"]
+
+
+# --- the rows -----------------------------------------------------------------------------------
+
+
+def stale_reading(state: State) -> None:
+    state.reading.t = 4.9
+
+
+def alert(state: State) -> None:
+    state.reading.alert = 0b10
+    state.reading.hardware[1] = 0b100
+
+
+def past_the_limit(state: State) -> None:
+    state.reading.q[0] = SETTINGS.hand.q_max[0] + 0.2
+
+
+def no_angle(state: State) -> None:
+    state.reading.q[0] = math.nan
+
+
+def too_fast(state: State) -> None:
+    state.reading.dq[1] = -7.0
+
+
+def too_much_current(state: State) -> None:
+    state.reading.current[1] = -1.9
+
+
+def stalled(state: State) -> None:
+    state.mode = Mode.MOVING
+    state.goal = goal((0.0, 0.3), (0.4, 0.4))
+    state.reading.current = [0.0, 0.39]
+
+
+def hot(state: State) -> None:
+    state.reading.temperature[0] = 71.0
+
+
+def brown_out(state: State) -> None:
+    state.reading.voltage[1] = 9.2
+
+
+def silent_frames(state: State) -> None:
+    state.contacts[0].t_arrival = state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+
+
+def unsound_estimates(state: State) -> None:
+    state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+
+
+def never_read(state: State) -> None:
+    state.reading.t = -math.inf
+
+
+def too_much_force(state: State) -> None:
+    state.contacts[1].force = 31.0
+
+
+def too_deep(state: State) -> None:
+    state.contacts[1].d = 0.013
+
+
+def near_the_rim(state: State) -> None:
+    state.contacts[0].theta = -math.asin(0.8) + 0.04
+
+
+def outside_the_model(state: State) -> None:
+    state.contacts[0].inside = False
+
+
+FAULTS: list[tuple[Callable[[State], None], str, str]] = [
+    (stale_reading, "servos.silent", "no good reading for 0.100 s"),
+    (alert, "servos.alert", "hardware error reported by right (overheating)"),
+    (past_the_limit, "joint.angle", "left joint at 1.200 rad, outside its limits"),
+    (no_angle, "joint.angle", "left joint at nan rad"),
+    (too_fast, "joint.velocity", "right joint at -7.00 rad/s, too fast"),
+    (too_much_current, "joint.current", "right joint takes -1.90 A, above 1.8 A"),
+    (stalled, "joint.stall", "right joint has stalled, 17.2° off its goal at 0.39 A"),
+    (hot, "servos.temperature", "left servo at 71 °C"),
+    (brown_out, "servos.voltage", "right servo's supply at 9.2 V, outside 9.5 to 16.0 V"),
+    (silent_frames, "tactile.silent", "tactile: no frame for 0.1"),
+    (unsound_estimates, "tactile.silent", "tactile: no sound estimate for 0.1"),
+    (never_read, "servos.silent", "servos: no good reading yet"),
+    (too_much_force, "tip.force", "right tip at 31.0 N, above 30 N"),
+    (too_deep, "tip.displacement", "right tip at 13.00 mm, above 12"),
+    (near_the_rim, "tip.tilt", "left tip at -50.8°, past 50.3° at this depth"),
+    (outside_the_model, "tip.tilt", "left tip at 5.7°, past"),
+]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name", "text"), FAULTS, ids=[each[0].__name__ for each in FAULTS]
+)
+def test_each_fault_is_found_and_named(
+    spoil: Callable[[State], None], name: str, text: str
+) -> None:
+    judge, state = safety(), sound()
+    spoil(state)
+    found = judged(judge, state, 2.5)
+    assert found[0] == name
+    assert text in found[1]
+    assert judge.cause(state), "and it refuses a command while it stands"
+
+
+def test_what_the_scene_lacks_is_no_cause() -> None:
+    state = sound()
+    for spoil in (stale_reading, alert, past_the_limit, too_fast, hot, brown_out):
+        spoil(state)
+    assert judged(safety(has_servos=False), state, 1.0) == ("", "")
+    state = sound()
+    for spoil in (silent_frames, too_much_force, near_the_rim):
+        spoil(state)
+    assert judged(safety(has_sensors=False), state, 1.0) == ("", "")
+
+
+def test_a_short_spike_of_what_must_last_is_no_fault() -> None:
+    judge, state = safety(), sound()
+    too_much_current(state)
+    for _ in range(20):
+        assert judge.judge(state) is None
+        later(state, 0.002)
+    state.reading.current = [0.0, 0.0]
+    judge.judge(state)
+    too_much_current(state)
+    assert judge.judge(state) is None, "it lasts anew"
+
+
+def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
+    state = sound()
+    state.contacts[0].t_sound = 5.0 - 4.0 / SETTINGS.tactile.rate
+    judge = safety()
+    assert judge.must_hold(state)
+    assert judge.limited["tactile.late"] == 1
+    assert judge.cause(state) == ""
+    state.mode = Mode.ARMED
+    assert not judge.must_hold(state)
+
+
+def test_overruns_in_a_row_are_a_cause() -> None:
+    judge, state = safety(), sound()
+    state.timing.late_in_row = SETTINGS.safety.overruns_fault
+    assert judged(judge, state) == ("loop.overruns", "loop: 100 overruns in a row")
+
+
+def frames_of(*thetas: float) -> list[Contact]:
+    return [Contact(contact=True, valid=True, theta=theta, theta_std=1e-3) for theta in thetas]
+
+
+def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -> None:
+    # θ1 = φ + q1, θ2 = φ − q2: the same φ of 0.1 rad by both
+    frames = frames_of(0.1 + 0.3, 0.1 - 0.25)
+    judge, state = safety(frames=frames), sound()
+    state.reading.q = [0.3, 0.25]
+    assert judged(judge, state, 0.5) == ("", "")
+    frames[1].theta += 0.11
+    assert judged(judge, state, 0.5) == ("", "")
+    assert [warning.name for warning in judge.warnings] == ["hand.angle"]
+    frames[1].theta += 0.1
+    name, text = judged(judge, state, 0.5)
+    assert name == "hand.angle"
+    assert "12.0° apart: the object lies askew" in text
+    frames[1].theta_std = 0.06  # not known well enough to accuse anybody
+    assert judged(judge, state, 0.5) == ("", "")
+
+
+def test_a_held_object_that_changes_its_width_is_a_fault() -> None:
+    judge, state = safety(), sound()
+    judged(judge, state)
+    state.object.width = 0.0355
+    name, text = judged(judge, state, 0.5)
+    assert name == "hand.width"
+    assert "changed by -4.5 mm" in text
+    state.mode = Mode.ARMED  # let go; the next object may have any width
+    assert judged(judge, state) == ("", "")
+    state.mode = Mode.HOLDING
+    assert judged(judge, state, 0.5) == ("", "")
+
+
+def unequal_forces(state: State) -> None:
+    state.contacts[0].force = 12.0
+
+
+def strained(state: State) -> None:
+    state.reading.current = [1.19, 0.3]
+
+
+def warm(state: State) -> None:
+    state.reading.temperature[1] = 62.0
+
+
+def nearly_too_much_force(state: State) -> None:
+    state.contacts[0].force = state.contacts[1].force = 27.5
+
+
+WARNINGS: list[tuple[Callable[[State], None], str, str]] = [
+    (unequal_forces, "hand.force", "the tips feel 12.0 N and 5.0 N of one grip"),
+    (strained, "joint.strained", "left joint grips with all of its 1.2 A"),
+    (warm, "servos.temperature", "right servo at 62 °C"),
+    (nearly_too_much_force, "tip.force", "left tip at 27.5 N, above 27 N"),
+]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name", "text"), WARNINGS, ids=[each[0].__name__ for each in WARNINGS]
+)
+def test_a_warning_is_told_once_until_it_has_been_over(
+    spoil: Callable[[State], None], name: str, text: str
+) -> None:
+    judge, state = safety(), sound()
+    spoil(state)
+    assert judged(judge, state, 2.0) == ("", "")
+    assert [(each.name, each.text) for each in judge.warnings if each.name == name] == [
+        (name, text)
+    ]
+    judge.warnings.clear()
+    for wait, told in ((0.3, 0), (1.5, 1)):
+        well = sound()
+        well.t = well.reading.t = state.t
+        for contact in well.contacts:
+            contact.t_sound = state.t
+        judged(judge, well, wait)
+        state = well
+        spoil(state)
+        judged(judge, state, 2.0)
+        assert [each.name for each in judge.warnings].count(name) == told
+
+
+def test_a_warning_at_its_limit_does_not_flicker() -> None:
+    judge, state = safety(), sound()
+    for k in range(4000):
+        state.reading.temperature[0] = 60.0 + (0.5 if k // 700 % 2 else -0.5)
+        judge.judge(state)
+        later(state, 0.002)
+    assert len(judge.warnings) == 1
+
+
+def test_torque_that_the_tip_does_not_feel_is_told() -> None:
+    judge, state = safety(held=levers(0.08)), sound()
+    state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
+    judged(judge, state, 0.5)
+    assert judge.warnings == []
+    state.reading.current[1] *= 2.5
+    judged(judge, state, 0.5)
+    assert [each.name for each in judge.warnings] == ["hand.torque"]
+    assert "right joint gives 1.00 N·m, its tip feels what takes 0.40 N·m" in judge.warnings[0].text
+
+
+def test_shear_near_friction_is_told() -> None:
+    held = Held()
+    judge, state = safety(held=held), sound()
+    held.shear = 0.5
+    judged(judge, state, 0.3)
+    assert [each.name for each in judge.warnings if each.name == "grip.slip"] == ["grip.slip"]
+
+
+def test_a_frozen_sensor_is_a_fault_while_something_touches() -> None:
+    sensor = Sensor(1)
+    judge, state = safety(sensors=[sensor]), sound()
+    rng = np.random.default_rng(3)
+    for frozen, fault in ((False, False), (True, True)):
+        kept = rng.integers(0, 50, (4, 4))
+        found = None
+        for k in range(400):
+            if k % 5 == 0:
+                sensor.give(state.t, kept if frozen else rng.integers(0, 50, (4, 4)))
+            found = judge.judge(state)
+            later(state, 0.002)
+        assert (found is not None) is fault
+    assert found is not None
+    assert found.name == "tactile.frozen"
+    assert "right sensor frozen" in found.text
+    state.contacts[1].contact = False  # an empty sensor may well read the same again and again
+    assert judged(judge, state) == ("", "")
+
+
+def test_full_cells_are_told() -> None:
+    sensor = Sensor(0)
+    judge, state = safety(sensors=[sensor]), sound()
+    sensor.give(5.0, np.full((4, 4), 65535))
+    judged(judge, state, 0.3)
+    assert [each.text for each in judge.warnings] == [
+        "tactile: 100% of the left sensor's cells are full"
+    ]
+
+
+near = st.sampled_from([0.0, 0.5, 0.99, 1.0, 1.01, 1.3, -1.0, -1.01, math.nan, math.inf, -math.inf])
+
+
+@given(st.lists(near, min_size=16, max_size=16), st.booleans(), st.booleans())
+@hypothesis_settings(max_examples=600, deadline=None)
+def test_the_quick_look_never_passes_over_what_a_row_finds(
+    share: list[float], contact: bool, inside: bool
+) -> None:
+    judge, state, limits = safety(), sound(), SETTINGS.safety
+    state.reading.q = [share[0] * 1.1, share[1] * 0.6]
+    state.reading.dq = [share[2] * limits.velocity_max, share[3] * limits.velocity_max]
+    state.reading.current = [share[4] * limits.current_fault, share[5] * limits.current_fault]
+    state.reading.t = 5.0 - share[6] * SETTINGS.servos.fault_after
+    for i, each in enumerate(state.contacts):
+        each.contact, each.inside = contact, inside
+        each.force = share[7 + i] * limits.force_max
+        each.d = share[9 + i] * limits.d_max
+        depth = 1.0 - each.d / SETTINGS.tip.radius
+        limit = math.asin(depth) if 0.0 <= depth <= 1.0 else 1.0
+        each.theta = share[11 + i] * limit
+        each.t_sound = 5.0 - share[13 + i] * limits.frame_age_fault / SETTINGS.tactile.rate
+    state.timing.late_in_row = 100 if share[15] > 1.2 else 0
+    if judge._quiet(state):
+        for watch in judge._each_tick:
+            assert watch.check(judge._view, state, watch.row.share) == "", watch.row.name
+
+
+def test_every_row_is_named_once_a_level_and_its_settings_exist() -> None:
+    seen = [(row.name, row.level) for row in ROWS]
+    assert len(seen) == len(set(seen))
+    for row in ROWS:
+        for key in row.keys:
+            section, _, name = key.partition(".")
+            assert hasattr(getattr(SETTINGS, section), name), key
+    told = {key for row in ROWS for key in row.keys}
+    missing = {f"safety.{name}" for name in Limits.model_fields} - told
+    assert missing == {"safety.current_move"}, "every limit that can be set stands in the table"

@@ -1,0 +1,98 @@
+"""Each kind of scene runs the whole pipeline, with what it has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from daemon.commands import Refused
+from daemon.messages import Parts, state_message
+from tests.harness.loop import Make, advance_to, command, grasped
+
+
+def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    advance_to(daemon, "holding", 5.0)
+    daemon.loop.stop()
+    daemon.loop.advance(1.0)
+    assert daemon.loop.state.mode == "disarmed"
+    command(daemon, "arm")
+    daemon.loop.advance(15.0)
+    assert daemon.loop.state.mode == "armed"
+
+
+SCENES: dict[str, dict[str, Any]] = {
+    "two fingers": {},
+    "one finger": {"scene": {"fingers": ("left",)}},
+    "the other finger": {"scene": {"fingers": ("right",)}},
+    "sensor without servos": {"servos": {"backend": "none"}},
+    "servos without sensors": {"tactile": {"backend": "none"}},
+    "no object model": {"scene": {"object_model": False}},
+}
+
+
+@pytest.mark.parametrize("sections", SCENES.values(), ids=SCENES.keys())
+def test_every_scene_runs_and_its_messages_have_one_shape(
+    make: Make, sections: dict[str, Any]
+) -> None:
+    daemon = make(**sections)
+    daemon.loop.advance(2.0)
+    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
+    reference = state_message(make().loop.state, Parts.of(daemon.settings))
+    assert message.keys() == reference.keys()
+    for part in ("left", "right", "object"):
+        assert message[part].keys() == reference[part].keys()
+        for key, value in reference[part].items():
+            assert type(message[part][key]) is type(value), (part, key)
+    fingers = daemon.settings.scene.fingers
+    assert message["left"]["valid"] is ("left" in fingers)
+    assert message["right"]["valid"] is ("right" in fingers)
+
+
+def test_one_finger_presses_on_a_fixed_object(make: Make) -> None:
+    daemon = grasped(make(scene={"fingers": ("left",)}), 6.0)
+    daemon.loop.advance(2.0)
+    assert daemon.loop.state.contacts[0].force == pytest.approx(6.0, rel=0.05)
+    assert daemon.loop.state.contacts[1].force == 0.0
+    assert not daemon.loop.state.object.valid
+    with pytest.raises(Refused, match="needs both fingers"):
+        command(daemon, "rotate", angle=0.1)
+
+
+def test_watching_a_compression_needs_no_servos(make: Make) -> None:
+    daemon = make(servos={"backend": "none"})
+    deepest = 0.0
+    for _ in range(80):
+        daemon.loop.advance(0.1)
+        deepest = max(deepest, daemon.loop.state.contacts[0].d)
+    assert deepest > 0.002
+    with pytest.raises(Refused, match="arm: this scene has no servos"):
+        command(daemon, "arm")
+
+
+def test_servos_without_sensors_move_but_do_not_grasp(make: Make) -> None:
+    daemon = make(tactile={"backend": "none"})
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.1)
+    advance_to(daemon, "armed", 3.0)
+    with pytest.raises(Refused, match="needs a tactile sensor"):
+        command(daemon, "grasp")
+
+
+def test_the_demo_task_grasps_turns_and_releases_by_itself(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    seen: list[str] = []
+    turned: list[float] = []
+    for _ in range(2000):
+        daemon.loop.advance(0.01)
+        state = daemon.loop.state
+        if not seen or seen[-1] != state.mode:
+            seen.append(state.mode)
+        if state.object.valid:
+            turned.append(state.object.angle)
+    assert daemon.loop.state.fault == ""
+    once = ["grasping", "holding", *(["rotating", "holding"] * 3), "releasing", "armed"]
+    assert seen[: len(once) + 2] == ["disarmed", "armed", *once]
+    assert max(turned) > 0.12
+    assert min(turned) < -0.12

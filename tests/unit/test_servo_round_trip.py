@@ -1,0 +1,146 @@
+"""Any instruction, through our packet handler and the emulated bus, equals direct table access."""
+
+from __future__ import annotations
+
+import dynamixel_sdk as sdk
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.servos import registers as reg
+from daemon.servos.groups import GroupRead
+from daemon.servos.packets import PacketHandler
+from daemon.servos.port import SerialPort
+from daemon.simulation.servo_bus import ServoBus
+from tests.harness.servos import RADIAN, make_bus
+
+
+class DirectPort(SerialPort):
+    """A port whose other end is a bus in this thread, at a time that is set by hand."""
+
+    def __init__(self, bus: ServoBus) -> None:
+        super().__init__("direct", 2_000_000, 0.01)
+        self.bus = bus
+        self.t = 0.0
+
+    def clearPort(self) -> None:
+        self.received.clear()
+
+    def writePort(self, packet: bytes) -> int:
+        self.received += self.bus.feed(bytes(packet), self.t)
+        return len(packet)
+
+    def fill(self) -> bool:
+        return False
+
+
+ADDRESSES = st.one_of(
+    st.sampled_from([7, 11, 64, 65, 98, 100, 102, 104, 108, 116, 126, 132, 168, 224, 578, 634]),
+    st.integers(0, 663),
+)
+# FF and FD often, so that stuffing is due; small numbers, so that writes are often allowed.
+DATA = st.one_of(
+    st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
+    st.binary(min_size=1, max_size=20),
+)
+SPANS = st.tuples(ADDRESSES, st.integers(1, 30))
+STEPS = st.one_of(
+    st.tuples(st.just("write"), st.sampled_from([1, 2]), ADDRESSES, DATA),
+    st.tuples(st.just("registered"), st.sampled_from([1, 2]), ADDRESSES, DATA),
+    st.tuples(st.just("sync write"), st.just(0), ADDRESSES, DATA),
+    st.tuples(st.just("bulk write"), st.just(0), ADDRESSES, DATA),
+    st.tuples(st.just("read"), st.sampled_from([1, 2]), ADDRESSES, st.integers(1, 30)),
+    st.tuples(st.just("sync read"), st.just(0), ADDRESSES, st.integers(1, 30)),
+    st.tuples(st.just("fast sync read"), st.just(0), ADDRESSES, st.integers(1, 30)),
+    st.tuples(st.just("bulk read"), st.just(0), ADDRESSES, st.integers(1, 30)),
+    st.tuples(st.just("fast bulk read"), st.just(0), ADDRESSES, st.integers(1, 30)),
+)
+
+
+def placed(angles: tuple[float, float]) -> ServoBus:
+    # Status and ID registers are protected by the test below, so that the servos stay in reach.
+    return make_bus("XM430-W210", prepared=True, counts=[angle / RADIAN for angle in angles])
+
+
+def out_of_reach(address: int, data: bytes) -> bool:
+    """Whether a write would change who answers to what, which direct access does not know of."""
+    span = range(address, address + len(data))
+    kept = (reg.ID, reg.SHADOW_ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
+    # Indirect addresses could point at those.
+    return any(a in span for a in kept) or address >= 168
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(STEPS, min_size=1, max_size=12),
+    st.tuples(st.floats(-9, 9), st.floats(-9, 9)),
+)
+def test_any_instruction_equals_direct_access(
+    steps: list[tuple[str, int, int, bytes | int]], angles: tuple[float, float]
+) -> None:
+    port, twin = DirectPort(placed(angles)), placed(angles)
+    handler = PacketHandler()
+    servos = {servo.id: servo for servo in twin.servos}
+    for number, (kind, servo_id, address, what) in enumerate(steps):
+        port.t = t = 0.003 * (number + 1)
+        port.bus.advance(t)
+        twin.advance(t)
+        if isinstance(what, bytes):
+            if out_of_reach(address, what):
+                continue
+            if kind == "write":
+                result, error = handler.writeTxRx(port, servo_id, address, len(what), list(what))
+                error &= 0x7F  # bit 7 tells of a hardware error, which limits may bring about
+                assert (result, error) == (
+                    sdk.COMM_SUCCESS,
+                    servos[servo_id].write(address, what, t),
+                )
+            elif kind == "registered":
+                result, error = handler.regWriteTxRx(port, servo_id, address, len(what), list(what))
+                error &= 0x7F
+                assert (result, error) == (
+                    sdk.COMM_SUCCESS,
+                    servos[servo_id].register(address, what),
+                )
+                handler.action(port, servo_id)
+                servos[servo_id].action(t)
+            else:
+                if kind == "sync write":
+                    group = sdk.GroupSyncWrite(port, handler, address, len(what))
+                    for each in servos:
+                        group.addParam(each, what)
+                else:
+                    group = sdk.GroupBulkWrite(port, handler)
+                    for each in servos:
+                        group.addParam(each, address, len(what), list(what))
+                assert group.txPacket() == sdk.COMM_SUCCESS
+                for servo in servos.values():
+                    servo.write(address, what, t)
+        elif kind == "read":
+            data, result, error = handler.readTxRx(port, servo_id, address, what)
+            expected = servos[servo_id].read(address, what, t)
+            assert result == sdk.COMM_SUCCESS
+            error &= 0x7F
+            assert (bytes(data), error) == ((bytes(what), 7) if expected is None else (expected, 0))
+        else:
+            expect = {each: servos[each].read(address, what, t) for each in servos}
+            if "bulk" in kind:
+                bulk = sdk.GroupBulkRead(port, handler)
+                for each in servos:
+                    bulk.addParam(each, address, what)
+                result = bulk.fastBulkRead() if "fast" in kind else bulk.txRxPacket()
+                got = {each: bytes(bulk.data_dict[each][0]) for each in servos}
+            else:
+                group_read = GroupRead(port, handler, address, what, list(servos))
+                result = group_read.exchange("fast" in kind)
+                got = {each: bytes(group_read.data_dict[each]) for each in servos}
+            if None not in expect.values():
+                assert result == sdk.COMM_SUCCESS
+                assert got == expect
+            elif kind == "fast sync read":
+                assert [error & 0x7F for error in group_read.errors.values()] == [7, 7]
+            elif kind == "sync read":
+                assert result != sdk.COMM_SUCCESS
+    for mine, other in zip(port.bus.servos, twin.servos, strict=True):
+        assert mine.table.memory == other.table.memory
+    assert np.array_equal(port.bus.plant.q, twin.plant.q)

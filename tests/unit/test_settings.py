@@ -1,0 +1,237 @@
+"""Settings: profiles load, and whatever is wrong with one is told in one report."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from daemon.profiles import load
+from daemon.settings import Settings, SettingsError
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+def report(tmp_path: Path, text: str, directory: Path | None = None) -> list[str]:
+    path = tmp_path / "profile.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SettingsError) as caught:
+        load(path, directory)
+    lines = str(caught.value).split("\n")
+    assert all(line.startswith(f"{path}: ") for line in lines)
+    return [line.removeprefix(f"{path}: ") for line in lines]
+
+
+def test_no_file_is_the_built_in_simulated_hand() -> None:
+    assert load() == Settings()
+    assert load().servos.backend == "simulated"
+
+
+def test_sim_profile_equals_the_built_in_hand_and_names_every_key() -> None:
+    path = CONFIG / "sim.toml"
+    assert load(path) == Settings()
+    written = tomllib.loads(path.read_text(encoding="utf-8"))
+    for name, section in Settings():
+        assert list(written[name]) == list(type(section).model_fields), name
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.glob("*.toml")), ids=lambda path: path.name)
+def test_every_profile_loads(path: Path, tmp_path: Path) -> None:
+    settings = load(path, tmp_path)
+    assert "{dir}" not in settings.servos.port + "".join(settings.tactile.port)
+
+
+def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path: Path) -> None:
+    lines = report(
+        tmp_path,
+        """
+        [hand]
+        pivot_seperation = 0.1
+        finger_length = "long"
+        q_min = [1, 2, 3]
+        [servos]
+        baud = 1.5
+        ids = [1, 300]
+        backend = "dynamxl"
+        [tip]
+        radius = -1
+        [lop]
+        rate = 3
+        [tactile]
+        noise = nan
+        [scene]
+        fingers = "left"
+        object_model = 1
+        """,
+    )
+    assert sorted(lines) == sorted(
+        [
+            "hand.pivot_seperation: found an unknown key, expected a known one; "
+            "nearest: pivot_separation",
+            'hand.finger_length: found "long", expected a number',
+            "hand.q_min: found [1, 2, 3], expected at most 2 items, not 3",
+            "servos.baud: found 1.5, expected a whole number",
+            "servos.ids.1: found 300, expected less than or equal to 252",
+            "servos.backend: found \"dynamxl\", expected 'simulated', 'dynamixel' or 'none'",
+            "tip.radius: found -1, expected greater than or equal to 0.0001",
+            "lop: found an unknown key, expected a known one; nearest: loop",
+            "tactile.noise: found nan, expected a finite number",
+            'scene.fingers: found "left", expected an array',
+            "scene.object_model: found 1, expected a boolean",
+        ]
+    )
+
+
+def test_contradictions_between_keys_are_all_told(tmp_path: Path) -> None:
+    lines = report(
+        tmp_path,
+        """
+        [scene]
+        fingers = ["left", "left"]
+        [hand]
+        q_min = [0.5, -0.5]
+        q_max = [0.2, 1.0]
+        open_angle = [0.0, 2.0]
+        [servos]
+        backend = "dynamixel"
+        ids = [3, 3]
+        port = "{dir}/servos"
+        [loop]
+        clock = "virtual"
+        [material]
+        law = "points"
+        strain = [0.0, 0.1]
+        stress = [0.0]
+        """,
+    )
+    keys = [line.split(":")[0] for line in lines]
+    assert keys == [
+        "scene.fingers",
+        "servos.backend, tactile.backend",
+        "hand.q_max",
+        "hand.open_angle",
+        "servos.ids",
+        "material.stress",
+        "loop.clock",
+        "servos.port",
+    ]
+
+
+def test_a_scene_without_anything_is_refused(tmp_path: Path) -> None:
+    text = '[servos]\nbackend = "none"\n[tactile]\nbackend = "none"\n'
+    (line,) = report(tmp_path, text)
+    assert line.endswith("found none and none, expected at least one")
+
+
+def test_a_file_that_is_not_toml_is_told_with_its_line(tmp_path: Path) -> None:
+    (line,) = report(tmp_path, "[loop]\nrate = = 3\n")
+    assert line.startswith("not TOML: ")
+    assert "line 2" in line
+
+
+def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "profile.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SettingsError, match="not UTF-8 text"):
+        load(path)
+    with pytest.raises(SettingsError, match=r"absent\.toml: can't be read"):
+        load(tmp_path / "absent.toml")
+
+
+def test_dir_fills_the_ports(tmp_path: Path) -> None:
+    path = tmp_path / "profile.toml"
+    path.write_text(
+        '[servos]\nport = "{dir}/servos"\n[tactile]\nport = ["{dir}/a", "/dev/b"]\n',
+        encoding="utf-8",
+    )
+    settings = load(path, Path("/tmp/hand"))
+    assert settings.servos.port == "/tmp/hand/servos"
+    assert settings.tactile.port == ("/tmp/hand/a", "/dev/b")
+
+
+def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
+    lines = report(tmp_path, '[servos]\nids = [3, 3]\n[tip]\nradius = "big"\n')
+    assert lines == [
+        'tip.radius: found "big", expected a number',
+        "servos.ids: found [3, 3], expected two different ids",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('[servos]\nbackend = "dynamixel"', "servos.backend, tactile.backend: found dynamixel and"),
+        ('[servos]\nmodel = "XM999"', "servos.model: "),
+        ("[servos]\nwatchdog = 0.003", "servos.watchdog: found 0.003 s, expected above two ticks"),
+        ('[stream]\naddress = "tcp://127.0.0.1:99999"', "stream.address: found"),
+        ('[stream]\naddress = "tcp://*:9872"', "stream.address: found"),
+        ('[stream]\naddress = "inproc://x"', "stream.address: found"),
+        ('[commands]\naddress = "tcp://10.0.0.2:9873"', "commands.address: found"),
+        ('access.ipc_mode = "0777"', "access.ipc_mode: found"),
+        ('[commands]\naddress = "ipc://"', "commands.address: found"),
+        ('[commands]\naddress = "ipc://a\\u0000b"', 'commands.address: found "ipc://a?b"'),
+        ('[commands]\naddress = "tcp://127.0.0.1:9872"', "commands.address: found"),
+        ("servos = 3", "servos: found 3, expected a table"),
+        ("[[loop]]\nrate = 100.0", "loop: found [a table], expected a table"),
+        ("[tactile]\nrate = 1e300", "tactile.rate: found 1e+300, expected less than or equal to"),
+        ("[hand]\nfinger_length = 1e300", "hand.finger_length: found 1e+300"),
+        ("[tip]\nradius = 1e-300", "tip.radius: found 1e-300"),
+        ("[simulation]\ntactile_delay = 1e9", "simulation.tactile_delay: found 1000000000.0"),
+        ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a number"),
+        ('"\\u001b[31m" = 1', "?[31m: found an unknown key"),
+        ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
+        ('[task]\nname = "demo"\nforce = 500.0', "task.force: found 500 N, expected above 0.5 to"),
+        ("x = " + "[" * 5000, "nested too deeply"),
+        ("x = " + "9" * 5000, "not TOML: "),
+        (
+            '[material]\nlaw = "points"\nstrain = [0.0, 0.2, 0.1]\nstress = [0.0, 1.0, 2.0]',
+            "material.strain, material.stress: ",
+        ),
+    ],
+)
+def test_absurd_settings_are_told_in_one_line(tmp_path: Path, text: str, line: str) -> None:
+    lines = report(tmp_path, text)
+    assert lines[0].startswith(line), lines
+    assert all(len(each) < 300 for each in lines)
+
+
+def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
+    path = tmp_path / "profile.toml"
+    path.write_bytes(b"\xef\xbb\xbf[loop]\nrate = 100.0\n")
+    assert load(path).loop.rate == 100.0
+
+
+def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text("loop.rate = 250.0\n[tip]\nradius = 0.015\n")
+    changes = ["loop.rate=1000", "tactile.backend=none", 'scene.fingers=["left"]']
+    settings = load(file, changes=changes)
+    assert (settings.loop.rate, settings.tip.radius) == (1000.0, 0.015)
+    assert settings.tactile.backend == "none"
+    assert settings.scene.fingers == ("left",)
+    with pytest.raises(SettingsError) as report:
+        load(file, changes=["loop.rate=fast", "tip.radios=0.02"])
+    assert str(report.value).splitlines() == [
+        "--set: tip.radios: found an unknown key, expected a known one; nearest: radius",
+        '--set: loop.rate: found "fast", expected a number',
+    ]
+
+
+@pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1"])
+def test_a_change_that_names_no_key_is_told(change: str) -> None:
+    with pytest.raises(SettingsError, match=r"^--set: found .* expected section\.key=value"):
+        load(changes=[change])
+
+
+def test_addresses_off_this_machine_need_keys(tmp_path: Path) -> None:
+    path = tmp_path / "far.toml"
+    path.write_text('commands.address = "tcp://10.0.0.2:9873"\n', encoding="utf-8")
+    with pytest.raises(SettingsError, match=r"need access\.keys"):
+        load(path)
+    for address in ("tcp://10.0.0.2:9873", "tcp://*:9873", "tcp://hand.lan:9873", "tcp://[::]:9"):
+        path.write_text(
+            f'commands.address = "{address}"\naccess.keys = "/etc/softfinger/keys"\n',
+            encoding="utf-8",
+        )
+        assert load(path).commands.address == address

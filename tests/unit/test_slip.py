@@ -1,0 +1,150 @@
+"""Loads from outside on a held object: seen in the joints' torques, answered by a firmer grip."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.prediction import Held
+from daemon.records import Contact
+from daemon.settings import Settings
+from daemon.slip import SlipWatch
+from tests.unit.test_control import PAPER, grasped
+from tools.benchmarks.control_rig import Watched, push_along
+
+FORCE = 10.0
+BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip
+
+
+@pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["outwards", "to the palm"])
+def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(
+    sections: dict[str, dict[str, Any]], way: float
+) -> None:
+    seen, moved = {}, {}
+    for raised in (0.0, 10.0):
+        with Watched(sections | {"control": {"grip_raise_max": raised}}) as hand:
+            grasped(hand)
+            before = hand.plant.object_pose.copy()
+            used = push_along(hand, way * 0.5 * BORNE, rate=9.0)
+            assert used < 0.75
+            push_along(hand, way * 1.4 * BORNE, rate=9.0, start=way * 0.5 * BORNE)
+            hand.watch(0.5)
+            moved[raised] = math.dist(hand.plant.object_pose[:2], before[:2])
+            seen[raised] = hand.mode, hand.plant.force.mean()
+    assert seen[10.0][0] == "holding"
+    assert FORCE * 1.3 < seen[10.0][1] < FORCE + 10.0 * 1.05
+    assert moved[10.0] < 2.5e-3, "the tips' own shear"
+    assert moved[0.0] > 10e-3
+
+
+def test_the_grip_comes_back_when_the_load_has_gone() -> None:
+    with Watched(PAPER) as hand:
+        grasped(hand)
+        push_along(hand, BORNE, rate=9.0)
+        assert hand.plant.force.mean() > 1.2 * FORCE
+        hand.plant.push(0.0, 0.0)
+        hand.watch(4.0)
+        assert hand.mode == "holding"
+        assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.02)
+
+
+@pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
+@pytest.mark.parametrize("force", [10.0, 5.0, 2.0])
+def test_turning_alone_raises_nothing(force: float, sections: dict[str, dict[str, Any]]) -> None:
+    with Watched(sections) as hand:
+        grasped(hand, force)
+        for angle in (0.17, -0.17, 0.0):
+            hand.command("rotate", angle=angle)
+            seen = hand.watch(1.2)
+            assert seen.force.mean(axis=1).max() < 1.1 * force
+
+
+def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
+    for raised, held in ((0.0, False), (10.0, True)):
+        with Watched({"control": {"grip_raise_max": raised}}) as hand:
+            grasped(hand)
+            start = hand.plant.object_pose[2]
+            # Both tips' friction bears about 0.25 N·m over the object's width.
+            for k in range(1, 76):
+                hand.plant.push(0.0, 0.0, 0.4 * k / 75)
+                hand.watch(0.02)
+            turned = abs(hand.plant.object_pose[2] - start)
+            assert (turned < math.radians(5.0)) == held
+            assert (hand.plant.force.mean() > 1.2 * FORCE) == held
+
+
+def held(load: float, normal: float = 10.0) -> Held:
+    made = Held()
+    made.load, made.load_lever = load, 0.03
+    made.arm, made.turn = [0.079, 0.079], [0.75, 0.75]
+    made.normal, made.stiffness = [normal, normal], [6e3, 6e3]
+    return made
+
+
+def watch(**control: float) -> SlipWatch:
+    return SlipWatch(Settings.model_validate({"control": control}))
+
+
+CONTACTS = [Contact(d=4e-3), Contact(d=4e-3)]
+
+
+def step(slip: SlipWatch, *seen: Any) -> float:
+    """One tick of a grip of so much force asked for."""
+    return slip.step(*seen) if slip.due() else slip.kept(seen[2])
+
+
+def run(slip: SlipWatch, load: float, seconds: float) -> float:
+    force = 0.0
+    for _ in range(round(seconds * 500)):
+        force = step(slip, held(load), CONTACTS, FORCE, True, 0.0)
+    return force
+
+
+def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is() -> None:
+    slip = watch()
+    for _ in range(500):
+        step(slip, held(1.5), CONTACTS, FORCE, False, 0.0)
+    slip.begin(held(1.5))
+    assert run(slip, 1.5, 1.0) == FORCE
+    assert slip.load == 0.0
+    # As much more as friction may hide of it: 0.05 N·m over 30 mm.
+    hidden = 0.05 / 0.03
+    expected = (6.0 - slip._still + hidden) / (0.6 * 0.8)
+    assert run(slip, 6.0, 1.0) == pytest.approx(expected, rel=0.01)
+
+
+def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() -> None:
+    for more, expected in ((2.0, 12.0), (100.0, 27.0), (0.0, 10.0)):
+        slip = watch(grip_raise_max=more)
+        slip.begin(held(0.0))
+        assert run(slip, 50.0, 1.0) == pytest.approx(expected)
+
+
+def test_a_wrong_torque_constant_is_no_load() -> None:
+    slip = watch()
+    # 8 % of 10 N at 79 mm looks like 2.1 N on a lever of 30 mm.
+    wrong = 0.08 * 10.0 * 0.079 / 0.03
+    for _ in range(500):
+        step(slip, held(wrong), CONTACTS, FORCE, False, 0.0)
+    slip.begin(held(wrong))
+    assert run(slip, wrong, 1.0) == FORCE
+    for normal in np.linspace(10.0, 20.0, 200):
+        force = step(slip, held(wrong * normal / 10.0, normal), CONTACTS, FORCE, True, 0.0)
+    assert force == FORCE
+
+
+def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques() -> None:
+    slip = watch()
+    slip.begin(held(0.0, 2.0))
+    for _ in range(1000):
+        assert step(slip, held(4.0, 2.0), CONTACTS, 2.0, True, 0.0) == 2.0
+
+
+def test_nothing_is_judged_before_holding_begins() -> None:
+    slip = watch()
+    for _ in range(500):
+        assert step(slip, held(20.0), CONTACTS, FORCE, False, 0.0) == FORCE
