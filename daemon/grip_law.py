@@ -23,7 +23,7 @@ from daemon.tracking import (
     TIP_STIFFNESS,
     TURN,
 )
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -129,20 +129,20 @@ def place(
     return g[CLOSED] + g[OFFSET], g[CLOSED] - g[OFFSET]
 
 
-@kernel
+@inner_kernel
 def _mean_stiffness(h: FloatArray) -> float:
     mean: float = 0.5 * (h[TIP_STIFFNESS] + h[TIP_STIFFNESS + TIP_SIZE])
     return max(mean, _STIFFNESS_MIN)
 
 
-@kernel
+@inner_kernel
 def _turning(h: FloatArray) -> float:
     """How far the object turns when one joint leans forward and the other back."""
     both: float = h[TURN] + h[TURN + 1]
     return max(both, _TURN_MIN)
 
 
-@kernel
+@inner_kernel
 def _correction(g: FloatArray, target: float, wanted: float, felt: float) -> float:
     """What the force felt asks for beyond the feed-forward [N]."""
     error = wanted - felt
@@ -156,7 +156,7 @@ def _correction(g: FloatArray, target: float, wanted: float, felt: float) -> flo
     return correction
 
 
-@kernel
+@inner_kernel
 def _steer(g: FloatArray, angle: FloatArray, h: FloatArray, turned: float) -> float:
     """Move the antisymmetric goal; returns its rate [rad/s]."""
     wanted = advance(angle, g[ROTATE_SPEED])
@@ -172,7 +172,7 @@ def _steer(g: FloatArray, angle: FloatArray, h: FloatArray, turned: float) -> fl
     return lean
 
 
-@kernel
+@inner_kernel
 def _share_out(g: FloatArray, h: FloatArray) -> None:
     """Take out what the object's rubbing on the table has put between the tips.
 
@@ -188,7 +188,7 @@ def _share_out(g: FloatArray, h: FloatArray) -> None:
     g[SHIFT] = shift
 
 
-@kernel
+@inner_kernel
 def _closing(h: FloatArray, rate: float, lean: float) -> float:
     """Closing [rad/s] for a ``rate`` [N/s] of the force, what turning takes counted in."""
     way = 2.0 * rate / _mean_stiffness(h)
@@ -197,7 +197,7 @@ def _closing(h: FloatArray, rate: float, lean: float) -> float:
     return closing
 
 
-@kernel
+@inner_kernel
 def _give(
     g: FloatArray, h: FloatArray, close: float, lean: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
@@ -214,7 +214,7 @@ def _give(
     return g[TORQUE], g[TORQUE + 1]
 
 
-@kernel
+@inner_kernel
 def _press(g: FloatArray, h: FloatArray, finger: int, rate: float, dq: float) -> float:
     """Torque [N·m] of one finger whose force is to change by ``rate`` [N/s]."""
     arm = h[ARM + finger]
@@ -226,7 +226,7 @@ def _press(g: FloatArray, h: FloatArray, finger: int, rate: float, dq: float) ->
     return torque
 
 
-@kernel
+@inner_kernel
 def _friction(g: FloatArray, rate: float) -> float:
     """What a joint's friction takes [N·m] at the ``rate`` [rad/s] that is wanted."""
     friction: float = g[FRICTION] * min(max(rate / g[FRICTION_SPEED], -1.0), 1.0)

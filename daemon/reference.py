@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def arrived(r: FloatArray) -> bool:
     return there
 
 
-@kernel
+@inner_kernel
 def _mean(r: FloatArray, mean: int, window: int, value: float) -> float:
     """Take ``value`` into a running mean whose window begins at ``window``."""
     at = int(r[mean + 1])

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 
 TIMES = ("wake", "compute", "bus", "publish")
 QUANTILES = (0.5, 0.99, 0.999)
@@ -36,7 +36,7 @@ class Spread(NamedTuple):
     max: float
 
 
-@kernel
+@inner_kernel
 def _bin(value: float) -> int:
     if not value > 0.0:
         return 0

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinematics.held import held_motion, holding_levers, total_tilt
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.shear import load_by_torques
 from kinematics.table import lookup
 
@@ -57,7 +57,7 @@ SLIDE, OBJECT_TAPER, SHEAR, LOAD, LOAD_LEVER, STRAYED = 29, 30, 31, 32, 33, 34
 TOLD_SIZE = 35
 
 
-@kernel
+@inner_kernel
 def _variance(m: FloatArray, which: int) -> float:
     """Variance of d1, d2 or φ: what the last frame left and what the joints may miss."""
     since = m[_SINCE + which]
@@ -69,14 +69,14 @@ def _variance(m: FloatArray, which: int) -> float:
     return variance
 
 
-@kernel
+@inner_kernel
 def _side_variance(m: FloatArray, sense: float) -> float:
     """Variance of the angle φ + sense α/2 of one face; ``sense`` is −1 for the left tip's."""
     variance: float = _variance(m, 2) + sense * m[_TAPER_COV] + 0.25 * m[_TAPER_VAR]
     return max(variance, 0.0)
 
 
-@kernel
+@inner_kernel
 def _free_taper(m: FloatArray, sense: float, angle: float, variance: float) -> None:
     """Take the taper as told, with only the face of ``sense`` known, by ``angle``."""
     spread = _TAPER_OFF * _TAPER_OFF
@@ -87,7 +87,7 @@ def _free_taper(m: FloatArray, sense: float, angle: float, variance: float) -> N
     m[_TAPER_COV] = -0.5 * sense * spread
 
 
-@kernel
+@inner_kernel
 def _credited(m: FloatArray, finger: int, way: float, shown: float, dt: float) -> float:
     """What of a tracked joint's ``way`` the estimates have not felt yet.
 
@@ -165,7 +165,7 @@ def advance(
     history[newest, _H_Q + 1] = m[_Q + 1]
 
 
-@kernel
+@inner_kernel
 def _past(history: FloatArray, newest: int, t: float) -> tuple[int, int, float]:
     """Rows before and after time ``t``, and the later one's share; the ends for a time beyond."""
     size = history.shape[0]
@@ -182,7 +182,7 @@ def _past(history: FloatArray, newest: int, t: float) -> tuple[int, int, float]:
     return later, later, 0.0
 
 
-@kernel
+@inner_kernel
 def _weigh(m: FloatArray, which: int, moved: float, found: float, variance: float) -> float:
     """Correct d1 or d2 by what a frame ``found``, ``moved`` ago by the joints; its weight."""
     own = _variance(m, which)
@@ -197,7 +197,7 @@ def _weigh(m: FloatArray, which: int, moved: float, found: float, variance: floa
     return weight
 
 
-@kernel
+@inner_kernel
 def _weigh_angle(m: FloatArray, sense: float, turned: float, found: float, variance: float) -> None:
     """Correct φ and α by the angle of one face that a frame ``found``, ``turned`` ago."""
     if m[RAW] > 0.0:
@@ -273,7 +273,7 @@ def correct(
     m[_TILT + finger] = tilt
 
 
-@kernel
+@inner_kernel
 def _between(history: FloatArray, row: int, later: int, share: float, column: int) -> float:
     first: float = history[row, column]
     last: float = history[later, column]

@@ -16,14 +16,14 @@ from kinematics.footprint import (
     line_span,
     plane,
 )
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer, address
 from kinematics.middles import FIRST, LAST, NUMBER, next_above, totals
 
 _STRONG = 6.0  # noise: above it the largest cell is looked at first
 
 
-@kernel
+@inner_kernel
 def neighbourhood(frame: Pointer, height: Pointer, rows: int, cols: int, i: int, j: int) -> float:
     """How far the 5 × 5 cells round (i, j), without the middle one, stand above noise 1.
 
@@ -42,7 +42,7 @@ def neighbourhood(frame: Pointer, height: Pointer, rows: int, cols: int, i: int,
     return total / math.sqrt(squares)
 
 
-@kernel
+@inner_kernel
 def _walk(
     frame: Pointer,
     height: Pointer,
@@ -67,7 +67,7 @@ def _walk(
     return contact, place
 
 
-@kernel
+@inner_kernel
 def activity(
     frame: FloatArray,
     middles: FloatArray,
@@ -112,7 +112,7 @@ def activity(
     return contact, row, col, peak, total / max(float(bounds[NUMBER]), 1.0), energy, finite
 
 
-@kernel
+@inner_kernel
 def presses_outside(
     frame: FloatArray,
     middles: FloatArray,

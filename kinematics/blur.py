@@ -15,7 +15,7 @@ import numpy as np
 from kinematics.cells import LIVE
 from kinematics.cut_cells import READING, WEIGHT
 from kinematics.footprint import FloatArray, IntArray
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.kernels import fast_inner_kernel, inner_kernel
 from kinematics.lane_sums import LANES, further, weighted
 from kinematics.lanes import Pointer, address
 
@@ -87,13 +87,13 @@ def average(
     return np.asarray(whole.reshape(high // n[1], n[1], wide // n[0], n[0]).mean(axis=(1, 3)))
 
 
-@fast_kernel
+@fast_inner_kernel
 def _clear(out: Pointer, first: int, last: int) -> None:
     for k in range(first, last):
         out[k] = 0.0
 
 
-@fast_kernel
+@fast_inner_kernel
 def _read(row: FloatArray, live: FloatArray, scale: float, out: FloatArray) -> None:
     for j in range(row.shape[0]):
         reading = row[j] * scale
@@ -101,7 +101,7 @@ def _read(row: FloatArray, live: FloatArray, scale: float, out: FloatArray) -> N
         out[WEIGHT, j] = live[j]
 
 
-@fast_kernel
+@fast_inner_kernel
 def _locate(
     places: IntArray, count: int, parts_x: int, width: int, phase: int
 ) -> tuple[int, int, int, int]:
@@ -124,7 +124,7 @@ def _locate(
     return low, high, left, right
 
 
-@kernel
+@inner_kernel
 def spread(
     packed: FloatArray,
     count: int,

@@ -20,7 +20,7 @@ from kinematics.footprint import (
     beyond_limit,
     line_span,
 )
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.kernels import fast_inner_kernel, inner_kernel, kernel
 from kinematics.material import stress_at
 
 # Strips of one cell: up to 2 crossings of the outline with each side, 2 more of the base plane with
@@ -34,7 +34,7 @@ ANGLE_NODES = 10
 NODES_A_CELL = (MAX_BREAKS - 1) * ANGLE_NODES * 2 * ANGLE_NODES
 
 
-@kernel
+@inner_kernel
 def nodes_needed(a: float, half: float, far: float) -> int:
     """Gauss points a direction that keep a cell well within 1e-6 E; 0 where the angle is needed.
 
@@ -55,7 +55,7 @@ def nodes_needed(a: float, half: float, far: float) -> int:
     return 0
 
 
-@kernel
+@inner_kernel
 def push_line(
     nodes: FloatArray, count: int, a: float, y: float, left: float, right: float, n: int, w: float
 ) -> int:
@@ -84,7 +84,7 @@ def push_line(
     return count
 
 
-@kernel
+@inner_kernel
 def push_whole(
     nodes: FloatArray, count: int, a: float, x0: float, x1: float, y0: float, y1: float
 ) -> int:
@@ -99,7 +99,7 @@ def push_whole(
     return count
 
 
-@fast_kernel
+@fast_inner_kernel
 def _strains(nodes: FloatArray, count: int, u: float, v: float, w: float, a: float) -> None:
     for k in range(count):
         x = nodes[X, k]
@@ -108,7 +108,7 @@ def _strains(nodes: FloatArray, count: int, u: float, v: float, w: float, a: flo
         nodes[STRAIN, k] = min(max(1.0 - (u - v * x - w * y) / math.sqrt(length2), 0.0), 1.0)
 
 
-@fast_kernel
+@fast_inner_kernel
 def _polynomial(nodes: FloatArray, count: int, coefficients: FloatArray) -> None:
     order = coefficients.shape[0]
     for k in range(count):
@@ -119,7 +119,7 @@ def _polynomial(nodes: FloatArray, count: int, coefficients: FloatArray) -> None
             nodes[STRESS, k] = nodes[STRESS, k] * nodes[STRAIN, k] + c
 
 
-@kernel
+@inner_kernel
 def evaluate(
     nodes: FloatArray, count: int, u: float, v: float, w: float, a: float, law: FloatArray
 ) -> None:
@@ -132,7 +132,7 @@ def evaluate(
             nodes[STRESS, k] = stress_at(law, nodes[STRAIN, k])
 
 
-@kernel
+@inner_kernel
 def _insert(breaks: FloatArray, count: int, value: float, low: float, high: float) -> int:
     """Put ``value`` into the sorted ``breaks`` if it lies between ``low`` and ``high``."""
     if not (low < value < high):
@@ -145,7 +145,7 @@ def _insert(breaks: FloatArray, count: int, value: float, low: float, high: floa
     return count + 1
 
 
-@kernel
+@inner_kernel
 def push_cut(
     nodes: FloatArray,
     count: int,

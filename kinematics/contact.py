@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ class Moments(NamedTuple):
     peak_position: FloatArray  # x of the peak, a² sin θ/h [m]
 
 
-@kernel
+@inner_kernel
 def theta_limit(radius: float, d: float) -> float:
     """asin((a − d)/a) [rad], clamped to [0, π/2]; NaN for NaN."""
     if d <= 0.0:
@@ -117,7 +117,7 @@ def closed_form(
     return force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
 
 
-@kernel
+@inner_kernel
 def closed_form_seconds(
     modulus: float, d: float, theta: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -140,7 +140,7 @@ def closed_form_seconds(
     )
 
 
-@kernel
+@inner_kernel
 def contact_moments(
     radius: float, d: float, theta: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
@@ -172,7 +172,7 @@ def contact_moments(
     )
 
 
-@kernel
+@inner_kernel
 def tangential_energy(modulus: float, d: float, theta: float, d_t: float) -> float:
     """U = πE[d³/(3 cos² θ) + d² d_t tan θ + d d_t²] [J] with tangential displacement d_t [m].
 
@@ -186,7 +186,7 @@ def tangential_energy(modulus: float, d: float, theta: float, d_t: float) -> flo
     return math.pi * modulus * d * (d * d * square / 3.0 + d * d_t * slope + d_t * d_t)
 
 
-@kernel
+@inner_kernel
 def tangential_force(modulus: float, d: float, theta: float, d_t: float) -> float:
     """T = ∂U/∂d_t = πE(d² tan θ + 2 d d_t) [N], the stick contact's force along the face."""
     if d <= 0.0:

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from kinematics.footprint import GAUSS_NODES, GAUSS_WEIGHTS, Crossings, FloatArray, IntArray
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.kernels import fast_inner_kernel, inner_kernel
 
 # Planes of the packed footprint cells: share, means of g, x g, y g over it, variance of strain,
 # reading, weight.
@@ -47,7 +47,7 @@ NEAR = 0.5 - 0.5 / math.sqrt(3.0)
 FAR = 0.5 + 0.5 / math.sqrt(3.0)
 
 
-@fast_kernel
+@fast_inner_kernel
 def integrate_strips(
     strips: FloatArray,
     count: int,
@@ -121,7 +121,7 @@ def integrate_strips(
                 strips[SUM_SQUARE, k] += half * (face_a * face_a + face_b * face_b)
 
 
-@kernel
+@inner_kernel
 def flush(
     strips: FloatArray,
     owners: IntArray,
@@ -178,7 +178,7 @@ def flush(
     filled[WAITING] = 0
 
 
-@kernel
+@inner_kernel
 def push_strips(
     strips: FloatArray,
     count: int,

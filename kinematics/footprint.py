@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.kernels import fast_inner_kernel, inner_kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -46,14 +46,14 @@ def _gauss_table() -> tuple[FloatArray, FloatArray]:
 GAUSS_NODES, GAUSS_WEIGHTS = _gauss_table()
 
 
-@kernel
+@inner_kernel
 def plane(a: float, d: float, n_x: float, n_y: float) -> tuple[float, float, float]:
     """(u, v, w) of the object's face; the normal's z component must be positive."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     return (a - d) / n_z, n_x / n_z, n_y / n_z
 
 
-@kernel
+@inner_kernel
 def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
     """Ends (left, right) in x of the footprint on the line ``y``; (inf, −inf) if it has none.
 
@@ -81,7 +81,7 @@ def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
     return left, right
 
 
-@fast_kernel
+@fast_inner_kernel
 def line_spans(
     u: float,
     v: float,
@@ -113,13 +113,13 @@ def line_spans(
         right[k] = -math.inf if none else far
 
 
-@kernel
+@inner_kernel
 def beyond_limit(u: float, v: float, w: float, a: float) -> bool:
     """Whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
     return u <= 0.0 or u * u < (v * v + w * w) * a * a
 
 
-@kernel
+@inner_kernel
 def extremes(u: float, v: float, w: float, a: float) -> Ends:
     """(y of the lowest, of the highest point, y and x of the leftmost, y and x of the rightmost).
 
@@ -142,7 +142,7 @@ def extremes(u: float, v: float, w: float, a: float) -> Ends:
     return low, high, w * (u - v * left) / e, left, w * (u - v * right) / e, right
 
 
-@kernel
+@inner_kernel
 def band_columns(
     u: float,
     v: float,

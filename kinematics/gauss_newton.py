@@ -13,7 +13,7 @@ from kinematics.blur import spread
 from kinematics.cells import CELL_PLANES
 from kinematics.cut_cells import LEVELS, OWNERS, PLANES, STRIP_ROWS, STRIPS
 from kinematics.footprint import FloatArray, Geometry, IntArray, plane
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lane_sums import LANES
 from kinematics.likelihood import accumulate, footprint_energy, is_bent, press
 from kinematics.packing import pack
@@ -42,7 +42,7 @@ RESULT = 8
 GAIN_CURVATURE = 6.0
 
 
-@kernel
+@inner_kernel
 def solve(
     sums: FloatArray,
     gain: float,
@@ -113,7 +113,7 @@ def solve(
     return math.isfinite(decrement), decrement
 
 
-@kernel
+@inner_kernel
 def covariance_of(
     inverse: FloatArray, a: float, u: float, v: float, w: float, variance: float, out: FloatArray
 ) -> None:
@@ -144,7 +144,7 @@ def covariance_of(
     out[15] = inverse[0, 0] * variance
 
 
-@kernel
+@inner_kernel
 def free_noise(square: float, floor: float) -> float:
     """A cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
 
@@ -167,7 +167,7 @@ def free_noise(square: float, floor: float) -> float:
     return 2.0 * floor / (low + high)
 
 
-@kernel
+@inner_kernel
 def fit(
     frame: FloatArray,
     scale: float,

@@ -14,7 +14,7 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from kinematics.fingers import tip_position, tip_velocity
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.table import lookup
 
 _SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
@@ -26,7 +26,7 @@ def total_tilt(tilt_x: float, tilt_y: float) -> float:
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
-@kernel
+@inner_kernel
 def held_motion(
     q1: float,
     q2: float,
@@ -75,7 +75,7 @@ def held_motion(
     )
 
 
-@kernel
+@inner_kernel
 def sheared_gradient(
     contact: tuple[float, float, float, float, float, float, bool],
     d: float,
@@ -96,7 +96,7 @@ def sheared_gradient(
     )
 
 
-@kernel
+@inner_kernel
 def holding_levers(
     data1: NDArray[float64],
     data2: NDArray[float64],

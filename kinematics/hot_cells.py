@@ -5,7 +5,7 @@ from __future__ import annotations
 from kinematics.activity import activity
 from kinematics.cells import LIVE
 from kinematics.footprint import FloatArray, IntArray
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer, address
 from kinematics.middles import HEIGHT, NUMBER
 from kinematics.workspace import SPIKES, SPIKES_MAX
@@ -13,7 +13,7 @@ from kinematics.workspace import SPIKES, SPIKES_MAX
 _DEAD = 1e3  # m below: no face is ever there
 
 
-@kernel
+@inner_kernel
 def is_spike(
     frame: Pointer,
     height: Pointer,
@@ -43,7 +43,7 @@ def is_spike(
     )
 
 
-@kernel
+@inner_kernel
 def without_spikes(
     frame: FloatArray,
     noise: float,
@@ -79,7 +79,7 @@ def without_spikes(
     return rejected, seen
 
 
-@kernel
+@inner_kernel
 def revive(rejected: int, cells: FloatArray, middles: FloatArray, integers: IntArray) -> None:
     """Make the hot cells of :func:`without_spikes` live again."""
     cols = cells.shape[2]

@@ -14,7 +14,7 @@ from kinematics.borrowed import borrowed
 from kinematics.footprint import FloatArray, IntArray
 from kinematics.gauss_newton import RESULT, fit
 from kinematics.hot_cells import revive, without_spikes
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.middles import NUMBER
 from kinematics.moments import RATIO_POINTS, coarse, coarse_weak, refine
 from kinematics.workspace import MIDDLES, SPIKES_MAX
@@ -70,7 +70,7 @@ GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
 
 
-@kernel
+@inner_kernel
 def _start(
     frame: FloatArray,
     middles: FloatArray,
@@ -119,7 +119,7 @@ def _start(
     state[GAIN] = min(max(gain, 0.02), 50.0)
 
 
-@kernel
+@inner_kernel
 def _moments(
     frame: FloatArray,
     middles: FloatArray,
@@ -162,7 +162,7 @@ def _moments(
     return False
 
 
-@kernel
+@inner_kernel
 def _likelihood(
     frame: FloatArray,
     scale: float,
@@ -242,7 +242,7 @@ def _likelihood(
     return False
 
 
-@kernel
+@inner_kernel
 def _tell(plan: FloatArray, state: FloatArray, covariance: FloatArray) -> None:
     """Turn the estimate from normals in the sensor's axes to tilts in the finger's."""
     c = math.cos(plan[ROTATION])
@@ -268,7 +268,7 @@ def _tell(plan: FloatArray, state: FloatArray, covariance: FloatArray) -> None:
         state[COVARIANCE + i + 3] = covariance[i + 3]
 
 
-@kernel
+@inner_kernel
 def _climb(
     frame: FloatArray,
     scale: float,

@@ -15,7 +15,7 @@ import numpy as np
 
 from kinematics.cut_cells import ALONG_X, ALONG_Y, PLAIN, READING, SHARE, VARIANCE, WEIGHT
 from kinematics.footprint import FloatArray
-from kinematics.kernels import fast_kernel, inlined_kernel, kernel
+from kinematics.kernels import fast_inner_kernel, inlined_kernel, inner_kernel
 
 SUMS = 17
 
@@ -64,7 +64,7 @@ def fit_law(law: FloatArray) -> FloatArray:
     return table
 
 
-@kernel
+@inner_kernel
 def is_bent(law: FloatArray) -> bool:
     """Whether a law as :func:`fit_law` gives it is curved, so that the strain's variance counts."""
     if law.shape[0] != 2:
@@ -75,7 +75,7 @@ def is_bent(law: FloatArray) -> bool:
     return bent
 
 
-@fast_kernel
+@fast_inner_kernel
 def footprint_energy(packed: FloatArray, count: int) -> tuple[float, float]:
     """Σ W p² [Pa²] and Σ W over the packed cells."""
     energy = 0.0
@@ -131,7 +131,7 @@ def _compared(
     return residual, response, 1.0 if counts else 0.0
 
 
-@fast_kernel
+@fast_inner_kernel
 def press(packed: FloatArray, count: int, u: float, v: float, w: float, law: FloatArray) -> None:
     """Put the material into the packed cells, in place.
 
@@ -170,7 +170,7 @@ def press(packed: FloatArray, count: int, u: float, v: float, w: float, law: Flo
         packed[BY_W, k] = slope * g_y
 
 
-@fast_kernel
+@fast_inner_kernel
 def accumulate(
     packed: FloatArray,
     count: int,

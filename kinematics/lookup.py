@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinematics.contact import theta_limit
-from kinematics.kernels import inlined_kernel, kernel
+from kinematics.kernels import inlined_kernel, inner_kernel, kernel
 from kinematics.lanes import SIZES, Pointer, address, polynomials
 
 FloatArray = NDArray[np.float64]
@@ -133,7 +133,7 @@ def _from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
     return ratios
 
 
-@kernel
+@inner_kernel
 def _from_square(p: Pointer, form: int, h: float, y: float) -> Ratios:
     """The five ratios by one of the forms in pieces of h and y."""
     if form == 1:
@@ -159,7 +159,7 @@ def _share(y: float, count: int) -> tuple[int, float]:
     return j, 2.0 * (y - j) - 1.0
 
 
-@kernel
+@inner_kernel
 def _from_corner(p: Pointer, h: float, y: float) -> Ratios:
     """The five ratios A + B log h below the lowest octave."""
     j, y = _share(y, CORNER_PIECES)
@@ -232,7 +232,7 @@ def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: 
     )
 
 
-@kernel
+@inner_kernel
 def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, float, float, bool]:
     """d, h, sin θ, cos θ, gap and ``inside`` at any d > 0 and θ, clamped to the domain."""
     radius = p[RADIUS]
@@ -272,7 +272,7 @@ def lookup_at(p: Pointer, d: float, theta: float) -> Six:
     return _at(p, d, h, s, c, gap, inside)
 
 
-@inlined_kernel
+@kernel
 def lookup(data: FloatArray, d: float, theta: float) -> Six:
     """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinematics.contact import flatten
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ _PIECE_DEGREE = 8  # up to here one expansion about 0 keeps all digits
 _PIECES = 8
 
 
-@kernel
+@inner_kernel
 def stress_at(law: FloatArray, strain: float) -> float:
     """σ(ε) [Pa] from ``law`` [pieces, order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
     if strain <= 0.0:
@@ -55,7 +55,7 @@ def stress_at(law: FloatArray, strain: float) -> float:
     return result
 
 
-@kernel
+@inner_kernel
 def energy_density_at(energy_law: FloatArray, strain: float) -> float:
     """w(ε) = ∫₀^ε σ [J/m³] from ``energy_law``; 0 for ε ≤ 0, beyond ε = 1 as σ is continued."""
     if strain <= 0.0:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinematics.footprint import FloatArray, Geometry, IntArray
-from kinematics.kernels import fast_kernel
+from kinematics.kernels import fast_inner_kernel
 from kinematics.lanes import Pointer
 
 # Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's middle, or
@@ -52,7 +52,7 @@ def cell_middles(
     return planes, bounds
 
 
-@fast_kernel
+@fast_inner_kernel
 def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[float, float, float]:
     """Σ p, which tells what is no number, Σ p² and the largest p, at least 0, of first..last."""
     total = 0.0
@@ -69,7 +69,7 @@ def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[floa
     return total, energy, np.int64(peak).view(np.float64)
 
 
-@fast_kernel
+@fast_inner_kernel
 def sums_above(
     frame: Pointer, middles: Pointer, size: int, first: int, last: int, level: float
 ) -> tuple[float, float, float, float]:
@@ -86,7 +86,7 @@ def sums_above(
     return total, sum_x, sum_y, number
 
 
-@fast_kernel
+@fast_inner_kernel
 def sums_inside(
     frame: Pointer,
     middles: Pointer,
@@ -118,7 +118,7 @@ def sums_inside(
     return total, sum_x, sum_y, square, number
 
 
-@fast_kernel
+@fast_inner_kernel
 def _any_of_64(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
     found = False
     for k in range(start, start + 64):
@@ -126,7 +126,7 @@ def _any_of_64(frame: Pointer, height: Pointer, start: int, level: float) -> boo
     return found
 
 
-@fast_kernel
+@fast_inner_kernel
 def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
     found = False
     for k in range(start, start + 8):
@@ -134,7 +134,7 @@ def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool
     return found
 
 
-@fast_kernel
+@fast_inner_kernel
 def next_above(frame: Pointer, height: Pointer, start: int, last: int, level: float) -> int:
     """The first cell in start..last that reads ``level`` or more; ``last`` if there is none."""
     while start + 64 <= last and not _any_of_64(frame, height, start, level):

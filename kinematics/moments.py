@@ -18,7 +18,7 @@ import numpy as np
 from kinematics.activity import neighbourhood
 from kinematics.contact import Fingertip
 from kinematics.footprint import FloatArray, Geometry, IntArray, extremes, plane
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.lanes import address
 from kinematics.material import Material
 from kinematics.middles import FIRST, LAST, X, Y, next_above, sums_above, sums_inside
@@ -73,7 +73,7 @@ def closed_trace(a: float, d: float, s: float) -> float:
     return d * (4.0 * a - d) / 6.0 - s * s * d * (12.0 * a - 5.0 * d) / 36.0
 
 
-@kernel
+@inner_kernel
 def _ratio(ratios: FloatArray, a: float, d: float, column: int) -> float:
     t = min(max(d / (RATIO_END * a), 0.0), 0.999999) * (RATIO_POINTS - 1)
     k = int(t)
@@ -81,7 +81,7 @@ def _ratio(ratios: FloatArray, a: float, d: float, column: int) -> float:
     return float(ratios[k, column] * (1.0 - t) + ratios[k + 1, column] * t)
 
 
-@kernel
+@inner_kernel
 def footprint_moments(
     frame: FloatArray,
     middles: FloatArray,
@@ -122,7 +122,7 @@ def footprint_moments(
     return total, x, y, square / total - x * x - y * y - own, number
 
 
-@kernel
+@inner_kernel
 def from_extent(a: float, trace: float, reach: float, ratios: FloatArray, start: float) -> float:
     """d from the trace of the pressure's covariance and the centroid's distance ``reach``.
 
@@ -141,7 +141,7 @@ def from_extent(a: float, trace: float, reach: float, ratios: FloatArray, start:
     return d
 
 
-@kernel
+@inner_kernel
 def coarse(
     frame: FloatArray,
     middles: FloatArray,
@@ -165,7 +165,7 @@ def coarse(
     return _from_area(geometry, sum_x / total, sum_y / total, number)
 
 
-@kernel
+@inner_kernel
 def coarse_weak(
     frame: FloatArray,
     middles: FloatArray,
@@ -202,7 +202,7 @@ def coarse_weak(
     return _from_area(geometry, sum_x / total, sum_y / total, 1.3 * number)
 
 
-@kernel
+@inner_kernel
 def _from_area(geometry: Geometry, x: float, y: float, number: float) -> tuple[float, float, float]:
     """(d, n_x, n_y) of a contact of so many cells round a place [m]."""
     a, _, _, pitch_x, pitch_y = geometry
@@ -213,7 +213,7 @@ def _from_area(geometry: Geometry, x: float, y: float, number: float) -> tuple[f
     return d, n_x, n_y
 
 
-@kernel
+@inner_kernel
 def bounded(n_x: float, n_y: float) -> tuple[float, float]:
     """(n_x, n_y) shortened to at most 0.95."""
     length = math.hypot(n_x, n_y)
@@ -222,7 +222,7 @@ def bounded(n_x: float, n_y: float) -> tuple[float, float]:
     return n_x, n_y
 
 
-@kernel
+@inner_kernel
 def refine(
     frame: FloatArray,
     middles: FloatArray,
@@ -262,7 +262,7 @@ def refine(
     return d, n_x, n_y, gain
 
 
-@kernel
+@inner_kernel
 def _contact(
     moments: tuple[float, float, float, float, float],
     geometry: Geometry,

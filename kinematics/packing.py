@@ -49,10 +49,10 @@ from kinematics.footprint import (
     extremes,
     line_spans,
 )
-from kinematics.kernels import fast_kernel, kernel
+from kinematics.kernels import fast_inner_kernel, inner_kernel
 
 
-@kernel
+@inner_kernel
 def pack(
     u: float,
     v: float,
@@ -187,7 +187,7 @@ def pack(
     return count
 
 
-@fast_kernel
+@fast_inner_kernel
 def copy_whole(
     cells: FloatArray,
     row: FloatArray,

@@ -32,7 +32,7 @@ from kinematics.footprint import (
     line_span,
     plane,
 )
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.material import Material
 
 NODES = 512 + NODES_A_CELL
@@ -48,7 +48,7 @@ def render_scratch(grid: SensorGrid) -> tuple[FloatArray, IntArray, FloatArray]:
     )
 
 
-@kernel
+@inner_kernel
 def _flush(
     nodes: FloatArray,
     count: int,

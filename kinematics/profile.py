@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinematics.contact import Fingertip
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.material import Material, energy_density_at, stress_at
 
 FloatArray = NDArray[np.float64]
@@ -131,7 +131,7 @@ def _breaks(profile: TipProfile, s: float, c: float, h: float) -> FloatArray:
     return np.unique(np.asarray(radii))
 
 
-@kernel
+@inner_kernel
 def _height(pieces: FloatArray, r: float) -> float:
     square = r * r
     k = pieces.shape[0] - 1
@@ -199,7 +199,7 @@ def _integrate(
     return force, energy, push
 
 
-@kernel
+@inner_kernel
 def _angle(distance: float, reach: float) -> float:
     """Half the angle over which reach·cos ψ > distance."""
     if distance >= reach:

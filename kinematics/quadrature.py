@@ -22,8 +22,8 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 
-from kinematics.contact import Closed, Fingertip, closed_form, flatten, theta_limit
-from kinematics.kernels import kernel
+from kinematics.contact import Closed, Fingertip, closed_forms, flatten, theta_limits
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.material import Material
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +51,7 @@ def nodes_for(degree: int) -> int:
     return _NODES if degree <= 8 else _MORE_NODES
 
 
-@kernel
+@inner_kernel
 def _horner(table: FloatArray, row: int, piece: int, u: float) -> float:
     order = table.shape[2]
     value: float = table[row, piece, order - 1]
@@ -60,7 +60,7 @@ def _horner(table: FloatArray, row: int, piece: int, u: float) -> float:
     return value
 
 
-@kernel
+@inner_kernel
 def ratios(
     gauss: FloatArray,
     circle: FloatArray,
@@ -157,71 +157,52 @@ def ratios(
 
 
 @kernel
-def exact(
+def ratios_at(
     gauss: FloatArray,
     circle: FloatArray,
     parts: FloatArray,
-    radius: float,
-    modulus: float,
-    d: float,
-    theta: float,
-) -> tuple[float, float, float, float, float, float]:
-    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ) by integration, for modulus E₀ and the law's expansions.
-
-    Zeros for d ≤ 0; NaN past the limit of θ, past d = a and for NaN.
-    """
-    zero = 0.0 * theta
-    if d <= 0.0:
-        return zero, zero, zero, zero, zero, zero
-    h = (radius - d) / radius
-    s = abs(math.sin(theta))
-    c = math.cos(theta)
-    if not (h >= 0.0 and abs(theta) <= theta_limit(radius, d)):
-        return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
-    force, energy, force_d, force_theta, energy_d, energy_theta = closed_form(modulus, d, theta)
-    r_f, r_u, r_fd, r_ft, r_ut = ratios(gauss, circle, parts, d / radius, h, s, c)
-    return (
-        force * r_f,
-        energy * r_u,
-        force_d * r_fd,
-        force_theta * r_ft,
-        energy_d * r_f,
-        energy_theta * r_ut,
-    )
-
-
-@kernel
-def _exacts(
-    gauss: FloatArray,
-    circle: FloatArray,
-    parts: FloatArray,
-    radius: float,
-    modulus: float,
-    d: FloatArray,
-    theta: FloatArray,
+    delta: FloatArray,
+    h: FloatArray,
+    s: FloatArray,
+    c: FloatArray,
     out: FloatArray,
 ) -> None:
-    for i in range(d.shape[0]):
-        (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i], out[5, i]) = exact(
-            gauss, circle, parts, radius, modulus, d[i], theta[i]
+    """:func:`ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
+    for i in range(delta.shape[0]):
+        (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i]) = ratios(
+            gauss, circle, parts, delta[i], h[i], s[i], c[i]
         )
 
 
-def integrate(tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike) -> Closed:
+def integrate(
+    tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike, nodes: int | None = None
+) -> Closed:
     """Force, energy and first partials of any material by integration, to 1e-14 relative.
 
     d [m] and θ [rad] broadcast. Zeros for d ≤ 0; NaN outside the domain d ≤ a, |θ| ≤ θ's limit.
+    ``nodes`` is the number of Gauss points a piece, chosen by the law's degree when not given.
     """
     shape, (depth, tilt) = flatten(d, theta)
-    out = np.empty((6, depth.size))
-    _exacts(
-        gauss_rule(nodes_for(material.degree)),
+    radius = tip.radius
+    inside = (depth > 0.0) & (depth <= radius) & (np.abs(tilt) <= theta_limits(radius, depth))
+    within = np.flatnonzero(inside)
+    found = np.full((5, depth.size), np.nan)
+    found[:, depth <= 0.0] = 1.0
+    some = np.empty((5, within.size))
+    ratios_at(
+        gauss_rule(nodes or nodes_for(material.degree)),
         circle_rule(material.degree),
         material.expansions(),
-        tip.radius,
-        material.reference_modulus,
-        depth,
-        tilt,
-        out,
+        depth[within] / radius,
+        (radius - depth[within]) / radius,
+        np.abs(np.sin(tilt[within])),
+        np.cos(tilt[within]),
+        some,
     )
-    return Closed(*(row.reshape(shape) for row in out))
+    found[:, within] = some
+    r_f, r_u, r_fd, r_ft, r_ut = found
+    closed = closed_forms(material.reference_modulus, depth, tilt)
+    six = (
+        each * ratio for each, ratio in zip(closed, (r_f, r_u, r_fd, r_ft, r_f, r_ut), strict=True)
+    )
+    return Closed(*(row.reshape(shape) for row in six))

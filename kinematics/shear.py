@@ -13,14 +13,14 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from kinematics.held import sheared_gradient
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.table import lookup
 
 _STEPS = 4  # of Newton's method; the equation is a parabola, all but a line
 _LEAST_SLOPE = 0.2  # of what it is where no tip is tilted
 
 
-@kernel
+@inner_kernel
 def _unexplained(
     data: NDArray[float64],
     d: float,
@@ -47,7 +47,7 @@ def _unexplained(
     return left, side * arm * normal_t + theta_t + lever
 
 
-@kernel
+@inner_kernel
 def load_by_torques(
     data1: NDArray[float64],
     data2: NDArray[float64],

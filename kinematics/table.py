@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -16,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinematics.contact import Fingertip, flatten
-from kinematics.kernels import source_digest
 from kinematics.lookup import (
     FORM,
     FORMS,
@@ -67,6 +67,7 @@ _contact: Any = Contact
 
 _MAGIC = b"SFTIPTAB"
 _CHECK = 32  # bytes of a SHA-256
+_SOURCES = ("table_build", "quadrature", "contact", "material", "material_fit", "lanes", "lookup")
 
 
 class ContactTable:
@@ -168,9 +169,17 @@ class ContactTable:
 def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:
     """What a saved table is for: SHA-256 of tip, material, tolerance and the code's version."""
     law = [str(value) for value in material.coefficients]
-    builder = Path(__file__).with_name("table_build.py")
-    text = repr((VERSION, source_digest(builder), tip.radius.hex(), law, float(tolerance).hex()))
+    text = repr((VERSION, _sources(), tip.radius.hex(), law, float(tolerance).hex()))
     return hashlib.sha256(text.encode()).digest()
+
+
+@cache
+def _sources() -> str:
+    """SHA-256 of the modules that decide what is in a table."""
+    here, state = Path(__file__).parent, hashlib.sha256()
+    for name in _SOURCES:
+        state.update(here.joinpath(f"{name}.py").read_bytes())
+    return state.hexdigest()
 
 
 def aligned(size: int) -> FloatArray:

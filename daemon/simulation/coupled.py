@@ -8,13 +8,13 @@ it is here: assembled, factorised as L D Lᵀ and solved. Only kernels live here
 from __future__ import annotations
 
 from daemon.simulation import layout
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 _INVERSE = layout.FULL + 25  # of the pivots
 
 
-@kernel
+@inner_kernel
 def factorise_full(memory: Pointer, pivots: tuple[float, float], g: float) -> None:
     """Factorise M + gD + g²K of stage 1 over all five coordinates; ``g`` = γh.
 
@@ -70,7 +70,7 @@ def factorise_full(memory: Pointer, pivots: tuple[float, float], g: float) -> No
             memory[full + 5 * i + k] = share
 
 
-@kernel
+@inner_kernel
 def solve_full(memory: Pointer, out: int) -> None:
     """Solve the full matrix for the load; five results from ``out`` on, held parts 0."""
     full = layout.FULL
@@ -86,7 +86,7 @@ def solve_full(memory: Pointer, out: int) -> None:
             memory[out + i] -= memory[full + 5 * j + i] * memory[out + j]
 
 
-@kernel
+@inner_kernel
 def extra_along(memory: Pointer, row: int, along: int) -> float:
     """An extra row times the coordinates' rates from ``along`` on."""
     rate: float = 0.0
@@ -95,7 +95,7 @@ def extra_along(memory: Pointer, row: int, along: int) -> float:
     return rate
 
 
-@kernel
+@inner_kernel
 def take_extra_stiffness(memory: Pointer, along: int, shears: int, g: float) -> None:
     """Take g K r of the extra rows from the load.
 
@@ -112,7 +112,7 @@ def take_extra_stiffness(memory: Pointer, along: int, shears: int, g: float) -> 
             memory[layout.LOAD + j] -= by * memory[row + j]
 
 
-@kernel
+@inner_kernel
 def add_extra_shears(memory: Pointer, along: int, shears: int, g: float) -> None:
     """Add what the solved k of velocity, from ``along`` on, brings to the shears' k: g row·k."""
     for extra in range(layout.EXTRA_ROWS):
@@ -122,7 +122,7 @@ def add_extra_shears(memory: Pointer, along: int, shears: int, g: float) -> None
             memory[shears + number - 1] += g * extra_along(memory, row, along)
 
 
-@kernel
+@inner_kernel
 def clear_extra(memory: Pointer, first: int, last: int) -> None:
     """Take the extra rows from ``first`` to before ``last`` out of the matrix."""
     for extra in range(first, last):

@@ -15,11 +15,11 @@ from daemon.simulation.coupled import clear_extra
 from daemon.simulation.mutual import evaluate_mutual, mutual_rows, tips_are_far
 from daemon.simulation.palm import evaluate_palm, palm_is_far
 from daemon.simulation.tip import clear_row, evaluate_tip
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 
-@kernel
+@inner_kernel
 def current_reference(memory: Pointer, joint: int, q: float, rate: float) -> float:
     """Current [A] that a servo asks of its motor: its mode's law within all that bounds it.
 
@@ -44,7 +44,7 @@ def current_reference(memory: Pointer, joint: int, q: float, rate: float) -> flo
     return current
 
 
-@kernel
+@inner_kernel
 def current_slopes(memory: Pointer, joint: int, g: float) -> tuple[float, float]:
     """How steeply the reference falls with angle [A/rad] and with velocity [A·s/rad].
 
@@ -64,7 +64,7 @@ def current_slopes(memory: Pointer, joint: int, g: float) -> tuple[float, float]
     return by_q, by_rate
 
 
-@kernel
+@inner_kernel
 def stop_stiffness(memory: Pointer, joint: int) -> float:
     """Stiffness [N·m/rad] of the end stop that the joint is on or will be within a step, else 0."""
     stiffness: float = 0.0
@@ -77,7 +77,7 @@ def stop_stiffness(memory: Pointer, joint: int) -> float:
     return stiffness
 
 
-@kernel
+@inner_kernel
 def script_place(memory: Pointer, t: float) -> float:
     """x [m] of a held object at ``t``: from its start onto the left tip, back, the right, back."""
     x: float = memory[layout.SCRIPT_X]
@@ -92,7 +92,7 @@ def script_place(memory: Pointer, t: float) -> float:
     return x
 
 
-@kernel
+@inner_kernel
 def touch_palm(
     memory: Pointer,
     position: int,
@@ -114,7 +114,7 @@ def touch_palm(
         evaluate_palm(memory, position, velocity, shears, nx, ny, stage)
 
 
-@kernel
+@inner_kernel
 def touch_each_other(
     memory: Pointer,
     data: Pointer,
@@ -145,7 +145,7 @@ def touch_each_other(
             clear_extra(memory, layout.PALM_ROWS, layout.EXTRA_ROWS)
 
 
-@kernel
+@inner_kernel
 def evaluate_hand(
     memory: Pointer,
     data: Pointer,

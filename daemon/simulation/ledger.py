@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from daemon.simulation import layout
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 LOSSLESS_TOLERANCE = 1e-3  # of the energy, what smooth steps may gain in all without losses
@@ -22,7 +22,7 @@ HALVINGS = 12  # of a step that has to be shortened
 _KEPT = 20  # places of the state that are kept: all before layout.STEPS
 
 
-@kernel
+@inner_kernel
 def kinetic(memory: Pointer) -> float:
     """Kinetic energy of joints and object [J]."""
     v = layout.VELOCITY
@@ -36,7 +36,7 @@ def kinetic(memory: Pointer) -> float:
     return energy
 
 
-@kernel
+@inner_kernel
 def weight_energy(memory: Pointer) -> float:
     """Potential energy of the object's weight [J]."""
     energy: float = -memory[layout.MASS] * (
@@ -46,7 +46,7 @@ def weight_energy(memory: Pointer) -> float:
     return energy
 
 
-@kernel
+@inner_kernel
 def elastic(memory: Pointer) -> float:
     """Energy of all contacts as last evaluated in stage 0, and of the end stops [J]."""
     energy: float = memory[layout.PALM_ENERGY]
@@ -60,7 +60,7 @@ def elastic(memory: Pointer) -> float:
     return energy
 
 
-@kernel
+@inner_kernel
 def on_rim(memory: Pointer) -> bool:
     """Whether a backing plate's rim is pressed into something."""
     row = layout.TIP
@@ -70,7 +70,7 @@ def on_rim(memory: Pointer) -> bool:
     return bool(depth > 0.0)
 
 
-@kernel
+@inner_kernel
 def open_ledger(memory: Pointer) -> None:
     """Start from the energy there is, unless it is the one that the last step left."""
     total = kinetic(memory) + elastic(memory) + weight_energy(memory)
@@ -79,14 +79,14 @@ def open_ledger(memory: Pointer) -> None:
         memory[layout.LEDGER] = total
 
 
-@kernel
+@inner_kernel
 def keep_earlier(memory: Pointer) -> None:
     """Remember the state before a step."""
     for place in range(_KEPT):
         memory[layout.EARLIER + place] = memory[place]
 
 
-@kernel
+@inner_kernel
 def work_done(memory: Pointer) -> float:
     """The most that motors and pushes can have put in since the state that was kept [J]."""
     work = 0.0
@@ -101,7 +101,7 @@ def work_done(memory: Pointer) -> float:
     return work
 
 
-@kernel
+@inner_kernel
 def balance_ledger(memory: Pointer, was_on_rim: bool) -> int:
     """Enter a step's energy, brought down to what it may be: 0 when it is, else what was changed.
 
@@ -130,7 +130,7 @@ def balance_ledger(memory: Pointer, was_on_rim: bool) -> int:
     return 1 if kept >= 0.0 else 2
 
 
-@kernel
+@inner_kernel
 def shorten(memory: Pointer, share: float) -> None:
     """Leave only ``share`` of the way and of the shears that the step brought."""
     for place in range(_KEPT):
@@ -143,14 +143,14 @@ def shorten(memory: Pointer, share: float) -> None:
             memory[place] = before + share * (memory[place] - before)
 
 
-@kernel
+@inner_kernel
 def is_covered(memory: Pointer) -> bool:
     """Whether a state at rest has no more energy than it may have."""
     total = elastic(memory) + weight_energy(memory)
     return bool(total <= memory[layout.LEDGER] + work_done(memory))
 
 
-@kernel
+@inner_kernel
 def enter_changed(memory: Pointer) -> None:
     """Enter the energy of a state that :func:`balance_ledger` changed."""
     total = kinetic(memory) + elastic(memory) + weight_energy(memory)

@@ -15,13 +15,13 @@ import math
 from daemon.simulation import layout
 from daemon.simulation.outline import rim_on_plane
 from daemon.simulation.tip import D_MIN, clear_row, fade, press, stiffen_by_rim
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 _FAR = 1.5  # radii: half the centres' distance from which on nothing is evaluated
 
 
-@kernel
+@inner_kernel
 def evaluate_mutual(
     memory: Pointer,
     data: Pointer,
@@ -112,7 +112,7 @@ def evaluate_mutual(
     return touching
 
 
-@kernel
+@inner_kernel
 def tips_are_far(memory: Pointer) -> bool:
     """Whether both tips, at TIP_PLACE, are too far from each other to be looked at."""
     place = layout.TIP_PLACE
@@ -122,7 +122,7 @@ def tips_are_far(memory: Pointer) -> bool:
     return bool(way_x * way_x + way_y * way_y > far * far)
 
 
-@kernel
+@inner_kernel
 def mutual_rows(memory: Pointer) -> None:
     """Hand the first stage's rows of both tips to the coupled matrix."""
     for finger in range(2):

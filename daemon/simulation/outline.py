@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 
 from daemon.simulation import layout
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 FACE = -1.0  # radius of curvature that stands for a plane face
 _SMALLEST = 1e-12  # m
 
 
-@kernel
+@inner_kernel
 def nearest_on_rectangle(
     u: float, v: float, half_width: float, half_height: float
 ) -> tuple[float, float, float, float]:
@@ -41,7 +41,7 @@ def nearest_on_rectangle(
     return to_left * across / distance, down * along / distance, distance, 0.0
 
 
-@kernel
+@inner_kernel
 def nearest_on_polygon(memory: Pointer, u: float, v: float) -> tuple[float, float, float, float]:
     """As :func:`nearest_on_rectangle`, for the edges of layout.OUTLINE."""
     best = -math.inf
@@ -79,7 +79,7 @@ def nearest_on_polygon(memory: Pointer, u: float, v: float) -> tuple[float, floa
     return -memory[face + layout.EDGE_NORMAL_X], -memory[face + layout.EDGE_NORMAL_Y], best, FACE
 
 
-@kernel
+@inner_kernel
 def nearest(memory: Pointer, u: float, v: float) -> tuple[float, float, float, float]:
     """As :func:`nearest_on_rectangle`, for whatever shape the object has; a disc's radius last."""
     shape = memory[layout.SHAPE]
@@ -96,7 +96,7 @@ def nearest(memory: Pointer, u: float, v: float) -> tuple[float, float, float, f
     return found
 
 
-@kernel
+@inner_kernel
 def rim_on_plane(memory: Pointer, row: int, d: float, sine: float, cosine: float) -> float:
     """Press both ends of the rim into a plane; how deep the deeper one is [m], negative: a gap.
 
@@ -116,7 +116,7 @@ def rim_on_plane(memory: Pointer, row: int, d: float, sine: float, cosine: float
     return deepest
 
 
-@kernel
+@inner_kernel
 def rim_on_disc(
     memory: Pointer, row: int, away: float, roundness: float, sine: float, cosine: float
 ) -> float:

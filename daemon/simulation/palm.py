@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from daemon.simulation import layout
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 STIFFNESS = 1e5  # N/m, of each corner up and along
 LOSS = 1e-3  # s, damping over stiffness
 
 
-@kernel
+@inner_kernel
 def palm_is_far(memory: Pointer, position: int, velocity: int) -> bool:
     """Whether no point of the object can meet the palm within a step."""
     height = memory[position + 3] - memory[layout.PALM] - memory[layout.EXTENT]
@@ -27,7 +27,7 @@ def palm_is_far(memory: Pointer, position: int, velocity: int) -> bool:
     return bool(height > memory[layout.STEP] * (abs(rate) + abs(turning)))
 
 
-@kernel
+@inner_kernel
 def evaluate_palm(
     memory: Pointer, position: int, velocity: int, shear: int, nx: float, ny: float, stage: np.int64
 ) -> None:

@@ -49,7 +49,7 @@ from daemon.simulation.ledger import (
 )
 from daemon.simulation.samples import settle
 from daemon.simulation.solver import factorise, joint_pivot, shear_along, solve, take_stiffness
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 from kinematics.lanes import Pointer, address
 
 FloatArray = NDArray[np.float64]
@@ -59,13 +59,13 @@ _LATER = layout.TIP + 2 * layout.TIP_ROW  # the tips' rows of stage 2
 _SHEARS = 6  # of palm and tips on each other
 
 
-@kernel
+@inner_kernel
 def bounded(value: float, most: float) -> float:
     """``value`` within ± ``most``."""
     return min(max(value, -most), most)
 
 
-@kernel
+@inner_kernel
 def load_motors(
     memory: Pointer, stage: int, position: int, velocity: int, h: float, g: float
 ) -> None:
@@ -99,7 +99,7 @@ def load_motors(
         memory[layout.LOAD + j] += constant * (current + g * change) - g * stop * way
 
 
-@kernel
+@inner_kernel
 def current_change(memory: Pointer, joint: int, acceleration: float, g: float) -> float:
     """k of a current, for the joint's k of velocity."""
     slope = memory[layout.MOTOR + 2 + joint] + g * memory[layout.MOTOR + joint]
@@ -109,7 +109,7 @@ def current_change(memory: Pointer, joint: int, acceleration: float, g: float) -
     return change
 
 
-@kernel
+@inner_kernel
 def first_stage(memory: Pointer, g: float) -> tuple[float, float]:
     """k1 of the coordinates, velocities and currents into FIRST_X, FIRST_V; that of the shears."""
     for j in range(5):
@@ -142,7 +142,7 @@ def first_stage(memory: Pointer, g: float) -> tuple[float, float]:
     )
 
 
-@kernel
+@inner_kernel
 def second_stage(memory: Pointer, shear1: float, shear2: float, h: float, g: float) -> None:
     """k2 and the step itself, from stage 2's forces; ``shear1``, ``shear2`` are the shears' k1."""
     for j in range(5):
@@ -198,7 +198,7 @@ def second_stage(memory: Pointer, shear1: float, shear2: float, h: float, g: flo
         memory[layout.VELOCITY + j] = bounded(memory[layout.VELOCITY + j] + change, most / h)
 
 
-@kernel
+@inner_kernel
 def evaluate_state(memory: Pointer, data: Pointer) -> None:
     """Evaluate all contacts and forces of the state as it is."""
     evaluate_hand(
@@ -213,7 +213,7 @@ def evaluate_state(memory: Pointer, data: Pointer) -> None:
     )
 
 
-@kernel
+@inner_kernel
 def go_back(memory: Pointer, data: Pointer) -> None:
     """Shorten a step that leads uphill, until it doesn't, or all of it."""
     for _ in range(HALVINGS):

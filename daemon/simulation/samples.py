@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.simulation import layout
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 FloatArray = NDArray[np.float64]
 
 
-@kernel
+@inner_kernel
 def felt_row(memory: Pointer, finger: int) -> int:
     """The row of what a tip feels: of object and other tip the one that presses more."""
     row = layout.TIP + finger * layout.TIP_ROW
@@ -29,7 +29,7 @@ def felt_row(memory: Pointer, finger: int) -> int:
     return row
 
 
-@kernel
+@inner_kernel
 def sample(memory: Pointer, ring: FloatArray) -> None:
     """Write the sample that is due into ``ring``, between the recorded tips and stage 1's."""
     h = memory[layout.STEP]
@@ -55,7 +55,7 @@ def sample(memory: Pointer, ring: FloatArray) -> None:
     memory[layout.SAMPLES] = number + 1.0
 
 
-@kernel
+@inner_kernel
 def settle(memory: Pointer, ring: FloatArray) -> None:
     """Take the samples that fall due at the state's instant, then record what the tips feel."""
     while (

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from daemon.simulation import layout
 from daemon.simulation.forces import stop_stiffness
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 
 
-@kernel
+@inner_kernel
 def joint_pivot(memory: Pointer, joint: int, g: float) -> float:
     """The matrix's entry of a joint by itself: inertia, friction, stop and motor."""
     motor = memory[layout.MOTOR + 2 + joint] + g * memory[layout.MOTOR + joint]
@@ -22,7 +22,7 @@ def joint_pivot(memory: Pointer, joint: int, g: float) -> float:
     return pivot
 
 
-@kernel
+@inner_kernel
 def factorise(memory: Pointer, g: float) -> None:
     """Factorise M + gD + g²K of stage 1 into the matrix; ``g`` = γh.
 
@@ -83,7 +83,7 @@ def factorise(memory: Pointer, g: float) -> None:
     memory[layout.MATRIX + 13] = free / (f - l20 * d - l21 * rest)
 
 
-@kernel
+@inner_kernel
 def solve(memory: Pointer, out: int) -> None:
     """Solve the factorised matrix for the load; five results from ``out`` on, held parts 0."""
     m = layout.MATRIX
@@ -106,7 +106,7 @@ def solve(memory: Pointer, out: int) -> None:
     memory[out + 4] = z2
 
 
-@kernel
+@inner_kernel
 def row_along(memory: Pointer, row: int, finger: int, along: int) -> float:
     """A tip's row over (q, x, y, φ) times the coordinates' rates from ``along`` on."""
     rate: float = (
@@ -118,7 +118,7 @@ def row_along(memory: Pointer, row: int, finger: int, along: int) -> float:
     return rate
 
 
-@kernel
+@inner_kernel
 def take_stiffness(memory: Pointer, along: int, shear1: float, shear2: float, g: float) -> None:
     """Take g K r from the load, K of stage 1; r stands from ``along`` on, then both shears."""
     for finger in range(2):
@@ -138,7 +138,7 @@ def take_stiffness(memory: Pointer, along: int, shear1: float, shear2: float, g:
             )
 
 
-@kernel
+@inner_kernel
 def shear_along(memory: Pointer, finger: int, along: int) -> float:
     """Rate of a tip's d_t by stage 1's row for the coordinates' rates from ``along`` on."""
     row = layout.TIP + finger * layout.TIP_ROW + layout.JT

@@ -33,7 +33,7 @@ import math
 
 from daemon.simulation import layout
 from daemon.simulation.outline import nearest, rim_on_disc, rim_on_plane
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel
 from kinematics.lanes import Pointer
 from kinematics.lookup import lookup_at
 
@@ -45,7 +45,7 @@ _WITHIN = 5e-13  # of friction's limit
 _BEFORE_RIM = 0.03  # of the radius, when the plate is parallel to the face: end of the soft range
 
 
-@kernel
+@inner_kernel
 def fade(theta: float) -> tuple[float, float]:
     """w(θ) and dw/dθ."""
     u = (abs(theta) - _FADE_FROM) / (_FADE_TO - _FADE_FROM)
@@ -57,7 +57,7 @@ def fade(theta: float) -> tuple[float, float]:
     return 1.0 - u * u * (3.0 - 2.0 * u), slope if theta > 0.0 else -slope
 
 
-@kernel
+@inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
     """Largest ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the largest ratio.
 
@@ -72,14 +72,14 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
     return math.sqrt(n0 / n2)
 
 
-@kernel
+@inner_kernel
 def clear_row(memory: Pointer, row: int) -> None:
     """A tip without contact; d, θ and the gain stay."""
     for place in range(layout.FORCE, layout.TIP_ROW):
         memory[row + place] = 0.0
 
 
-@kernel
+@inner_kernel
 def press(
     memory: Pointer,
     data: Pointer,
@@ -221,7 +221,7 @@ def press(
     memory[row + layout.TANGENT] = tangent
 
 
-@kernel
+@inner_kernel
 def stiffen_by_rim(memory: Pointer, row: int) -> None:
     """Add the rim's stiffness to a row whose step may meet it.
 
@@ -232,7 +232,7 @@ def stiffen_by_rim(memory: Pointer, row: int) -> None:
     memory[row + layout.K_THETA] += hard * memory[layout.RADIUS] ** 2
 
 
-@kernel
+@inner_kernel
 def evaluate_tip(
     memory: Pointer,
     data: Pointer,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from daemon.tactile.byte_masks import WIDTH, clear, equal, lowest
 from kinematics.borrowed import borrowed
-from kinematics.kernels import kernel
+from kinematics.kernels import inner_kernel, kernel
 
 Bytes = NDArray[np.uint8]
 Mask: TypeAlias = np.uint64
@@ -35,7 +35,7 @@ def crc_tables() -> NDArray[np.uint16]:
     return tables
 
 
-@kernel
+@inner_kernel
 def crc16(data: Bytes, size: int, tables: NDArray[np.uint16]) -> int:
     """CRC-16/IBM-3740 of the first ``size`` bytes: polynomial 0x1021, start 0xFFFF, no inversion.
 
@@ -62,14 +62,14 @@ def crc16(data: Bytes, size: int, tables: NDArray[np.uint16]) -> int:
     return int(crc)
 
 
-@kernel
+@inner_kernel
 def _copy(source: Bytes, out: Bytes) -> None:
     # Indices that start at 0 need no look at their sign, so this becomes vector instructions.
     for k in range(source.shape[0]):
         out[k] = source[k]
 
 
-@kernel
+@inner_kernel
 def _short_codes(packet: Bytes, place: int) -> tuple[Mask, int]:
     """Which of the 64 bytes from the code at ``place`` on are codes, up to the first above 2.
 

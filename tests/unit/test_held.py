@@ -12,6 +12,12 @@ from kinematics.fingers import HandGeometry
 from kinematics.grasp import Grasp, GraspState
 from kinematics.held import held_motion, holding_levers, sheared_gradient, total_tilt
 from kinematics.table import lookup
+from tests.harness.called import called
+
+# Inner kernels, made callable.
+holding_levers = called(holding_levers)
+sheared_gradient = called(sheared_gradient)
+held_motion = called(held_motion)
 
 HAND = HandGeometry(finger_offset=0.003)
 LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)

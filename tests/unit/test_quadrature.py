@@ -14,7 +14,7 @@ from numpy.polynomial.legendre import leggauss
 from kinematics import Fingertip, Material
 from kinematics.contact import closed_forms
 from kinematics.profile import TipProfile, compress
-from kinematics.quadrature import circle_rule, gauss_rule, integrate, ratios
+from kinematics.quadrature import circle_rule, gauss_rule, integrate, ratios_at
 
 TIP = Fingertip(0.020)
 TABLE_I = Material.table_i()
@@ -89,8 +89,10 @@ def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
     s, c = math.sin(limit * share), math.cos(limit * share)
     for material, tolerance in ((TABLE_I, 2e-13), (STIFFENING, 1e-12)):
         parts = material.expansions()
-        usual = ratios(gauss_rule(), circle_rule(material.degree), parts, depth, h, s, c)
-        finer = ratios(gauss_rule(40), circle_rule(40), parts, depth, h, s, c)
+        place = np.array([[depth], [h], [s], [c]])
+        usual, finer = np.empty((2, 5, 1))
+        ratios_at(gauss_rule(), circle_rule(material.degree), parts, *place, usual)
+        ratios_at(gauss_rule(40), circle_rule(40), parts, *place, finer)
         # ∂F/∂θ may pass through zero: to F tan θ, whose ratio is that of F.
         scale = np.abs(finer)
         scale[3] = max(scale[3], scale[0])

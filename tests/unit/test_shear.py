@@ -13,6 +13,13 @@ from kinematics.grasp import Grasp, GraspState
 from kinematics.held import held_motion, holding_levers, sheared_gradient
 from kinematics.shear import load_by_torques
 from kinematics.table import lookup
+from tests.harness.called import called
+
+# Inner kernels, made callable.
+held_motion = called(held_motion)
+holding_levers = called(holding_levers)
+sheared_gradient = called(sheared_gradient)
+load_by_torques = called(load_by_torques)
 
 HAND = HandGeometry(finger_offset=0.003)
 LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from kinematics.contact import Fingertip, closed_form, closed_forms, theta_limits
 from kinematics.lookup import CLOSED, FORMS, lookup
 from kinematics.material import Material
-from kinematics.quadrature import circle_rule, exact, gauss_rule
+from kinematics.quadrature import integrate
 from kinematics.table import ContactTable, TableError
 from tools.benchmarks import contact_kernels, contact_scipy
 from tools.benchmarks.contact_report import MODES, ContactRow, Timing, aligned_table
@@ -135,14 +135,7 @@ def reference(material: Material, d: FloatArray, theta: FloatArray) -> FloatArra
         energy = force * depth / (3 * cosine)
         six = (force, energy, 2 * force / depth, force * slope, force / cosine, 2 * energy * slope)
         return np.stack(six)
-    out = np.empty((6, d.size))
-    rules = _rules(material, _REFERENCE_NODES)
-    contact_kernels.exact_batch(rules, TIP.radius, material.reference_modulus, d, theta, out)
-    return out
-
-
-def _rules(material: Material, nodes: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return gauss_rule(nodes), circle_rule(material.degree), material.expansions()
+    return np.stack(integrate(TIP, material, d, theta, _REFERENCE_NODES))
 
 
 def _error(got: Any, expected: FloatArray, outputs: int) -> float:
@@ -249,19 +242,11 @@ def _domain_case(table: ContactTable, tolerance: float, count: int) -> _Case:
 
 
 def _quadrature_case(material: Material, nodes: int, d: FloatArray, theta: FloatArray) -> _Case:
-    rules, modulus = _rules(material, nodes), material.reference_modulus
-    out = np.empty((6, d.size))
-    batch = partial(contact_kernels.exact_batch, rules, TIP.radius, modulus)
-    batch(d, theta, out)
-    error = _error(out, reference(material, d, theta), 6)
+    quadrature = partial(integrate, TIP, material, nodes=nodes)
+    error = _error(quadrature(d, theta), reference(material, d, theta), 6)
     case = _Case(f"direct quadrature, {nodes} nodes a piece", material.name, 6, error)
-    few = min(32, d.size)
-    case.subjects["loop"] = _compiled(
-        contact_kernels.exact_loop, rules, TIP.radius, modulus, d[:few], theta[:few]
-    )
-    case.subjects["kernel"] = _single(partial(exact, *rules, TIP.radius, modulus), d, theta)
-    room = np.empty((6, _TILES * d.size))
-    case.subjects["batch"] = _batch(lambda d, theta: batch(d, theta, room), d, theta)
+    case.subjects["python"] = _single(quadrature, d, theta)
+    case.subjects["batch"] = _batch(quadrature, d, theta)
     return case
 
 

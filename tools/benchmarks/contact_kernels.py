@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from kinematics.contact import closed_form
 from kinematics.kernels import kernel
-from kinematics.lookup import lookup
-from kinematics.quadrature import exact
+from kinematics.lanes import address
+from kinematics.lookup import lookup_at
 
 FloatArray = NDArray[np.float64]
 
@@ -79,21 +79,23 @@ def closed_chain_six(
 def lookup_loop_two(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
+    p = address(data)
     i = 0
     for _ in range(repeat * d.shape[0]):
         i = _next(i, d.shape[0])
-        out[i, 0], out[i, 1], _, _, _, _, _ = lookup(data, d[i], theta[i])
+        out[i, 0], out[i, 1], _, _, _, _, _ = lookup_at(p, d[i], theta[i])
 
 
 @kernel
 def lookup_loop_six(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
+    p = address(data)
     i = 0
     for _ in range(repeat * d.shape[0]):
         i = _next(i, d.shape[0])
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5], _ = lookup(
-            data, d[i], theta[i]
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5], _ = lookup_at(
+            p, d[i], theta[i]
         )
 
 
@@ -101,10 +103,11 @@ def lookup_loop_six(
 def lookup_chain_two(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
+    p = address(data)
     wait = 0.0
     for _ in range(repeat):
         for i in range(d.shape[0]):
-            out[i, 0], last, _, _, _, _, _ = lookup(data, d[i] + wait, theta[i] + wait)
+            out[i, 0], last, _, _, _, _, _ = lookup_at(p, d[i] + wait, theta[i] + wait)
             out[i, 1] = last
             wait = 0.0 * last
 
@@ -113,47 +116,12 @@ def lookup_chain_two(
 def lookup_chain_six(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
+    p = address(data)
     wait = 0.0
     for _ in range(repeat):
         for i in range(d.shape[0]):
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], last, _ = lookup(
-                data, d[i] + wait, theta[i] + wait
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], last, _ = lookup_at(
+                p, d[i] + wait, theta[i] + wait
             )
             out[i, 5] = last
             wait = 0.0 * last
-
-
-@kernel
-def exact_loop(
-    repeat: int,
-    rules: tuple[FloatArray, FloatArray, FloatArray],
-    radius: float,
-    modulus: float,
-    d: FloatArray,
-    theta: FloatArray,
-    out: FloatArray,
-) -> None:
-    gauss, circle, parts = rules
-    i = 0
-    for _ in range(repeat * d.shape[0]):
-        i = _next(i, d.shape[0])
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = exact(
-            gauss, circle, parts, radius, modulus, d[i], theta[i]
-        )
-
-
-@kernel
-def exact_batch(
-    rules: tuple[FloatArray, FloatArray, FloatArray],
-    radius: float,
-    modulus: float,
-    d: FloatArray,
-    theta: FloatArray,
-    out: FloatArray,
-) -> None:
-    """The integrals at d and θ [n] into ``out`` [6, n]."""
-    gauss, circle, parts = rules
-    for k in range(d.shape[0]):
-        out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k] = exact(
-            gauss, circle, parts, radius, modulus, d[k], theta[k]
-        )

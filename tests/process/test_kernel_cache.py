@@ -1,0 +1,131 @@
+"""The folder of compiled kernels: nothing compiled from other sources is run, nor by another user.
+
+A small package of this shape, with the real decorators, is changed and run in processes of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import kinematics
+from kinematics import kernel_cache
+
+FILES = {
+    "kinematics/__init__.py": "",
+    "kinematics/layout.py": "OFFSET = 1.0\n",
+    "kinematics/callee.py": """
+from kinematics.kernels import inner_kernel
+
+@inner_kernel
+def twice(x):
+    return 2.0 * x
+""",
+    "kinematics/caller.py": """
+from kinematics import layout
+from kinematics.callee import twice
+from kinematics.kernels import kernel
+
+@kernel
+def caller(x):
+    return twice(x) + layout.OFFSET
+""",
+}
+RUN = """
+import kinematics.caller as c
+print(c.caller(1.0), sum(c.caller.stats.cache_hits.values()))
+"""
+
+
+class Package:
+    """The small package in a folder, with a cache folder of its own beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.cache = folder / "cache"
+        for name, text in FILES.items():
+            self.write(name, text)
+        real = Path(kinematics.__file__).parent
+        for name in ("kernels.py", "kernel_cache.py", "inner_kernels.py"):
+            shutil.copy(real / name, folder / "kinematics")
+
+    def write(self, name: str, text: str) -> None:
+        """Write one of its files."""
+        file = self.folder / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+
+    def run(self) -> tuple[list[str], str]:
+        """What the kernel gave and how often it came from the cache; what was warned of."""
+        environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
+        environment.pop("NUMBA_CACHE_DIR", None)
+        done = subprocess.run(
+            [sys.executable, "-c", RUN],
+            env=environment,
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout.split(), done.stderr
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Package:
+    return Package(tmp_path)
+
+
+def test_a_changed_callee_or_constant_is_compiled_anew(package: Package) -> None:
+    assert package.run() == (["3.0", "0"], "")
+    assert package.run() == (["3.0", "1"], "")
+    package.write("kinematics/callee.py", FILES["kinematics/callee.py"].replace("2.0", "5.0"))
+    assert package.run()[0] == ["6.0", "0"]
+    package.write("kinematics/layout.py", "OFFSET = 7.0\n")
+    assert package.run()[0] == ["12.0", "0"]
+    package.write("kinematics/layout.py", "OFFSET = 1.0\n")
+    assert package.run()[0] == ["6.0", "1"], "the folder of these sources is still there"
+
+
+def test_the_folder_is_the_users_own_and_others_may_not_write_to_it(package: Package) -> None:
+    package.run()
+    (folder,) = (package.cache / "softfinger").iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    found, told = package.run()
+    assert found == ["3.0", "0"]
+    assert "others may write to it (mode 777); chmod 700" in told
+    folder.chmod(0o700)
+    assert package.run()[0] == ["3.0", "1"]
+
+
+def test_own_folder_refuses_links_files_and_other_users(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel_cache.own_folder(tmp_path / "new")
+    kernel_cache.own_folder(tmp_path / "new")
+    (tmp_path / "link").symlink_to(tmp_path / "new")
+    (tmp_path / "file").touch()
+    for name in ("link", "file"):
+        with pytest.raises(NotADirectoryError, match="found a link or a file"):
+            kernel_cache.own_folder(tmp_path / name)
+    monkeypatch.setattr(kernel_cache.os, "geteuid", lambda: 12345)
+    with pytest.raises(PermissionError, match="expected 12345"):
+        kernel_cache.own_folder(tmp_path / "new")
+
+
+def test_folders_that_were_not_used_for_longest_go(package: Package) -> None:
+    base = package.cache / "softfinger"
+    for age in range(7):
+        old = base / f"kernels-{age}"
+        old.mkdir(parents=True)
+        os.utime(old, (1e9 - age, 1e9 - age))
+    (base / "contact-1.table").touch()
+    package.run()
+    kept = {each.name for each in base.iterdir()}
+    assert {"kernels-0", "kernels-1", "kernels-2", "kernels-3", "contact-1.table"} < kept
+    assert len(kept) == 6
