@@ -19,27 +19,24 @@ import zmq
 from daemon.clock import Clock, RealClock, VirtualClock
 from daemon.commands import CommandServer
 from daemon.doorkeeper import Doorkeeper
-from daemon.grip import Grip
 from daemon.keys import load_server
 from daemon.loop import EventSink, Loop
 from daemon.messages import Facts
 from daemon.model import (
     FingerModel,
-    make_grid,
     make_material,
-    make_models,
     make_table,
-    make_tip,
 )
 from daemon.perception import FingerPerception
 from daemon.prediction import Prediction
-from daemon.records import FINGERS, Contact, ObjectPose, Reading
+from daemon.records import FINGERS
 from daemon.servos import make_servos
 from daemon.servos.base import Servos
 from daemon.settings import Settings
 from daemon.sockets import Guard
 from daemon.stream import Publisher
 from daemon.tactile import make_sensor
+from daemon.warm_up import Scene, warm_up
 from kinematics.table import ContactTable
 
 if TYPE_CHECKING:
@@ -75,14 +72,15 @@ class Daemon:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
         self.publisher = publisher
-        self.models = make_models(settings, cache, on_event)
+        scene = Scene(settings, cache, on_event)
+        self.models = scene.models
+        warm_up(scene)
         self.hand = self._make_hand(cache, on_event)
         self.servos = make_servos(settings, self.clock, self.hand)
         perceptions = self._make_perceptions()
         self.prediction: Prediction | None = None
         if perceptions and self.servos is not None:
             self.prediction = Prediction(settings, self.tables)
-        warm_up(settings, self.tables, perceptions)
         if self.servos is not None:
             self._connect(self.servos)
         for perception in perceptions:
@@ -194,34 +192,3 @@ def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> Facts:
         for model in models
     ]
     return Facts(version("softfinger"), settings.model_dump_json(), *calibrations, *tables)
-
-
-def warm_up(
-    settings: Settings,
-    tables: tuple[ContactTable, ContactTable],
-    perceptions: list[FingerPerception],
-) -> None:
-    """Run every kernel of the loop once on a made-up contact, on estimators' scratch alone."""
-    if not perceptions:
-        return
-    pressure = make_grid(settings).pressure(
-        make_tip(settings), make_material(settings.material), 0.1 * settings.tip.radius, 0.1, 0.0
-    )
-    contacts = [Contact(), Contact()]
-    for perception in perceptions:
-        perception.warm_up(pressure, contacts[perception.finger])
-    prediction = Prediction(settings, tables)
-    for k in (1, 2):
-        prediction.advance(Reading(t=0.01 * k))
-        for perception in perceptions:
-            made_up = Contact(valid=True, contact=True, d=1e-3, force=1.0, d_std=1e-5)
-            prediction.correct(perception.finger, made_up, contacts[perception.finger])
-        prediction.fill(contacts, ObjectPose())
-    grip = Grip(settings, [perception.finger for perception in perceptions])
-    grip.start(prediction.held, 1.0, 2.0)
-    grip.steer(0.0, 0.1)
-    reading = Reading()
-    grip.torques(reading, contacts, ObjectPose(), prediction.held)
-    grip.coast(reading, prediction.held)
-    if len(perceptions) == len(FINGERS):
-        grip.angles(contacts, ObjectPose(), prediction.held)

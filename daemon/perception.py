@@ -87,18 +87,6 @@ class FingerPerception:
             contact.t_sound = frame.t_arrival
         return True
 
-    def warm_up(self, pressure: NDArray[np.float64], contact: Contact) -> None:
-        """Run all kernels on a made-up ``pressure`` [Pa] and on none, so that none compiles later.
-
-        The next frame is the first again; ``contact`` is left without contact.
-        """
-        for each in (pressure, pressure, np.zeros_like(pressure)):
-            if self._converter is not None:
-                self.estimate(each, contact)
-            else:
-                counts = np.clip(np.round(each / self._scale), 0, 65535).astype(np.uint16)
-                self.estimate(counts, contact)
-
     def estimate(self, counts: NDArray[np.uint16] | NDArray[np.float64], contact: Contact) -> None:
         """Fill ``contact`` from counts, or from the pressure [Pa] of a calibrated sensor, alone."""
         estimate = self._estimator.update(counts, self._scale)

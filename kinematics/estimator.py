@@ -230,10 +230,6 @@ class ContactEstimator:
         self._state[ladder.WARM] = 0.0
         self._seq = None
 
-    def warm_up(self) -> None:
-        """Compile, or load from the cache, all that :meth:`update` needs, on an empty frame."""
-        self(np.zeros(self.grid.shape))
-
     def compiled_arguments(
         self,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, _LowerResult
 from numba.core.compiler_machinery import register_pass
@@ -37,6 +38,11 @@ class InnerKernel:
             no_cfunc_wrapper=True,
             **options,
         )(function)
+        # Numba would compile it anew for each literal among the arguments; LLVM folds them anyway.
+        resolve = self._dispatcher.get_call_template
+        self._dispatcher.get_call_template = lambda args, kws: resolve(
+            tuple(types.unliteral(each) for each in args), kws
+        )
 
     @property
     def _numba_type_(self) -> Any:

@@ -68,21 +68,9 @@ class KernelFolder:
 
 @cache
 def kernel_folder() -> Path | None:
-    """This state's folder, made when absent; None, with a warning, where there can be none.
-
-    It lies in NUMBA_CACHE_DIR where that is set, else in the user's cache directory.
-    """
-    given = os.environ.get("NUMBA_CACHE_DIR")
+    """This state's folder, made when absent; None, with a warning, where there can be none."""
     try:
-        base = Path(given) if given else user_cache()
-        folder = base / f"kernels-{digest()}"
-        if not given:
-            own_folder(base)
-        fresh = not folder.exists()
-        own_folder(folder)
-        os.utime(folder)  # by which pruning knows what is in use
-        if fresh:
-            _prune(base, folder)
+        return find_folder()
     except (OSError, RuntimeError) as error:
         warnings.warn(
             f"compiled kernels can't be kept, so every start compiles anew: {error} "
@@ -91,6 +79,23 @@ def kernel_folder() -> Path | None:
             stacklevel=2,
         )
         return None
+
+
+def find_folder() -> Path:
+    """This state's folder in NUMBA_CACHE_DIR, where that is set, or in the user's cache directory.
+
+    Raises as :func:`own_folder`, and RuntimeError where there is no home.
+    """
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    base = Path(given) if given else user_cache()
+    if not given:
+        own_folder(base)
+    folder = base / f"kernels-{digest()}"
+    fresh = not folder.exists()
+    own_folder(folder)
+    os.utime(folder)  # by which pruning knows what is in use
+    if fresh:
+        _prune(base, folder)
     return folder
 
 

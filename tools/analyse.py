@@ -44,17 +44,19 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     from daemon.tactile.base import TactileError
     from daemon.tactile.recording import RecordingError as FramesError
+    from daemon.warm_up import FRAMES
     from tools.analysis.contacts import analyse, write_csv
     from tools.analysis.sources import open_source
+    from tools.kernel_build import build_kernels, print_event, table_cache
     from tools.progress import Progress
-    from tools.run import cache_folder
 
+    build_kernels(settings, print_event, FRAMES)
     path: Path = arguments.file
     own = arguments.config is None and not arguments.set
     base = Path(str(path).rstrip("/"))
     table = arguments.csv or base.with_name(base.name + ".contacts.csv")
     try:
-        source = open_source(path, settings, cache_folder(), own)
+        source = open_source(path, settings, table_cache(), own)
         began = time.perf_counter()
         with Progress("analyse", source.total) as progress:
             contacts = analyse(source, progress)

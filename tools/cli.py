@@ -27,6 +27,7 @@ SUBCOMMANDS = {
     "scan": "find the servos on a port, at any rate",
     "calibrate": "calibrate the pressure sensor under a tip, step by step",
     "limits": "every limit of the hand: what is judged, what follows, which setting",
+    "compile": "compile a hand's kernels now, not at its first start",
     "keys": "make the keys that addresses off this machine need",
     "install-service": "a systemd unit and udev rules for this machine",
     "figures": "the paper's figures from this model, as CSV and PNG",

@@ -13,13 +13,13 @@ from daemon.checkup.addresses import check_addresses
 from daemon.checkup.hand import check_board, check_servos
 from daemon.checkup.kernels import check_kernels
 from daemon.checkup.machine import check_machine
-from daemon.checkup.mending import mend_kernels, mend_latency_timer, mend_servos
+from daemon.checkup.mending import mend_latency_timer, mend_servos
 from daemon.checkup.ports import check_latency_timer, check_port, note_ports
 from daemon.checkup.result import Result
 from daemon.records import FINGERS
 from daemon.settings import Settings, SettingsError
 from tools.arguments import add_profile, profile
-from tools.run import cache_folder
+from tools.kernel_build import build_kernels, print_event
 
 _PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board
 _EPILOG = """\
@@ -80,8 +80,8 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
             if free[tactile.port[finger]]:
                 yield check_board(settings, finger)
     yield from check_machine()
-    if fix and any(result.status == "warn" for result in check_kernels(settings)):
-        yield mend_kernels(settings, cache_folder())
+    if fix:
+        build_kernels(settings, print_event)
     yield from check_kernels(settings)
     yield from check_addresses(settings)
 

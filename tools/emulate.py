@@ -141,9 +141,11 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals)
     from daemon.realtime import RealTime, hold_collector
 
     hold_collector()
-    from daemon.simulation.emulator import Emulator, EmulatorError
-    from tools.run import cache_folder
+    from daemon.simulation.emulator import Emulator, EmulatorError, with_board
+    from daemon.warm_up import EMULATED
+    from tools.kernel_build import build_kernels, print_event, table_cache
 
+    build_kernels(with_board(settings), print_event, EMULATED)
     try:
         emulator = Emulator(
             settings,
@@ -153,7 +155,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals)
             prepared=not arguments.factory,
             ids=arguments.ids,
             faults=arguments.fault,
-            table_cache=cache_folder(),
+            table_cache=table_cache(),
             undisturbed=signals.held,
         )
     except (EmulatorError, SettingsError) as error:

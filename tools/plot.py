@@ -48,12 +48,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw; 1 with one line when the recording, the folder or an extra is no good."""
+    from daemon.settings import Settings
+    from daemon.warm_up import FRAMES
     from tools.analysis.plots import draw
     from tools.analysis.plots_data import load_run
     from tools.figure_pages import style
+    from tools.kernel_build import build_kernels, print_event, table_cache
     from tools.progress import Progress
     from tools.recordings.reader import Recording
-    from tools.run import cache_folder
 
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
@@ -65,8 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
         with style.settings():
             pass  # before a long recording is read: is there anything to draw with?
         recording = Recording(path, teller("plot"))
+        build_kernels(Settings(), print_event, FRAMES)
         with Progress("plot", recording.size) as progress:
-            held = load_run(recording, start, end, cache_folder(), progress)
+            held = load_run(recording, start, end, table_cache(), progress)
         folder.mkdir(parents=True, exist_ok=True)
         for name, file, why in draw(held, names, arguments.format, folder):
             if file is None:

@@ -114,13 +114,15 @@ def _publish(arguments: argparse.Namespace, recording: Any) -> int:
 
 def _recompute(arguments: argparse.Namespace, recording: Any) -> int:
     from daemon.profiles import load
+    from daemon.settings import Settings
+    from tools.kernel_build import build_kernels, print_event, table_cache
     from tools.progress import Progress
     from tools.recordings.recomputed import recompute
-    from tools.run import cache_folder
 
     settings = None if arguments.config is None else load(arguments.config)
+    build_kernels(settings or Settings(), print_event)
     with Progress("recompute", recording.size) as progress:
-        result = recompute(recording, settings, cache_folder(), progress)
+        result = recompute(recording, settings, table_cache(), progress)
     print(
         f"{arguments.file}: {result.ticks} ticks, {result.states} states of {result.fields} fields "
         "compared"

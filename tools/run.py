@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import time
@@ -85,11 +84,12 @@ def _serve(
     from daemon.servos.base import ServoError
     from daemon.sockets import AddressError
     from daemon.tactile.base import TactileError
+    from tools.kernel_build import build_kernels, table_cache
 
     log.line("info", "start", f"softfinger: {_scene(settings)}")
-    log.line("info", "start", "kernels that are new take half a minute to compile")
+    build_kernels(settings, log.line)
     try:
-        daemon = Daemon(settings, on_event=log.line, table_cache=cache_folder())
+        daemon = Daemon(settings, on_event=log.line, table_cache=table_cache())
     except (SettingsError, AddressError, ServoError, TactileError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
         return 1
@@ -213,14 +213,3 @@ class _Signals:
     def _stop(self, _number: int, _frame: Any) -> None:
         if self._loop is not None:
             self._loop.stop()
-
-
-def cache_folder() -> Path | None:
-    """Where built contact tables are kept between runs; None where there is no home for it."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    if base:
-        return Path(base) / "softfinger"
-    try:
-        return Path.home() / ".cache" / "softfinger"
-    except RuntimeError:
-        return None

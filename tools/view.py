@@ -130,6 +130,9 @@ class _View:
 
     def show(self) -> int:
         """From the first message to the end."""
+        from daemon.settings import Settings
+        from daemon.warm_up import LANDSCAPE
+        from tools.kernel_build import build_kernels
         from tools.viewing.known import warm_up
 
         arguments, ending = self._arguments, self._ending
@@ -144,6 +147,7 @@ class _View:
             if arguments.web or arguments.save is None:
                 viewer = self._open()
             self._connect(viewer)
+            build_kernels(Settings(), lambda _level, _kind, text: self._say(text), LANDSCAPE)
             warm_up()
             ending.begin()
             if recording is None:

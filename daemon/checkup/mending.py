@@ -1,4 +1,4 @@
-"""What `softfinger doctor --fix` changes, and nothing else: adapters, servos, compiled kernels.
+"""What `softfinger doctor --fix` changes, and nothing else: adapters and servos.
 
 The hand lets go where a servo's EEPROM has to be written; nothing is ever stiffened or moved.
 """
@@ -6,13 +6,12 @@ The hand lets go where a servo's EEPROM has to be written; nothing is ever stiff
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from daemon.checkup.ports import check_latency_timer, latency_file
 from daemon.checkup.result import Result
 from daemon.servos.base import ServoError
 from daemon.servos.mend import mend
-from daemon.settings import Loop, ServoSettings, Settings
+from daemon.settings import Settings
 
 
 def mend_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
@@ -50,26 +49,3 @@ def _line(text: str) -> Result:
     if done == text:
         return Result("warn", name, f"not mended: {what}")
     return Result("fixed", name, what.removesuffix(")"))
-
-
-def mend_kernels(settings: Settings, table_cache: Path | None = None) -> Result:
-    """Compile this scene's kernels, so that the next start is short, on a simulated hand's frames.
-
-    ``table_cache`` is where the contact table is kept.
-    """
-    # Imported here, since it brings everything that the daemon has.
-    from daemon.assembly import Daemon
-
-    backends: dict[str, Any] = {
-        "loop": Loop(clock="virtual"),
-        "servos": ServoSettings(
-            backend="none" if settings.servos.backend == "none" else "simulated"
-        ),
-    }
-    if settings.tactile.backend != "none":
-        backends["tactile"] = settings.tactile.model_copy(update={"backend": "simulated"})
-    with Daemon(
-        settings.model_copy(update=backends), wire=False, table_cache=table_cache
-    ) as daemon:
-        daemon.loop.advance(0.1)
-    return Result("fixed", "kernels", "compiled")

@@ -21,7 +21,6 @@ from typing import Any
 from daemon.model import make_material, make_table
 from daemon.records import FINGERS
 from daemon.settings import Settings, TactileSettings
-from daemon.simulation import protocol
 from daemon.simulation.bus_faults import FaultError, ReplyFaults
 from daemon.simulation.control_port import ControlPort
 from daemon.simulation.encoders import ENCODERS, encoder_for
@@ -182,7 +181,6 @@ class Emulator:
             raise EmulatorError(f"servos.model: {error.args[0]}") from None
         except ValueError as error:
             raise EmulatorError(str(error)) from None
-        protocol.crc16(b"")  # compiled before anyone waits for an answer
         link = self._links.path / "servos"
         return PtyServoBus(bus, link, baud=baud, latency=latency, clock=self.clock.now)
 

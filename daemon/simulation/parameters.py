@@ -47,9 +47,9 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     """Sub-step [s] from the stiffest oscillation of the object on the tips, deeply grasped."""
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius)
-    c = table(np.array([d]), np.array([0.0]))
+    c = table(d, 0.0)
     # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
-    stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d[0]), 2.0 * c.force[0] / d)
+    stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     shape = shape_of(simulation)
     if shape.kind == layout.NO_OBJECT:
         fastest = geometry_of(settings).reach * math.sqrt(stiffness / simulation.joint_inertia)

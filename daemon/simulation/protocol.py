@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import numpy as np
-
-from kinematics.kernels import kernel
+from daemon.servos.crc import crc16
 
 HEADER: Final = b"\xff\xff\xfd"
 BROADCAST: Final = 0xFE
@@ -48,32 +46,6 @@ _PREFIX: Final = HEADER + b"\x00"
 _STUFFED: Final = HEADER + b"\xfd"
 _ASKED_AGAIN: Final = frozenset((READ, SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ))
 _KNOWN: Final = 32  # requests remembered
-
-
-def _crc_table() -> np.ndarray[tuple[int], np.dtype[np.uint16]]:
-    """Remainders of every byte for x¹⁶ + x¹⁵ + x² + 1, most significant bit first."""
-    table = []
-    for value in range(256):
-        register = value << 8
-        for _ in range(8):
-            register = (register << 1) ^ 0x8005 if register & 0x8000 else register << 1
-        table.append(register & 0xFFFF)
-    return np.array(table, np.uint16)
-
-
-_CRC: Final = _crc_table()
-
-
-@kernel
-def _crc16(data: bytes, crc: int) -> int:
-    for byte in data:
-        crc = (crc << 8 & 0xFF00) ^ _CRC[crc >> 8 ^ byte]
-    return crc
-
-
-def crc16(data: bytes, crc: int = 0) -> int:
-    """CRC-16 with polynomial 0x8005 over ``data``, going on from ``crc``; not reflected."""
-    return _crc16(data, crc)
 
 
 def stuff(body: bytes) -> bytes:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from daemon.servos import registers as reg
+from daemon.servos.crc import crc16
 from daemon.servos.models import ServoModel, by_name
 from daemon.servos.modes import mode_number
 from daemon.servos.units import JointScale
@@ -317,7 +318,7 @@ class ServoBus:
             # Each CRC goes over all bytes before it, the earlier CRCs too.
             piece += bytes((error | servo.alert, servo_id))
             piece += bytes(length) if data is None else data
-            crc = protocol.crc16(piece, crc)
+            crc = crc16(piece, crc)
             block += piece
             piece = crc.to_bytes(2, "little")
             delay += servo.return_delay

@@ -17,6 +17,23 @@ from daemon.simulation.hand import SimulatedHand
 from daemon.simulation.sensor_model import Imperfections, SensorModel
 
 
+def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
+    """The pressure sensor under one simulated tip."""
+    simulation, tactile = settings.simulation, settings.tactile
+    return SensorModel(
+        make_grid(settings, finger),
+        make_tip(settings),
+        make_material(settings.material),
+        tactile.pascal_per_count,
+        Imperfections.of(simulation),
+        seed=(simulation.seed, finger),
+        full_count=tactile.full_count,
+        gain=simulation.modulus_scale,
+        dead=tactile.dead[finger],
+        threshold=tactile.threshold,
+    )
+
+
 class SimulatedTactile:
     """Frames of one fingertip of a :class:`SimulatedHand`.
 
@@ -41,22 +58,8 @@ class SimulatedTactile:
             (simulation.seed, finger, 1),
         )
         self._shape = (tactile.rows, tactile.cols)
-        self._model = SensorModel(
-            make_grid(settings, finger),
-            make_tip(settings),
-            make_material(settings.material),
-            tactile.pascal_per_count,
-            Imperfections.of(simulation),
-            seed=(simulation.seed, finger),
-            full_count=tactile.full_count,
-            gain=simulation.modulus_scale,
-            dead=tactile.dead[finger],
-            threshold=tactile.threshold,
-        )
+        self._model = make_sensor_model(settings, finger)
         self._radius = settings.tip.radius
-        if simulation.object_shape == "disc":
-            # So that no kernel has to be loaded when the disc is touched.
-            self._model.press(0.0, 0.0, 0.0, 0.0, 1.0 / simulation.object_radius)
         self._pressed = -1  # number of the newest sample that the cells have felt
         self._frame: Frame | None = None
         self._lost = 0

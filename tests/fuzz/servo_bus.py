@@ -13,6 +13,7 @@ import time
 from typing import NamedTuple
 
 from daemon.servos import registers as reg
+from daemon.servos.crc import crc16
 from daemon.simulation import protocol
 from daemon.simulation.protocol import BROADCAST, Parser, frame
 from daemon.simulation.servo import REBOOT_TIME, EmulatedServo
@@ -59,7 +60,7 @@ def mutated(source: random.Random) -> bytes:
         else:
             packet.insert(at, source.choice((0xFF, 0xFD, 0, 1, 0x55)))
     if source.random() < 0.7:  # most get a right CRC, so that they come through
-        packet[-2:] = protocol.crc16(bytes(packet[:-2])).to_bytes(2, "little")
+        packet[-2:] = crc16(bytes(packet[:-2])).to_bytes(2, "little")
     return bytes(packet)
 
 

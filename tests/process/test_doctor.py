@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zmq
 
+from daemon import warm_up
 from daemon.checkup import addresses as sockets
 from daemon.checkup import hand, kernels, machine, mending, ports
 from daemon.checkup.result import Result
@@ -301,35 +301,23 @@ def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
     assert len(machine.wake_ups()) == 5
 
 
-def test_kernels_cold_warm_and_stale(tmp_path, monkeypatch):
-    module = tmp_path / "some_kernels.py"
-    text = "from kinematics.kernels import kernel\n\n\n@kernel\ndef twice(x):\n    return {} * x\n"
-    module.write_text(text.format("2.0"))
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(kernels, "_SENSING", (("some_kernels", "twice"),))
-    scene = Settings.model_validate(
-        {"servos": {"backend": "none"}, "tactile": {"backend": "flexitac"}}
-    )
-
-    def last() -> Result:
-        return kernels.check_kernels(scene)[-1]
-
-    assert last().status == "warn"
-    assert "half a minute" in last().text
-    import some_kernels
-
-    assert some_kernels.twice(np.float64(2.0)) == 4.0
-    assert last().status == "pass"
-    some_kernels.twice._cache._cache_file._source_stamp = "another source's"
-    assert last().status == "warn"
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    assert "NUMBA_CACHE_DIR" in kernels.check_kernels(scene)[0].mend
-
-
-def test_mending_compiles_what_the_scene_needs():
-    scene = load(HIL, Path("/nowhere"))
-    assert mending.mend_kernels(scene).status == "fixed"
-    assert [found.status for found in kernels.check_kernels(scene)][-1] == "pass"
+def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
+    scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(warm_up, "kernel_folder", lambda: tmp_path)
+    (found,) = kernels.check_kernels(scene)
+    assert found.status == "warn"
+    assert "contact table not compiled yet" in found.text
+    for part in warm_up.parts(scene):
+        warm_up.mark_built(part)
+    (found,) = kernels.check_kernels(scene)
+    assert found.status == "pass"
+    (folder,) = tmp_path.glob("kernels-*")
+    folder.chmod(0o777)
+    (found,) = kernels.check_kernels(scene)
+    assert found.status == "warn"
+    assert "others may write to it" in found.text
+    assert "NUMBA_CACHE_DIR" in found.mend
 
 
 # Sockets.

@@ -1,0 +1,106 @@
+"""Kernels compiled ahead: `softfinger compile`, its processes, and what is said meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from daemon.settings import Settings
+from daemon.warm_up import named
+from tests.conftest import until
+from tests.harness.daemon_process import SOFTFINGER
+
+BARE = ["--set", "servos.backend=dynamixel", "--set", "tactile.backend=none"]
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """An own, cold cache."""
+    own = os.environ | {"XDG_CACHE_HOME": str(folder)}
+    own.pop("NUMBA_CACHE_DIR", None)
+    return own
+
+
+def compiled(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """The whole command."""
+    return subprocess.run(
+        [*SOFTFINGER, "compile", *BARE, *words],
+        env=environment(folder),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def steep(folder: Path) -> Path:
+    """A profile whose material no table reaches the tolerance for."""
+    strain = [0.1 * k for k in range(11)]
+    stress = [1e5 * (math.exp(5.0 * each) - 1.0) for each in strain]
+    file = folder / "steep.toml"
+    file.write_text(
+        f"table.tolerance = 1e-13\n[material]\nlaw = 'points'\n{strain = }\n{stress = }\n"
+    )
+    return file
+
+
+def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
+    tmp_path: Path,
+) -> None:
+    table = named("contact table")
+    settings = Settings().model_dump_json()
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.kernel_worker"],
+        input=f"{settings}\n\n{table.name}\n",
+        env=environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    *kernels, last = done.stdout.splitlines()
+    assert last == "done"
+    assert 0.8 * table.kernels <= len(kernels) <= 1.2 * table.kernels
+    rest = compiled(tmp_path)
+    assert rest.returncode == 0
+    first, last = rest.stderr.splitlines()
+    assert first == "compiling kernels, on the first start only: filter and grip"
+    assert last.startswith("compiled in ")
+    again = compiled(tmp_path)
+    assert (again.returncode, again.stdout, again.stderr) == (0, "all kernels are compiled\n", "")
+    # What can't be built is told, and by the exit status, too.
+    (folder,) = (tmp_path / "softfinger").glob("kernels-*")
+    (folder / "contact-table.built").unlink()
+    bad = compiled(tmp_path, "--config", str(steep(tmp_path)))
+    assert bad.returncode == 1
+    assert "contact table was not compiled ahead: SettingsError: table.tolerance" in bad.stderr
+
+
+def alive(folder: Path) -> list[str]:
+    """Processes that compile into ``folder``."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if str(folder).encode() in (process / "environ").read_bytes():
+                found.append(process.name)
+    return found
+
+
+def test_ctrl_c_ends_every_process(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*SOFTFINGER, "compile"], env=environment(tmp_path), stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    try:
+        assert process.stderr.readline().startswith("compiling kernels, on the first start only:")
+        until(lambda: len(alive(tmp_path)) > 1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        until(lambda: not alive(tmp_path))
+        assert process.stderr.read() == ""
+    finally:
+        process.kill()
+        process.wait()
+        process.stderr.close()

@@ -1,0 +1,35 @@
+"""``softfinger compile``: the kernels of a hand, compiled now instead of at its first start."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from daemon.settings import SettingsError
+from tools.arguments import add_profile, profile
+from tools.kernel_build import build_kernels, print_event
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``compile``."""
+    add_profile(parser)
+    parser.add_argument(
+        "--all", action="store_true", help="also what the other tools and the tests use"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compile what is missing; 1 when something could not be, 2 with the report on the settings."""
+    try:
+        settings = profile(arguments)
+    except SettingsError as error:
+        print(error, file=sys.stderr)
+        return 2
+    from daemon.warm_up import ALL
+
+    built = build_kernels(settings, print_event, ALL if arguments.all else None)
+    if built.failed:
+        return 1
+    if not built.parts:
+        print("all kernels are compiled")
+    return 0
