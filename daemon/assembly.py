@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import zmq
 
-from daemon.clock import Clock, RealClock, VirtualClock
+from daemon.clock import LoopClock, make_clock
 from daemon.commands import CommandServer
 from daemon.doorkeeper import Doorkeeper
 from daemon.keys import load_server
@@ -59,8 +59,7 @@ class Daemon:
         table_cache: Path | None = None,
     ) -> None:
         self.settings = settings
-        virtual = settings.loop.clock == "virtual"
-        self.clock: Clock = VirtualClock() if virtual else RealClock(settings.realtime.spin)
+        self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
         try:
             self._assemble(on_event, wire, table_cache)
@@ -117,7 +116,7 @@ class Daemon:
             commands.max_bytes,
             commands.per_second,
             guard,
-            self.clock.now,
+            self.clock.host,
         )
         self._closers.append(server.close)
         return publisher, server

@@ -94,12 +94,13 @@ class Broadcast:
         )
 
     def _rates(self, state: State) -> Rates:
-        """Rates [Hz] since they were last asked for."""
+        """Rates [Hz] since they were last asked for, by the machine's time."""
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frames
         last = self._told
-        now = self._told = _Counts(state.t, state.seq, self._states, self._maps, *frames)
+        t = state.t + state.timing.behind_s
+        now = self._told = _Counts(t, state.seq, self._states, self._maps, *frames)
         per = 1.0 / (now.t - last.t) if now.t > last.t else 0.0
         return Rates(
             tick=per * (now.ticks - last.ticks),

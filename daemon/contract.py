@@ -73,6 +73,13 @@ _STATE = (
     Field("wake_late_s", "float", "s", "this tick's start after its deadline"),
     Field("overruns", "int", "", "ticks whose work outlasted the period"),
     Field(
+        "behind_s",
+        "float",
+        "s",
+        "how long a hand simulated in the daemon has waited for a busy machine since the start: "
+        "what its time is behind by; 0 for other hands",
+    ),
+    Field(
         "goal_force",
         "float",
         "N",
@@ -148,6 +155,7 @@ _INPUT = (
     Field("mono_ns", "int", "ns", "the daemon's monotonic clock at the tick"),
     Field("t", "float", "s", "the same, with all its digits"),
     Field("late_in_row", "int", "", "overruns in a row, up to this tick"),
+    Field("busy_s", "float", "s", "how long this machine has just kept the loop from a tick, or 0"),
     Field("reading.seq", "int", "", "readings of the servos"),
     Field("reading.t", "float", "s", "when the last good one was taken; no number before it"),
     Field("reading.valid", "bool", "", "this tick's is good"),
@@ -305,6 +313,11 @@ def page() -> str:
         "a float is always sent as a float. A field named `left.q` is `q` in the map `left`.",
         "The integers of `hand/state` and `hand/input` take 64 bits whatever their value, so that",
         "while its texts stay the same, each message of such a topic is laid out as the last one.",
+        "",
+        "`timestamp` is the machine's Unix time. `mono_ns` is the time that the hand lives in, for",
+        "differences: the machine's monotonic clock or, of a hand simulated in the daemon, one",
+        "that waits while the machine is too busy to keep up (`loop.clock`, `behind_s`). How long",
+        "things took (`tick_s`, `compute_s`, `hand/stats`) is in the machine's time.",
     ]
     for topic, fields in TOPICS.items():
         lines += [

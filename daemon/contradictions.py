@@ -12,9 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from daemon.settings import FINGER_NAMES, GRIP_SHARE, Settings
+from daemon.settings import FINGER_NAMES, GRIP_SHARE, SIMULATED, Settings
 
-_SIMULATED = ("simulated", "replay", "none")
 _LONGEST = 60  # characters of a value that are shown
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
@@ -57,7 +56,7 @@ def _backends(settings: Settings) -> Iterator[str]:
     both = f"servos.backend, tactile.backend: found {servos} and {tactile}"
     if servos == tactile == "none":
         yield f"{both}, expected at least one"
-    elif "none" not in (servos, tactile) and (servos in _SIMULATED) != (tactile in _SIMULATED):
+    elif "none" not in (servos, tactile) and (servos in SIMULATED) != (tactile in SIMULATED):
         yield f"{both}, expected both real or both simulated (none takes one out)"
 
 
@@ -144,9 +143,9 @@ def _recordings(settings: Settings) -> Iterator[str]:
 
 
 def _clock(settings: Settings) -> Iterator[str]:
-    simulated = {settings.servos.backend, settings.tactile.backend} <= set(_SIMULATED)
-    if settings.loop.clock == "virtual" and not simulated:
-        yield 'loop.clock: found "virtual", expected "real" with hardware backends'
+    clock = settings.loop.clock
+    if clock in ("hand", "virtual") and not settings.simulated:
+        yield f'loop.clock: found {shown(clock)}, expected "auto" or "real" with hardware backends'
 
 
 def _limits(settings: Settings) -> Iterator[str]:
@@ -209,7 +208,7 @@ def _folder(settings: Settings) -> Iterator[str]:
     ports = []
     if settings.servos.backend == "dynamixel":
         ports.append(("servos.port", settings.servos.port))
-    if settings.tactile.backend not in _SIMULATED:
+    if settings.tactile.backend not in SIMULATED:
         ports += [("tactile.port", port) for port in settings.tactile.port]
     for key, port in ports:
         if "{dir}" in port:

@@ -100,6 +100,7 @@ class StateMap(FixedMap):
             timing.compute_s,
             timing.wake_late_s,
             timing.overruns,
+            timing.behind_s,
             goal.force,
             goal.angle,
         ]
@@ -146,6 +147,7 @@ class InputMap(FixedMap):
             int(state.t * 1e9),
             state.t,
             state.timing.late_in_row,
+            state.timing.busy_s,
             reading.seq,
             reading.t,
             FALSE + reading.valid,

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from daemon.broadcast import Broadcast
-from daemon.clock import Clock
+from daemon.clock import LoopClock
 from daemon.commands import Handler, Refused
 from daemon.control import Control
 from daemon.drive import Drive
+from daemon.lateness import Lateness
 from daemon.messages import Truth
 from daemon.modes import Command, Mode
 from daemon.orders import Orders
@@ -30,9 +31,9 @@ from daemon.task import Task, TaskOver
 
 EventSink = Callable[[str, str, str], None]
 
+# Both in the machine's time, whose clients sent the commands.
 _STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
 _DEAF = 0.1  # s in which what waited meanwhile has come through the socket's own thread
-_LATE = 0.05  # s after its deadline from which a late tick is told
 
 
 class Commands(Protocol):
@@ -53,7 +54,7 @@ class Loop:
     def __init__(
         self,
         settings: Settings,
-        clock: Clock,
+        clock: LoopClock,
         servos: Servos | None,
         perceptions: list[FingerPerception],
         prediction: Prediction | None,
@@ -72,7 +73,7 @@ class Loop:
         self._server = server
         self._on_event = on_event
         self._control = Control(settings, servos is not None, bool(perceptions))
-        self._task = Task.named(settings.task)
+        self._task = Task.named(settings)
         self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
         sensors = bool(perceptions)
         self._safety = Safety(
@@ -92,13 +93,16 @@ class Loop:
         )
         self._fault_after_opening = ("", "")  # name and reason
         self.statistics = Statistics()
+        self._lateness = Lateness(settings, self.state.timing)
         self._broadcast = None
         if publisher is not None:
             self._broadcast = Broadcast(settings, publisher, perceptions, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
         self._ending = False
         self._stopping = False
-        self._deaf_until = -math.inf  # until then commands are from before a stall
+        self._began = -math.inf  # the present tick, in the machine's time
+        self._deaf_until = -math.inf  # until then, likewise, commands are from before a stall
+        self._commanded = False  # a command was carried out at this tick, which may take long
 
     @property
     def servos(self) -> Servos | None:
@@ -144,30 +148,38 @@ class Loop:
                 self.emit("info", "end", "ended, torque off")
 
     def advance(self, duration: float | None = None) -> None:
-        """Tick for ``duration`` s, or until `end`, and leave the hand as it is then.
+        """Tick for ``duration`` s of the machine, or until `end`, and leave the hand as it is then.
 
-        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst.
+        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst:
+        real time has gone on meanwhile, a simulated hand's own has waited.
         """
         clock, timing = self._clock, self.state.timing
+        clock.sleep_until(clock.now())  # what went before is no lateness of a tick
+        before = clock.behind - timing.behind_s
         deadline = clock.now()
-        last = deadline - self.period
-        finish = None if duration is None else deadline + duration - 0.5 * self.period
-        while not self._ending and (finish is None or deadline < finish):
-            clock.sleep_until(deadline)
-            now = clock.now()
-            timing.wake_late_s = now - deadline
-            timing.tick_s = now - last
-            if timing.wake_late_s > _LATE:
-                self.emit("warning", "late", f"a tick came {timing.wake_late_s:.3f} s late")
+        last = clock.host() - self.period
+        finish = math.inf
+        if duration is not None:
+            finish = deadline + clock.behind + duration - 0.5 * self.period
+        while not self._ending and deadline + clock.behind < finish:
+            timing.wake_late_s = clock.sleep_until(deadline)
+            timing.behind_s = clock.behind - before
+            began = clock.host()
+            timing.tick_s = began - last
+            last = began
+            event = self._lateness.look(began, self._commanded)
+            if event is not None:
+                self.emit(*event)
+            self._commanded = False
             if timing.tick_s > _STALL:
-                self._deaf_until = now + _DEAF
-            last = now
-            done = self.tick(now)
+                self._deaf_until = began + _DEAF
+            done = self.tick(clock.now())
             deadline += self.period
-            if done > deadline:
+            if done > deadline + clock.behind:
                 timing.overruns += 1
+            if (now := clock.now()) > deadline:
                 timing.late_in_row += 1
-                deadline = done
+                deadline = now
             else:
                 timing.late_in_row = 0
             if self.heartbeat is not None:
@@ -187,28 +199,29 @@ class Loop:
     # The tick
 
     def tick(self, now: float) -> float:
-        """One pass of the pipeline at clock time ``now``; returns the time at its end."""
+        """One pass of the pipeline at clock time ``now``; the machine's time at its end."""
         state, clock, statistics = self.state, self._clock, self.statistics
+        began = self._began = clock.host()
         state.seq += 1
         state.t = now
         state.wall = clock.wall()
         self._read()
-        read = clock.now()
+        read = clock.host()
         self._feel()
         self._decide()
-        decided = clock.now()
+        decided = clock.host()
         self._drive.write(self._control.torque, now)
-        written = clock.now()
+        written = clock.host()
         if self._broadcast is not None:
             self._broadcast(state)
-        done = clock.now()
-        state.timing.compute_s = done - now
+        done = clock.host()
+        state.timing.compute_s = done - began
         record(
             statistics.counts,
             statistics.largest,
             state.timing.wake_late_s,
-            done - now,
-            (read - now) + (written - decided),
+            done - began,
+            (read - began) + (written - decided),
             done - written,
         )
         return done
@@ -249,7 +262,7 @@ class Loop:
         if stopped:
             self._by_person({"command": "stop"})
         if self._server is not None:
-            if stopped or state.t < self._deaf_until:
+            if stopped or self._began < self._deaf_until:
                 self._server.drain(self._refuse_old)
             else:
                 self._server.serve(self._by_person)
@@ -275,6 +288,8 @@ class Loop:
         if not control.torque:
             self._fault_after_opening = ("", "")
             return
+        if finding is not None:
+            finding = finding._replace(text=self._with_cause(*finding))
         if finding is not None and safety.opens_first(finding, state.mode):
             self.emit("error", *finding)
             self._fault_after_opening = finding
@@ -295,6 +310,7 @@ class Loop:
             self._tell(request, str(refusal))
             raise
         self._tell(request, "")
+        self._commanded = self._commanded or request["command"] != "status"
         return reply
 
     def _tell(self, request: dict[str, Any], error: str) -> None:
@@ -312,13 +328,16 @@ class Loop:
         return reply
 
     def _follow(self, task: Task) -> None:
-        """Carry out what the task says is due; a task that can't go on ends."""
+        """Carry out what the task says is due; one that can't go on ends, or begins again."""
         try:
             request = task.next(self.state, self.period)
             if request is not None:
                 self.command(request)
         except (TaskOver, Refused) as reason:
-            self._end_task(str(reason))
+            if task.lasting:
+                self.emit("warning", "task", task.begin_again(self.state, str(reason)))
+            else:
+                self._end_task(str(reason))
 
     def _end_task(self, reason: str) -> None:
         self._task = None
@@ -331,8 +350,15 @@ class Loop:
         if self._on_event is not None:
             self._on_event(level, kind, text)
 
+    def _with_cause(self, name: str, text: str) -> str:
+        # A command may keep the bus busy for long by itself.
+        at_work = 0.0 if self._commanded else self._clock.host() - self._began
+        return self._lateness.with_cause(name, text, at_work)
+
     def _fail(self, reason: str, name: str = BUS) -> None:
         if not self.state.fault:
+            if name == BUS:
+                reason = self._with_cause(name, reason)
             self.state.fault, self.state.fault_name = reason, name
             self._control.fail(reason, name)
             self.state.mode = self._control.mode

@@ -128,6 +128,7 @@ def state_message(state: State, scene: Parts, step: int = 1) -> dict[str, Any]:
         "compute_s": timing.compute_s,
         "wake_late_s": timing.wake_late_s,
         "overruns": timing.overruns,
+        "behind_s": timing.behind_s,
         "goal_force": state.goal.force,
         "goal_angle": state.goal.angle,
         "left": left,
@@ -182,6 +183,7 @@ def input_message(state: State, frames: tuple[Frame | None, Frame | None]) -> di
         "mono_ns": int(state.t * 1e9),
         "t": state.t,
         "late_in_row": state.timing.late_in_row,
+        "busy_s": state.timing.busy_s,
         "reading": {
             "seq": reading.seq,
             "t": reading.t,

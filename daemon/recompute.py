@@ -81,6 +81,7 @@ class Recomputation:
         self._commands.waiting = list(commands)
         loop.state.seq = taken["seq"] - 1
         loop.state.timing.late_in_row = taken["late_in_row"]
+        loop.state.timing.busy_s = taken["busy_s"]
         loop.tick(taken["t"])
         return loop.state
 
@@ -100,6 +101,8 @@ def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: P
 class _Clock:
     """The recorded time."""
 
+    behind = 0.0
+
     def __init__(self) -> None:
         self.t = 0.0
         self.unix = 0.0
@@ -110,8 +113,12 @@ class _Clock:
     def wall(self) -> float:
         return self.unix
 
-    def sleep_until(self, t: float) -> None:
+    def host(self) -> float:
+        return self.t
+
+    def sleep_until(self, t: float) -> float:
         self.t = t
+        return 0.0
 
 
 class _Servos:

@@ -93,13 +93,15 @@ class Goal:
 
 @dataclass(slots=True)
 class Timing:
-    """What the loop knows about its own ticks [s]."""
+    """What the loop knows about its own ticks, in this machine's time [s]."""
 
     tick_s: float = 0.0  # from this tick's start to the last one's
     compute_s: float = 0.0  # work of the last tick
     wake_late_s: float = 0.0  # this tick's start after its deadline
     overruns: int = 0  # ticks whose work outlasted the period
-    late_in_row: int = 0  # the last of them, without one in time between
+    late_in_row: int = 0  # the last of them, without one in time between; 0 where time waits
+    behind_s: float = 0.0  # how long a simulated hand has waited for this machine since the start
+    busy_s: float = 0.0  # how long this machine has just kept the loop from a tick, or 0
 
 
 def _contacts() -> list[Contact]:

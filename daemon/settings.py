@@ -34,6 +34,9 @@ Cells = tuple[tuple[Index, Index], ...]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
+SIMULATED = ("simulated", "replay", "none")  # backends behind which there is no metal
+
+
 class SettingsError(Exception):
     """The settings can't be used. The message lists every error: file, key, found, expected."""
 
@@ -141,10 +144,15 @@ class EstimatorSettings(Section):
 
 
 class Loop(Section):
-    """The tick. ``virtual`` runs as fast as the machine can and needs simulated backends."""
+    """The tick, and whose time it goes by.
+
+    ``real`` is this machine's time; ``hand`` a simulated hand's own, which waits while the machine
+    is busy; ``virtual`` runs as fast as the machine can. The latter two need simulated backends;
+    ``auto`` is ``hand`` with these and ``real`` with others.
+    """
 
     rate: Annotated[float, Field(ge=10, le=5000)] = 500.0
-    clock: Literal["real", "virtual"] = "real"
+    clock: Literal["auto", "hand", "real", "virtual"] = "auto"
 
 
 class Realtime(Section):
@@ -330,3 +338,8 @@ class Settings(Section):
     object: ObjectSettings = ObjectSettings()
     simulation: Simulation = Simulation()
     task: Task = Task()
+
+    @property
+    def simulated(self) -> bool:
+        """Neither real servos nor real sensors take part."""
+        return self.servos.backend in SIMULATED and self.tactile.backend in SIMULATED

@@ -5,17 +5,18 @@ A task speaks through the same commands as a client; it can do nothing that a cl
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import cycle
+from collections.abc import Callable, Iterator
+from itertools import chain, cycle
 from typing import Any
 
 from daemon.modes import Mode
 from daemon.records import State
-from daemon.settings import Task as TaskSettings
+from daemon.settings import Settings
 
 Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, rest after it [s]
 
 _PATIENCE = 10.0  # s for a step
+_PAUSE = 2.0  # s in which a person can read what went wrong
 
 
 class TaskOver(Exception):
@@ -23,25 +24,34 @@ class TaskOver(Exception):
 
 
 class Task:
-    """Issues one command after another, each when the hand has come to where the last one led."""
+    """Issues one command after another, each when the hand has come to where the last one led.
 
-    def __init__(self, steps: Iterator[Step]) -> None:
-        self._steps = steps
-        self._mode = Mode.DISARMED  # what the present step waits for
+    ``lasting``: it can begin again after a fault. That is for simulated hands alone: metal must not
+    start by itself when something was wrong.
+    """
+
+    def __init__(self, script: Callable[[], Iterator[Step]], lasting: bool = False) -> None:
+        self._script = script
+        self.lasting = lasting
+        self._steps = script()
+        self._mode: str = Mode.DISARMED  # what the present step waits for
         self._rest = 0.5
         self._left = self._rest
         self._waited = 0.0
 
     @staticmethod
-    def named(settings: TaskSettings) -> Task | None:
+    def named(settings: Settings) -> Task | None:
         """The settings' task, or None."""
-        return Task(demo(settings.force, settings.angle)) if settings.name == "demo" else None
+        task = settings.task
+        if task.name == "none":
+            return None
+        return Task(lambda: demo(task.force, task.angle), settings.simulated)
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
         """The command that is due at this tick, if any.
 
         Raises TaskOver after a fault, when the hand was disarmed, or when a step did not come to
-        its end: then a person is at work, and the hand must not start by itself again.
+        its end.
         """
         if state.mode != self._mode:
             if state.mode in (Mode.FAULT, Mode.DISARMED):
@@ -57,6 +67,17 @@ class Task:
         request, self._mode, self._rest = next(self._steps)
         self._left, self._waited = self._rest, 0.0
         return request
+
+    def begin_again(self, state: State, reason: str) -> str:
+        """From now on: a pause, then out of the present mode, and the script from its start.
+
+        What a person is told of it.
+        """
+        way_out = "clear" if state.mode == Mode.FAULT else "stop"
+        self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
+        self._mode = state.mode
+        self._left, self._waited = _PAUSE, 0.0
+        return f"{reason}: {way_out} and begin again in {_PAUSE:g} s, since the hand is simulated"
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:

@@ -30,6 +30,7 @@ SCHEMA = 1  # of hand/state, the newest this module knows
 HISTORY_STEP = 0.2  # s in one column of the trends
 HISTORY_LENGTH = 600
 WINDOW = 1.0  # s of statistics
+LATELY = 3.0  # s in which a busy machine is called so
 EVENTS = 200  # kept
 
 
@@ -152,6 +153,7 @@ class Feed:
         self._bin: list[tuple[float, float]] = []
         self._bin_end = -math.inf
         self._ticks: deque[tuple[float, float, float, float]] = deque(maxlen=10_000)
+        self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
         self._mono = math.nan
 
@@ -181,6 +183,7 @@ class Feed:
         mono = 1e-9 * number(record, "mono_ns")
         if number(record, "seq") < number(self.state, "seq"):  # another daemon: a new story
             self._ticks.clear()
+            self._waits.clear()
             self.history.clear()
             self.frames.clear()
             self._bin.clear()
@@ -190,6 +193,9 @@ class Feed:
         elif 0.0 < mono - self._mono < 60.0:
             step = mono - self._mono
             self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
+            waited = number(record, "behind_s") - number(self.state, "behind_s")
+            if waited > 0.0:
+                self._waits.append((now, waited))
         self._mono = mono
         self.state = record
         self.state_at = now
@@ -310,6 +316,12 @@ class Feed:
         if age > max(2.0, 10.0 * self._period):
             return "lost"
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
+
+    def waited(self, now: float) -> float:
+        """Seconds that a simulated hand has lately waited for a busy machine."""
+        while self._waits and self._waits[0][0] < now - LATELY:
+            self._waits.popleft()
+        return sum(waited for _, waited in self._waits)
 
     def statistics(self, now: float) -> TickStatistics:
         """What the last second's states say of the tick."""

@@ -45,6 +45,7 @@ CENTRE = 34  # columns of the numbers
 MAP_LINES = 11  # of each map at the least size
 OLD = 1.0  # s after which a frame on the page is called old
 REPLY_TIME = 12.0  # s a reply stays
+LATE = 0.05  # s behind from which it is told
 _RAISED = 1.01  # of what was asked for: told as raised
 
 BOLD = Style(bold=True)
@@ -117,7 +118,7 @@ class Page:
             numbers = [faded(line) for line in numbers]
         page = [
             self._header(width, now, status),
-            self._notice(width, status),
+            self._notice(width, now, status),
             *numbers,
             *self._messages(width, events, now, reply),
             self._footer(width),
@@ -150,7 +151,7 @@ class Page:
         right = [Segment(unreadable, WARN), *right]
         return apart(left, right, width)
 
-    def _notice(self, width: int, status: str) -> Line:
+    def _notice(self, width: int, now: float, status: str) -> Line:
         if status == "lost":
             return [Segment(" nothing comes any more; what stands below is old", BAD)]
         fault = text(self.feed.state, "fault")
@@ -165,6 +166,11 @@ class Page:
         if self.feed.state is not None and schema != SCHEMA:
             what = f" the stream has schema {schema!r:.12}, this page knows {SCHEMA}"
             return [Segment(what + ": it shows the fields that it knows", WARN)]
+        lately = self.feed.waited(now)
+        if lately > LATE:
+            total = short(number(self.feed.state, "behind_s"), 2)
+            what = f" this machine is busy: the simulated hand runs {short(lately, 2)} s behind"
+            return [Segment(cut(f"{what} ({total} s in all)", width), WARN)]
         return []
 
     def _body(self, width: int, lines: int, now: float) -> list[Line]:

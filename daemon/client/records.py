@@ -78,6 +78,7 @@ class HandState:
     compute_s: float
     wake_late_s: float
     overruns: int
+    behind_s: float  # how long a simulated hand has waited for a busy machine [s]
     goal_force: float  # the tips' mean force that the grip goes to [N], NaN without a grip
     goal_angle: float  # the object's angle that it keeps [rad], NaN where it keeps none
     left: FingerState

@@ -71,10 +71,11 @@ class EmulatorClock:
         """Unix time [s]."""
         return time.time()
 
-    def sleep_until(self, t: float) -> None:
-        """Return at the hand's time ``t``."""
+    def sleep_until(self, t: float) -> float:
+        """Return at the hand's time ``t``: how late that was [s]."""
         while (delay := t - self.now()) > 0.0:
             time.sleep(min(delay, 0.5 * _STALL))
+        return -delay
 
 
 class Emulator:

@@ -56,6 +56,7 @@ def state(t: float, seq: int) -> dict[str, Any]:
         "compute_s": 11e-6,
         "wake_late_s": 3e-6,
         "overruns": 0,
+        "behind_s": 0.0,
         "goal_force": 10.0,
         "goal_angle": math.radians(5.0),
         "left": finger(t, 0),

@@ -34,6 +34,7 @@ def sample_state() -> State:
     state.reading.seq, state.reading.t, state.reading.valid = 1234, 12.4995, True
     state.timing.tick_s, state.timing.compute_s = 0.002, 15.5e-6
     state.timing.wake_late_s, state.timing.overruns = 3.25e-6, 2
+    state.timing.behind_s, state.timing.busy_s = 1.875, 0.15625
     for finger, contact in enumerate(state.contacts):
         sign = 1.0 - 2.0 * finger
         state.reading.q[finger] = 0.25 + 0.0625 * finger

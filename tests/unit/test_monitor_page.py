@@ -145,6 +145,17 @@ def test_statistics_of_the_last_second() -> None:
     assert (tick.late, tick.late_max) == (3e-6, 900e-6)
 
 
+def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it() -> None:
+    feed = Feed()
+    states = [fake_daemon.state(1.0, seq) | {"mono_ns": 10**9 * (seq - 98)} for seq in (99, 100)]
+    give(feed, b"hand/state", states[0] | {"behind_s": 1.55}, 10.0)
+    assert "busy" not in shown(feed, 10.0)
+    give(feed, b"hand/state", states[1] | {"behind_s": 1.9}, 10.01)
+    said = "this machine is busy: the simulated hand runs 0.35 s behind (1.90 s in all)"
+    assert said in shown(feed, 10.02)
+    assert "busy" not in shown(feed, 13.1)
+
+
 def test_a_new_daemon_begins_a_new_story() -> None:
     feed = Feed()
     for k in range(10):

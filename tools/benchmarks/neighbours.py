@@ -237,7 +237,7 @@ def _serve(link: Connection, address: str, priority: int, noise: bool) -> None:
         def kept(now: float) -> float:
             done = tick(now)
             late.append(loop.state.timing.wake_late_s)
-            compute.append(done - now)
+            compute.append(loop.state.timing.compute_s)
             return done
 
         loop.tick = kept  # type: ignore[method-assign]

@@ -20,7 +20,7 @@ from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
 
 # What depends on the machine and the moment, and not on what the loop took in.
-_MOMENT = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "seq_step"})
+_MOMENT = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 
 @dataclass(slots=True)
