@@ -18,7 +18,7 @@ class Clock(Protocol):
         """Unix time [s] that belongs to now."""
 
     def sleep_until(self, t: float) -> float:
-        """Return at monotonic time ``t``, at once if that has passed: how late that was [s]."""
+        """Return at monotonic time ``t``, at once if that has passed: how late it woke up [s]."""
 
 
 class LoopClock(Clock, Protocol):
@@ -100,7 +100,7 @@ class HandClock:
         if missed <= 0.0:
             return self._machine.sleep_until(due)
         self.behind += missed
-        return missed
+        return 0.0
 
 
 class VirtualClock:

@@ -274,10 +274,13 @@ class Loop:
             control.coast(state.goal)
         else:
             control.step(self.period, state.goal)
-        for event in control.events:
-            self.emit(*event)
-        control.events.clear()
+        self._tell_events()
         state.mode = control.mode
+
+    def _tell_events(self) -> None:
+        for event in self._control.events:
+            self.emit(*event)
+        self._control.events.clear()
 
     def _judge(self) -> None:
         state, control, safety = self.state, self._control, self._safety
@@ -361,4 +364,5 @@ class Loop:
                 reason = self._with_cause(name, reason)
             self.state.fault, self.state.fault_name = reason, name
             self._control.fail(reason, name)
+            self._tell_events()
             self.state.mode = self._control.mode

@@ -73,11 +73,11 @@ class Task:
 
         What a person is told of it.
         """
-        way_out = "clear" if state.mode == Mode.FAULT else "stop"
+        way_out, says = ("clear", "clears it") if state.mode == Mode.FAULT else ("stop", "stops it")
         self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
         self._mode = state.mode
         self._left, self._waited = _PAUSE, 0.0
-        return f"{reason}: {way_out} and begin again in {_PAUSE:g} s, since the hand is simulated"
+        return f"{reason}; the task {says} and begins again in {_PAUSE:g} s: the hand is simulated"
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:

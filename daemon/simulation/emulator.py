@@ -72,7 +72,7 @@ class EmulatorClock:
         return time.time()
 
     def sleep_until(self, t: float) -> float:
-        """Return at the hand's time ``t``: how late that was [s]."""
+        """Return at the hand's time ``t``: how late it woke up [s]."""
         while (delay := t - self.now()) > 0.0:
             time.sleep(min(delay, 0.5 * _STALL))
         return -delay

@@ -8,7 +8,7 @@ import pytest
 
 from daemon.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
 from daemon.settings import Settings
-from tests.late_machine import LateMachine
+from tests.harness.late_machine import LateMachine
 
 
 def test_virtual_time_moves_only_by_waiting_and_never_back() -> None:

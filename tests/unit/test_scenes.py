@@ -6,8 +6,12 @@ from typing import Any
 
 import pytest
 
+from daemon.assembly import Daemon
 from daemon.commands import Refused
 from daemon.messages import Parts, state_message
+from daemon.records import Reading
+from daemon.settings import Settings
+from daemon.task import Task
 from tests.harness.loop import Make, advance_to, command, grasped
 
 
@@ -20,6 +24,81 @@ def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
     command(daemon, "arm")
     daemon.loop.advance(15.0)
     assert daemon.loop.state.mode == "armed"
+
+
+Events = list[tuple[str, str, str]]
+
+
+def holding_demo(daemon: Daemon) -> Events:
+    """The demo, brought to holding; its events from then on."""
+    events: Events = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    advance_to(daemon, "holding", 5.0)
+    events.clear()
+    return events
+
+
+def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    events = holding_demo(daemon)
+    daemon.loop._fail("made up")
+    daemon.loop.advance(6.0)
+    again = "the task clears it and begins again in 2 s: the hand is simulated"
+    assert events[:6] == [
+        ("info", "mode", "holding → fault"),
+        ("error", "servos.bus", "made up"),
+        ("warning", "task", f"the hand is in fault; {again}"),
+        ("info", "mode", "fault → disarmed"),
+        ("info", "mode", "disarmed → armed"),
+        ("info", "mode", "armed → grasping"),
+    ]
+    assert daemon.loop.state.fault == ""
+    daemon.loop.stop()
+    daemon.loop.advance(5.0)
+    assert daemon.loop.state.mode == "disarmed", "a person ends it for good"
+
+
+def test_a_demo_that_cannot_clear_its_fault_tries_again(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    events, servos = holding_demo(daemon), daemon.loop.servos
+    assert servos is not None
+    really = servos.read
+
+    def alerting(reading: Reading) -> None:
+        really(reading)
+        reading.alert = 1
+
+    servos.read = alerting  # type: ignore[method-assign]
+    daemon.loop.advance(5.0)
+    told = [text for _, kind, text in events if kind == "task"]
+    assert len(told) == 3
+    assert told[1].startswith("clear: servos: hardware error reported by left; the task clears it")
+    servos.read = really  # type: ignore[method-assign]
+    advance_to(daemon, "holding", 6.0)
+
+
+def test_a_demo_whose_step_never_ends_begins_again(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    events = holding_demo(daemon)
+    assert daemon.loop._task is not None
+    daemon.loop._task._mode = "moving"  # which it never comes to
+    advance_to(daemon, "disarmed", 13.0)
+    assert events[0][2].startswith("still holding after 10 s; the task stops it and begins again")
+    advance_to(daemon, "holding", 6.0)
+
+
+def test_metals_demo_ends_with_the_first_fault(make: Make) -> None:
+    metal = Settings.model_validate({"task": {"name": "demo"}, "servos": {"backend": "dynamixel"}})
+    task = Task.named(metal)
+    assert task is not None
+    assert not task.lasting
+    daemon = make()
+    daemon.loop._task = task
+    events = holding_demo(daemon)
+    daemon.loop._fail("made up")
+    daemon.loop.advance(6.0)
+    assert events[2:] == [("warning", "task", "task over: the hand is in fault")]
+    assert daemon.loop.state.fault == "made up"
 
 
 SCENES: dict[str, dict[str, Any]] = {

@@ -1,0 +1,214 @@
+"""A machine that is late: what a simulated hand, a hand on real time and a person get of it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import daemon.assembly
+from daemon.assembly import Daemon
+from daemon.clock import HandClock
+from daemon.lateness import EVERY, FIRST, RECENT, Lateness
+from daemon.messages import Parts, state_message
+from daemon.records import Timing
+from daemon.settings import Settings
+from tests.harness.late_machine import LateMachine
+from tests.harness.loop import advance_to, grasped
+
+MOMENT = ("timestamp", "tick_s", "compute_s", "wake_late_s", "overruns", "behind_s")
+Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
+
+
+@pytest.fixture
+def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
+    """Daemons on a machine whose lateness the test chooses, with their events."""
+    daemons = []
+
+    def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
+        machine, events = LateMachine(), []  # type: ignore[var-annotated]
+        made = machine if clock == "real" else HandClock(machine)
+        monkeypatch.setattr(daemon.assembly, "make_clock", lambda _: made)
+        daemons.append(
+            Daemon(
+                Settings.model_validate({"loop": {"clock": clock}, **sections}),
+                wire=False,
+                on_event=lambda *event: events.append(event),
+            )
+        )
+        return daemons[-1], machine, events
+
+    yield build
+    for each in daemons:
+        each.close()
+
+
+def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
+    """The state after so many ticks, less what depends on the machine."""
+    loop = daemon.loop
+
+    def end_in_time(_: float) -> None:
+        if loop.state.seq >= count:
+            loop.end()
+
+    loop.heartbeat = end_in_time
+    loop.advance()
+    message = state_message(loop.state, Parts.of(daemon.settings))
+    return {key: value for key, value in message.items() if key not in MOMENT}
+
+
+TICKS = 1500  # the demo holds the object by then and turns it
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> dict[str, Any]:
+    chosen = Settings.model_validate({"loop": {"clock": "virtual"}, "task": {"name": "demo"}})
+    with Daemon(chosen, wire=False) as daemon:
+        return ticked(daemon, TICKS)
+
+
+@settings(max_examples=10, deadline=None)
+@given(late=st.lists(st.sampled_from([0.0, 0.0, 0.0, 1e-4, 0.0019, 0.01, 0.3, 5.0]), max_size=300))
+def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(
+    undisturbed: dict[str, Any], late: list[float]
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        machine = LateMachine()
+        patch.setattr(daemon.assembly, "make_clock", lambda _: HandClock(machine))
+        chosen = Settings.model_validate({"task": {"name": "demo"}})
+        with Daemon(chosen, wire=False) as hand:
+            machine.late_by = list(itertools.chain.from_iterable((each, 0.0) for each in late))
+            assert ticked(hand, TICKS) == undisturbed
+    assert undisturbed["mode"] == "rotating"
+    assert undisturbed["object"]["valid"]
+
+
+def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
+    on_late_machine: Build,
+) -> None:
+    daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
+    machine.work(60.0)  # building everything is no lateness
+    machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.2]
+    daemon.loop.advance(4.0)
+    state = daemon.loop.state
+    assert state.fault == ""
+    assert state.timing.behind_s == pytest.approx(0.6 - 2 * 0.002)
+    assert state.timing.late_in_row == 0
+    told = [text for level, kind, text in events if kind == "late"]
+    assert told == ["this machine was busy: the simulated hand waited 0.40 s (0.40 s in all)"]
+    daemon.loop.advance(2.0)
+    told = [text for level, kind, text in events if kind == "late"]
+    assert told[1:] == ["this machine was busy: the simulated hand waited 0.20 s (0.60 s in all)"]
+
+
+def test_a_duration_is_the_machines(on_late_machine: Build) -> None:
+    daemon, machine, _ = on_late_machine("auto")
+    begin = machine.now()
+    machine.late_by = [0.0] * 100 + [3.0]
+    daemon.loop.advance(5.0)
+    assert machine.now() - begin == pytest.approx(5.0, abs=0.02)
+
+
+def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine: Build) -> None:
+    daemon, machine, events = on_late_machine("real")
+    daemon.loop.advance(0.3)
+    grasped(daemon, 6.0)
+    machine.late_by = [0.0] * 5 + [0.148]
+    advance_to(daemon, "fault", 1.0)
+    state = daemon.loop.state
+    assert state.fault.startswith("this machine was busy for 148 ms: the bus watchdog stopped the")
+    assert state.fault_name == "servos.bus"
+    late = [event for event in events if event[1] == "late"]
+    assert late == [
+        ("warning", "late", "this machine was busy: ticks came late by 0.15 s (0.15 s in all)")
+    ]
+
+
+def test_a_fault_of_another_kind_names_no_busy_machine(
+    on_late_machine: Build,
+) -> None:
+    daemon, machine, _ = on_late_machine("real")
+    daemon.loop.advance(0.3)
+    grasped(daemon, 6.0)
+    machine.late_by = [0.0, 0.08]
+    daemon.loop.advance(0.1)
+    assert daemon.loop.state.timing.busy_s == pytest.approx(0.08)
+    daemon.loop._control._grip.retarget(40.0)
+    advance_to(daemon, "fault", 3.0)
+    assert daemon.loop.state.fault_name.startswith("tip.")
+    assert "busy" not in daemon.loop.state.fault
+    daemon.loop.advance(RECENT)
+    assert daemon.loop.state.timing.busy_s == 0.0
+
+
+def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(
+    on_late_machine: Build,
+) -> None:
+    daemon, machine, _ = on_late_machine("real", task={"name": "demo"})
+    servos, state = daemon.loop.servos, daemon.loop.state
+    assert servos is not None
+    really = servos.set_torque
+
+    def slowly(on: bool) -> None:
+        really(on)
+        machine.work(0.3)  # a slow bus
+
+    servos.set_torque = slowly  # type: ignore[method-assign]
+    advance_to(daemon, "fault", 2.0)  # the task arms
+    assert (state.fault_name, state.timing.busy_s) == ("servos.bus", 0.0)
+    assert state.fault.startswith("the bus watchdog")
+    servos.set_torque = really  # type: ignore[method-assign]
+    advance_to(daemon, "grasping", 5.0)
+    sensor = daemon.loop.perceptions[0].sensor
+    latest = sensor.latest
+
+    def held_up() -> Any:
+        sensor.latest = latest  # type: ignore[method-assign]
+        machine.work(0.25)
+        return latest()
+
+    sensor.latest = held_up  # type: ignore[method-assign]
+    advance_to(daemon, "fault", 0.5)
+    assert state.fault.startswith("this machine was busy for 250 ms: the bus watchdog")
+
+
+METAL = Settings.model_validate({"servos": {"backend": "dynamixel"}})
+
+
+def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
+    """What is told of ticks of metal that come so late."""
+    timing = Timing(wake_late_s=late, tick_s=0.002)
+    lateness = Lateness(METAL, timing)
+    ticks = round(seconds / 0.002)
+    found = [lateness.look(0.002 * k, False) for k in range(ticks)]
+    return [event for event in found if event is not None]
+
+
+def test_how_steady_the_first_second_was_is_told_once() -> None:
+    assert looked(0.0003, 0.9 * FIRST) == []
+    (told,) = looked(0.0003, 5.0 * FIRST)
+    assert told == (
+        "info",
+        "realtime",
+        "ticks of the first second came at most 0.3 ms late; "
+        "the servos' watchdog stops them after 100 ms",
+    )
+    (told,) = looked(0.035, 5.0 * FIRST)
+    assert told[0] == "warning"
+    for word in ("35 ms", "realtime.priority", "realtime.cpus", "softfinger doctor"):
+        assert word in told[2]
+
+
+def test_lateness_without_end_is_told_every_few_seconds() -> None:
+    told = [event for event in looked(0.06, 4.2 * EVERY) if event[1] == "late"]
+    assert len(told) == 5
+
+
+def test_a_simulated_hand_has_no_budget_to_keep(on_late_machine: Build) -> None:
+    daemon, _, events = on_late_machine("auto")
+    daemon.loop.advance(3.0 * FIRST)
+    assert events == []
