@@ -11,6 +11,8 @@ even answered, so that a flood costs the tick a bounded time and no one else's c
 
 from __future__ import annotations
 
+import logging
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -21,6 +23,7 @@ import zmq
 
 from daemon.keys import ClientKeys
 from daemon.messages import pack
+from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
 from daemon.sockets import OWNER_ONLY, Bound, Guard
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
@@ -33,6 +36,8 @@ _FULL = "too many commands wait already"
 _STOPPED = "a stop came before its turn; send it again"
 _STOP = b"stop"
 _VALUES = (str, int, float)  # and bool, which is an int
+
+_log = logging.getLogger(__name__)
 
 
 class Refused(Exception):
@@ -200,9 +205,12 @@ class NoAnswer(Exception):
 
 
 def send(
-    address: str, request: dict[str, Any], timeout: float = 2.0, keys: ClientKeys | None = None
+    address: str, request: dict[str, Any], timeout: float = PATIENCE, keys: ClientKeys | None = None
 ) -> dict[str, Any]:
-    """Send one command and return the reply. Raises NoAnswer after ``timeout`` s."""
+    """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
+
+    A warning is logged when that takes long, which without handlers goes to standard error.
+    """
     context: zmq.Context[Any] = zmq.Context()
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
@@ -214,10 +222,15 @@ def send(
         except zmq.ZMQError as error:
             raise NoAnswer(f"{address}: {error}") from None
         socket.send(pack(request))
-        if not socket.poll(int(timeout * 1000)):
+        silence = min(SILENCE, timeout)
+        answered = socket.poll(math.ceil(silence * 1e3))
+        if not answered and silence < timeout:
+            _log.warning(still_waiting(answer_to(request, address), timeout))
+            answered = socket.poll(math.ceil((timeout - silence) * 1e3))
+        if not answered:
             hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
             raise NoAnswer(
-                f"no answer from {address} within {timeout:g} s; is softfinger running, "
+                f"no {answer_to(request, address)} within {timeout:g} s; is softfinger running, "
                 f"or still starting?{hint}"
             )
         reply = msgpack.unpackb(socket.recv(), raw=False)

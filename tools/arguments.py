@@ -67,7 +67,7 @@ def waiting(address: str, folder: Path | None) -> str:
 
 def nothing(address: str, seconds: float, folder: Path | None) -> str:
     """And what, when no more is waited for."""
-    return f"nothing from {address} within {seconds:g} s; is softfinger running?{_hint(folder)}"
+    return f"no stream from {address} within {seconds:g} s; is softfinger running?{_hint(folder)}"
 
 
 def _hint(folder: Path | None) -> str:

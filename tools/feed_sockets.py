@@ -11,6 +11,7 @@ from typing import Any
 import msgpack
 import zmq
 
+from daemon.patience import PATIENCE, SILENCE
 from tools.feed import Feed, field, text
 
 TOPICS = (
@@ -59,6 +60,16 @@ class Reply:
     text: str
 
 
+@dataclass(slots=True)
+class _Pending:
+    """A command that is not answered yet."""
+
+    label: str
+    socket: zmq.Socket[bytes]
+    sent: float
+    told: bool = False  # that it takes long
+
+
 class Commander:
     """Sends commands without ever waiting. The newest reply is kept in ``reply``.
 
@@ -66,14 +77,13 @@ class Commander:
     a stop least of all.
     """
 
-    PATIENCE = 1.0  # s for an answer
     OPEN_LIMIT = 8  # commands under way; further ones are dropped, except stop
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context
         self._address = address
         self._envelope = {"client": client} if client else {}
-        self._pending: list[tuple[str, zmq.Socket[bytes], float]] = []
+        self._pending: list[_Pending] = []
         self.reply: Reply | None = None
 
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
@@ -86,7 +96,7 @@ class Commander:
         request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
         request.connect(self._address)
         request.send(msgpack.packb({"command": command, **self._envelope, **fields}), zmq.NOBLOCK)
-        self._pending.append((label, request, now + self.PATIENCE))
+        self._pending.append(_Pending(label, request, now))
 
     def refuse(self, now: float, why: str) -> None:
         """Say that a key was not turned into a command."""
@@ -95,17 +105,22 @@ class Commander:
     def collect(self, now: float) -> None:
         """Take the replies that came, give up on those that are overdue."""
         waiting = []
-        for label, request, deadline in self._pending:
+        for each in self._pending:
             try:
-                payload = request.recv(zmq.NOBLOCK)
+                payload = each.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
-                if now < deadline:
-                    waiting.append((label, request, deadline))
+                overdue = now - each.sent >= PATIENCE
+                if overdue or (not each.told and now - each.sent >= SILENCE):
+                    each.told = True
+                    so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
+                    said = f"{each.label}: no answer from {self._address} {so_far}"
+                    self.reply = Reply(now, False, said)
+                if not overdue:
+                    waiting.append(each)
                     continue
-                self.reply = Reply(now, False, f"{label}: no answer from {self._address}")
             else:
-                self.reply = self._read(now, label, payload)
-            request.close()
+                self.reply = self._read(now, each.label, payload)
+            each.socket.close()
         self._pending = waiting
 
     @staticmethod
@@ -122,6 +137,6 @@ class Commander:
 
     def close(self) -> None:
         """Close what is open; commands that were not taken yet are dropped."""
-        for _, request, _ in self._pending:
-            request.close()
+        for each in self._pending:
+            each.socket.close()
         self._pending = []

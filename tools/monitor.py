@@ -22,6 +22,7 @@ from typing import Any
 import zmq
 
 from daemon.keys import KeyFileError
+from daemon.patience import PATIENCE
 from tools.arguments import add_keys, client_keys, nothing
 from tools.feed import FINGERS, Feed, number, text
 from tools.feed_sockets import Commander, Subscriber
@@ -32,7 +33,6 @@ from tools.terminal import Keys, Terminal, TerminalGone
 REDRAW = 1.0 / 15.0  # s between redraws at most
 PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
 PLAIN_LINE = 1.0  # s between plain lines
-PATIENCE = 2.0  # s to wait for a first state with --no-wait
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from daemon.patience import PATIENCE
 from daemon.settings import Stream
 from tools.arguments import (
     ALL,
@@ -29,7 +30,7 @@ Ends with Ctrl-C, after --duration, or at --to; prints what it wrote and what wa
 With --split-size or --split-time it goes on in FILE-2.mcap, FILE-3.mcap and so on.
 Exit status: 0 written, 1 not or not all, with the reason."""
 
-_WAIT = 2.0  # s without a message until the waiting is told, or --no-wait gives up
+_SILENCE = 2.0  # s without a message until the waiting is told
 # s between two looks at the clock and the socket, where what came since then is waiting: waking for
 # each message would cost more than all that is done with it.
 _LOOK = 0.1
@@ -71,7 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--split-time", type=seconds, metavar="S", help="a new file after S seconds"
     )
     parser.add_argument(
-        "--no-wait", action="store_true", help="end with an error when nothing comes within 2 s"
+        "--no-wait",
+        action="store_true",
+        help=f"end with an error when nothing comes within {PATIENCE:g} s",
     )
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # a pipe of the daemon's
     parser.add_argument(
@@ -164,9 +167,9 @@ class _Recorder:
             now = time.monotonic()
             if taken:
                 heard = now
-            elif self._first is None and now - began > _WAIT:
-                if arguments.no_wait:
-                    failure = nothing(arguments.address, _WAIT, arguments.keys)
+            elif self._first is None and now - began > _SILENCE:
+                if arguments.no_wait and now - began > PATIENCE:
+                    failure = nothing(arguments.address, PATIENCE, arguments.keys)
                     break
                 self._tell_waiting()
             if arguments.lifeline is not None and _hung_up(arguments.lifeline):
@@ -278,7 +281,7 @@ class _Recorder:
             f"{elapsed:8.1f} s  {self._messages} messages  {size:.1f} MB  "
             f"{size / max(elapsed, 1e-3):.2f} MB/s  {self._lost()} lost"
         )
-        if silent > _WAIT:
+        if silent > _SILENCE:
             line += f"  silent for {silent:.0f} s"
         print(f"\r{line:<79.79}", end="", file=sys.stderr, flush=True)
 

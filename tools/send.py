@@ -10,6 +10,7 @@ from typing import Any
 
 from daemon.commands import NoAnswer, send
 from daemon.keys import KeyFileError
+from daemon.patience import PATIENCE
 from daemon.settings import CommandSettings
 from tools.arguments import add_keys, client_keys, seconds
 
@@ -29,7 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--address", default=CommandSettings().address, help="command socket")
     add_keys(parser)
     parser.add_argument("--client", default="", help="name that owns the commander's lease")
-    parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S")
+    parser.add_argument(
+        "--timeout",
+        type=seconds,
+        default=PATIENCE,
+        metavar="S",
+        help=f"to wait for the reply; {PATIENCE:g} unless given",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from daemon.patience import PATIENCE
 from daemon.settings import Stream
 from tools.arguments import add_keys, client_keys, megabytes, moment, nothing, seconds, waiting
 from tools.viewing.errors import NoRerun, ViewError
@@ -33,7 +34,7 @@ From another machine: ssh -L 9090:127.0.0.1:9090 -L PORT:127.0.0.1:PORT, with th
 Exit status: 0, or 1 with the reason when nothing could be shown."""
 
 _PORT = 9090  # of the page, when it is free
-_WAIT = 2.0  # s without a message until the waiting is told, or --no-wait gives up
+_SILENCE = 2.0  # s without a message until the waiting is told
 _SLOW_LOOK = 1.0  # s between two looks at this process's memory
 _BREATH = 50.0  # MB that it may grow by itself
 _AHEAD = 200  # pictures of a recording that are sent before the viewer is waited for
@@ -216,9 +217,9 @@ class _View:
                 if silent and count:
                     self._say("the stream is here")
                     silent = False
-                elif not silent and now - heard > _WAIT:
-                    if self._arguments.no_wait:
-                        raise ViewError(nothing(stream.address, _WAIT, self._arguments.keys))
+                elif self._arguments.no_wait and now - heard > PATIENCE:
+                    raise ViewError(nothing(stream.address, PATIENCE, self._arguments.keys))
+                elif not silent and now - heard > _SILENCE:
                     coming = waiting(stream.address, self._arguments.keys)
                     self._say(f"silent: {stream.address}" if ever else coming)
                     silent = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,9 +17,12 @@ from daemon import messages
 from daemon.client.errors import HandFault, NoStream, NotInTime
 from daemon.client.hand import COMMANDS, STREAM, accepted
 from daemon.client.records import Event, HandState, TactileFrame
-from daemon.client.wire import Decoder, nothing_from, prepare
+from daemon.client.wire import Decoder, nothing_from, prepare, silent
 from daemon.commands import NoAnswer
 from daemon.keys import load_client
+from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
+
+_log = logging.getLogger(__name__)
 
 
 class AsyncHand:
@@ -30,7 +34,7 @@ class AsyncHand:
         commands: str = COMMANDS,
         *,
         client: str = "",
-        timeout: float = 2.0,
+        timeout: float = PATIENCE,
         keys: Path | None = None,
     ) -> None:
         self.stream_address = stream
@@ -89,9 +93,13 @@ class AsyncHand:
         """
         last: HandState | None = None
         states = self.stream()
+        told = asyncio.get_running_loop().call_later(
+            SILENCE, silent, self.stream_address, messages.STATE, timeout
+        )
         try:
             async with asyncio.timeout(timeout):
                 async for last in states:
+                    told.cancel()
                     if condition(last):
                         return last
                     if last.fault:
@@ -99,6 +107,7 @@ class AsyncHand:
         except TimeoutError:
             pass
         finally:
+            told.cancel()
             await states.aclose()  # type: ignore[attr-defined]
         if last is None:
             raise NoStream(nothing_from(self.stream_address, messages.STATE, timeout))
@@ -112,8 +121,14 @@ class AsyncHand:
         async with self._socket(zmq.REQ) as socket:
             socket.connect(self.command_address)
             await socket.send(messages.pack(request))
-            if not await socket.poll(self.timeout * 1e3):
-                raise NoAnswer(f"no answer from {self.command_address} within {self.timeout:g} s")
+            silence = min(SILENCE, self.timeout)
+            answered = await socket.poll(silence * 1e3)
+            what = answer_to(request, self.command_address)
+            if not answered and silence < self.timeout:
+                _log.warning(still_waiting(what, self.timeout))
+                answered = await socket.poll((self.timeout - silence) * 1e3)
+            if not answered:
+                raise NoAnswer(f"no {what} within {self.timeout:g} s; is softfinger running?")
             reply = msgpack.unpackb(await socket.recv())
         if not isinstance(reply, dict):
             raise NoAnswer(f"{self.command_address} answered something that is not a reply")

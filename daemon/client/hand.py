@@ -14,9 +14,10 @@ import zmq
 from daemon import messages
 from daemon.client.errors import HandFault, NoStream, NotInTime
 from daemon.client.records import Event, HandState, TactileFrame
-from daemon.client.wire import Decoder, nothing_from, prepare
+from daemon.client.wire import Decoder, nothing_from, prepare, silent
 from daemon.commands import Refused, send
 from daemon.keys import load_client
+from daemon.patience import PATIENCE, SILENCE
 from daemon.settings import CommandSettings, Stream
 
 _Record = TypeVar("_Record")
@@ -48,15 +49,25 @@ class Subscription(Generic[_Record]):
         return self.next(self._timeout)
 
     def next(self, timeout: float | None) -> _Record:
-        """The next record. Raises NoStream when none comes within ``timeout`` s."""
-        deadline = None if timeout is None else time.monotonic() + timeout
+        """The next record. Raises NoStream when none comes within ``timeout`` s.
+
+        A warning is logged when that takes long; without a timeout, silence may be as it should.
+        """
+        deadline = math.inf if timeout is None else time.monotonic() + timeout
         while True:
-            left = None if deadline is None else max(deadline - time.monotonic(), 0.0)
-            if not self._socket.poll(None if left is None else math.ceil(left * 1e3)):
+            left = max(deadline - time.monotonic(), 0.0)
+            come = self._poll(min(left, SILENCE) if timeout is not None else left)
+            if not come and timeout is not None and left > SILENCE:
+                silent(self._address, self._topic, timeout)
+                come = self._poll(left - SILENCE)
+            if not come:
                 raise NoStream(nothing_from(self._address, self._topic, timeout or 0.0))
             record: _Record | None = self._decoder.take(self._socket.recv_multipart())
             if record is not None:
                 return record
+
+    def _poll(self, seconds: float) -> int:
+        return self._socket.poll(math.ceil(seconds * 1e3) if seconds < math.inf else None)
 
     def skip(self) -> None:
         """Drop what waits: the next record is one that is still to come."""
@@ -98,7 +109,7 @@ class Hand:
         commands: str = COMMANDS,
         *,
         client: str = "",
-        timeout: float = 2.0,
+        timeout: float = PATIENCE,
         keys: Path | None = None,
     ) -> None:
         self.stream_address = stream

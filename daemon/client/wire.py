@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections import deque
 from collections.abc import Callable
@@ -12,10 +13,13 @@ import zmq
 
 from daemon import messages
 from daemon.client.records import read_event, read_frame, read_state
+from daemon.patience import still_waiting
 
 _QUEUE = 100_000  # messages kept for a program that is slow for a while
 _AGAIN = 1000  # messages that are known again
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+
+_log = logging.getLogger(__name__)
 
 READERS: dict[bytes, Callable[[dict[str, Any]], Any]] = {
     messages.STATE: read_state,
@@ -38,6 +42,11 @@ def prepare(socket: Any, address: str, *topics: bytes) -> None:
 def nothing_from(address: str, topic: bytes, seconds: float) -> str:
     """What a NoStream says."""
     return f"no {topic.decode()} from {address} within {seconds:g} s; is softfinger running?"
+
+
+def silent(address: str, topic: bytes, seconds: float) -> None:
+    """Log that nothing has come for a while."""
+    _log.warning(still_waiting(f"{topic.decode()} from {address}", seconds))
 
 
 class Gaps:

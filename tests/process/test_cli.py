@@ -127,7 +127,10 @@ def test_a_missing_port_is_named(profile: Profile, text: str, error: str) -> Non
 def test_send_without_a_daemon_or_with_nonsense(addresses: tuple[str, str]) -> None:
     done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "0.1")
     assert done.returncode == 2
+    assert f"send: no answer to arm from {addresses[1]} within 0.1 s" in done.stderr
     assert "is softfinger running, or still starting?" in done.stderr
+    done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "1.1")
+    assert f"no answer to arm from {addresses[1]} yet, waiting up to 1.1 s" in done.stderr
     done = softfinger("send", "grasp", "force:5", "--address", addresses[1])
     assert done.returncode == 2
     assert "found 'force:5', expected key=number" in done.stderr

@@ -30,6 +30,7 @@ from daemon.client import (
 )
 from daemon.client.records import read_event, read_frame, read_state
 from daemon.client.wire import Gaps
+from daemon.patience import SILENCE
 from daemon.records import State
 from tests.conftest import until
 from tests.harness import fake_daemon
@@ -138,6 +139,33 @@ def test_no_daemon_is_told(addresses: tuple[str, str]) -> None:
             hand.wait_for(lambda state: True, timeout=0.1)
         with pytest.raises(NoAnswer, match="is softfinger running"):
             hand.arm()
+
+
+def test_who_waits_for_a_daemon_says_for_what(
+    addresses: tuple[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    stream, commands = addresses
+    timeout = SILENCE + 0.05
+    unanswered = rf"no answer to arm from {commands} within 1\.05 s"
+
+    async def ask() -> None:
+        async with AsyncHand(*addresses, timeout=timeout) as hand:
+            with pytest.raises(NoStream):
+                await hand.state()
+            with pytest.raises(NoAnswer, match=unanswered):
+                await hand.command("arm")
+
+    with Hand(*addresses, timeout=timeout) as hand:
+        with pytest.raises(NoStream):
+            hand.state()
+        with pytest.raises(NoAnswer, match=unanswered):
+            hand.arm()
+    asyncio.run(ask())
+    said = [
+        f"no hand/state from {stream} yet, waiting up to 1.05 s",
+        f"no answer to arm from {commands} yet, waiting up to 1.05 s",
+    ]
+    assert caplog.messages == said + said
 
 
 def test_state_is_never_one_that_has_waited(fake: FakeDaemon, hand: Hand) -> None:

@@ -305,7 +305,7 @@ def test_no_wait_without_a_daemon() -> None:
     with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
         assert page.ended() == 1
         assert page.is_restored()
-        assert f"nothing from {NOBODY} within 2 s" in page.written.decode()
+        assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
 
 
 def test_plain_on_a_terminal(fake: FakeDaemon) -> None:

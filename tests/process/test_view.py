@@ -379,7 +379,7 @@ def test_without_the_extra_it_names_what_to_install() -> None:
             "nothing came",
         ),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
-        (("--address", "tcp://127.0.0.1:9", "--no-wait", "--save", "c.rrd"), "nothing from tcp"),
+        (("--address", "tcp://127.0.0.1:9", "--no-wait", "--save", "c.rrd"), "no stream from tcp"),
     ],
 )
 def test_bad_input_is_one_clear_line(
