@@ -1,34 +1,43 @@
 # make run: the simulated hand with its live page.  make test: the tests.
-# Both set up everything in .venv first; PYTHON chooses the interpreter (3.11 or later).
+# Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
+TO_RUN := $(VENV)/.ready-run
+TO_TEST := $(VENV)/.ready-test
 
 .PHONY: run test lint format clean
 
-run: $(READY)
-	$(BIN)/softfinger run --config config/demo.toml --monitor $(ARGS)
+run: $(TO_RUN)
+	@echo "Starting the simulated hand at work; q ends it."
+	@$(BIN)/softfinger run --config config/demo.toml --monitor $(ARGS)
 
-test: $(READY)
+test: $(TO_TEST)
 	$(BIN)/python -m pytest $(ARGS)
 
-lint: $(READY)
+lint: $(TO_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(READY)
+format: $(TO_TEST)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-$(READY): pyproject.toml constraints.txt
+$(TO_RUN): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "softfinger needs Python 3.11 or later; say which with PYTHON=…"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	@touch $(READY)
+	@echo "Setting up $(VENV) once: numpy, numba and six small packages, about 100 MB to fetch."
+	@$(PYTHON) -m venv $(VENV)
+	@$(INSTALL) --editable .
+	@touch $@
+
+$(TO_TEST): $(TO_RUN)
+	@echo "Adding what the tests need to $(VENV) once: the viewer, pyarrow, scipy and others."
+	@$(INSTALL) --editable '.[dev]'
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache

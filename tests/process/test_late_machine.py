@@ -1,0 +1,70 @@
+"""The demo as a process that stands still for a second while it is at work."""
+
+from __future__ import annotations
+
+import select
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.client import Event, Hand, HandState
+from daemon.client.hand import Subscription
+from tests.harness.daemon_process import Running
+
+Profile = Callable[[str], Path]
+STILL = 1.0  # s, ten times what the watchdog and the frames' age allow
+PATIENCE = 60.0  # s for anything to happen on a busy machine
+
+
+@pytest.fixture
+def hand(addresses: tuple[str, str]) -> Iterator[Hand]:
+    with Hand(*addresses, timeout=PATIENCE) as hand:
+        yield hand
+
+
+def stand_still(running: Running) -> None:
+    running.process.send_signal(signal.SIGSTOP)
+    select.select([], [], [], STILL)
+    running.process.send_signal(signal.SIGCONT)
+
+
+def after(states: Subscription[HandState], mode: str) -> HandState:
+    return next(state for state in states if state.mode == mode or state.fault)
+
+
+def told(events: Subscription[Event], kind: str, text: str) -> str:
+    return next(each.text for each in events if each.kind == kind and text in each.text)
+
+
+def test_a_simulated_hand_outlives_a_machine_that_stands_still(
+    start: Callable[..., Running], profile: Profile, hand: Hand
+) -> None:
+    running = start("--config", str(profile('task.name = "demo"\n')))
+    with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
+        before = after(states, "holding")
+        stand_still(running)
+        for mode in ("rotating", "holding", "releasing", "grasping"):
+            state = after(states, mode)
+            assert state.fault == ""
+        # The hand's time has gone on by what it did, and not by what the machine did not.
+        assert state.behind_s >= before.behind_s + 0.9 * STILL
+        passed = 1e-9 * (state.mono_ns - before.mono_ns)
+        assert passed == pytest.approx((state.seq - before.seq) / 500.0)
+        assert told(events, "late", "the simulated hand waited")
+    assert running.end() == 0
+
+
+def test_on_real_time_it_faults_names_the_busy_machine_and_begins_again(
+    start: Callable[..., Running], profile: Profile, hand: Hand
+) -> None:
+    running = start("--config", str(profile('task.name = "demo"\nloop.clock = "real"\n')))
+    with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
+        after(states, "holding")
+        stand_still(running)
+        fault = told(events, "servos.bus", "watchdog")
+        assert fault.startswith("this machine was busy for ")
+        told(events, "task", "the task clears it and begins again")
+        told(events, "mode", "armed → grasping")
+    assert running.end() in (0, 1)  # a busy machine may stop it at any time
