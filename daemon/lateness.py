@@ -59,8 +59,8 @@ class Lateness:
         return self._steadiness(t) if self._watchdog else None
 
     def _text(self, new: float) -> str:
-        did = "the simulated hand waited" if self._waits else "ticks came late by"
-        return f"this machine was busy: {did} {new:.2f} s ({self._sum:.2f} s in all)"
+        did = f"the hand waited {new:.2f} s" if self._waits else f"ticks came {new:.2f} s late"
+        return f"this machine is busy: {did}, {self._sum:.1f} s in all"
 
     def _steadiness(self, t: float) -> Event | None:
         """Once, how late the first second's ticks came against what the servos bear."""

@@ -99,10 +99,10 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
     assert state.timing.behind_s == pytest.approx(0.6 - 2 * 0.002)
     assert state.timing.late_in_row == 0
     told = [text for level, kind, text in events if kind == "late"]
-    assert told == ["this machine was busy: the simulated hand waited 0.40 s (0.40 s in all)"]
+    assert told == ["this machine is busy: the hand waited 0.40 s, 0.4 s in all"]
     daemon.loop.advance(2.0)
     told = [text for level, kind, text in events if kind == "late"]
-    assert told[1:] == ["this machine was busy: the simulated hand waited 0.20 s (0.60 s in all)"]
+    assert told[1:] == ["this machine is busy: the hand waited 0.20 s, 0.6 s in all"]
 
 
 def test_a_duration_is_the_machines(on_late_machine: Build) -> None:
@@ -124,7 +124,7 @@ def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine: Build) -> 
     assert state.fault_name == "servos.bus"
     late = [event for event in events if event[1] == "late"]
     assert late == [
-        ("warning", "late", "this machine was busy: ticks came late by 0.15 s (0.15 s in all)")
+        ("warning", "late", "this machine is busy: ticks came 0.15 s late, 0.1 s in all")
     ]
 
 
