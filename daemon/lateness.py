@@ -15,7 +15,7 @@ LATE = 0.05  # s from which lateness is told
 EVERY = 5.0  # s between two tellings
 RECENT = 0.25  # s after a late tick in which a fault may be its doing
 FIRST = 1.0  # s of ticks after which it is told how steady they were
-_STEADY = 0.2  # share of the servos' watchdog that a tick may be late without a warning
+_STEADY = 0.2  # share of the servos' watchdog that a pause may take without a warning
 # Rows of `daemon.limits` that stand when a tick comes late.
 _BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
@@ -32,7 +32,7 @@ class Lateness:
         self._waits = settings.simulated and settings.loop.clock != "real"
         self._watchdog = 0.0 if settings.simulated else settings.servos.watchdog
         self._begin = math.nan
-        self._worst = 0.0  # lateness of a tick in the first second
+        self._worst = 0.0  # s by which a pause of the first second was longer than the period
         self._sum = 0.0  # s that ticks came late in all, or that the hand has waited
         self._told = (0.0, -math.inf)  # that sum, and when
         self._busy_until = -math.inf
@@ -43,35 +43,36 @@ class Lateness:
         ``own_doing``: the last one took its time for a command. The event to be told, if any.
         """
         timing = self._timing
-        gap = timing.tick_s - self._period
-        if gap > LATE and not own_doing:
+        gap = 0.0 if own_doing else timing.tick_s - self._period
+        if gap > LATE:
             timing.busy_s, self._busy_until = gap, t + RECENT
         elif t > self._busy_until:
             timing.busy_s = 0.0
         if self._waits:
             self._sum = timing.behind_s
-        elif timing.wake_late_s > LATE:
-            self._sum += timing.wake_late_s
+        elif gap > LATE:
+            self._sum += gap
         new = self._sum - self._told[0]
         if new > LATE and t - self._told[1] > EVERY:
             self._told = (self._sum, t)
             return "warning", "late", self._text(new)
-        return self._steadiness(t) if self._watchdog else None
+        return self._steadiness(t, gap) if self._watchdog else None
 
     def _text(self, new: float) -> str:
         did = f"the hand waited {new:.2f} s" if self._waits else f"ticks came {new:.2f} s late"
         return f"this machine is busy: {did}, {self._sum:.1f} s in all"
 
-    def _steadiness(self, t: float) -> Event | None:
-        """Once, how late the first second's ticks came against what the servos bear."""
+    def _steadiness(self, t: float, gap: float) -> Event | None:
+        """Once, the first second's longest pause against what the servos bear."""
         if math.isnan(self._begin):
             self._begin = t
-        self._worst = max(self._worst, self._timing.wake_late_s)
+        self._worst = max(self._worst, gap)
         if t - self._begin < FIRST:
             return None
         budget, self._watchdog = self._watchdog, 0.0
         text = (
-            f"ticks of the first second came at most {self._worst * 1e3:.3g} ms late; "
+            "the longest pause between two ticks of the first second took "
+            f"{(self._worst + self._period) * 1e3:.3g} ms; "
             f"the servos' watchdog stops them after {budget * 1e3:g} ms"
         )
         if self._worst <= _STEADY * budget:
