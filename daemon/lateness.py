@@ -48,8 +48,8 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + RECENT
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:
-            self._sum = timing.behind_s
+        if self._waits:  # and will have waited for this tick's lateness when the next is due
+            self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATE:
             self._sum += gap
         new = self._sum - self._told[0]

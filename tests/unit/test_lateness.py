@@ -105,6 +105,19 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
     assert told[1:] == ["this machine is busy: the hand waited 0.20 s, 0.6 s in all"]
 
 
+def test_a_long_wait_is_told_with_all_before_it_at_the_tick_that_ends_it(
+    on_late_machine: Build,
+) -> None:
+    daemon, machine, events = on_late_machine("auto")
+    machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.3] + [0.0] * 50 + [6.0]
+    daemon.loop.advance(6.9)
+    told = [text for level, kind, text in events if kind == "late"]
+    assert told == [
+        "this machine is busy: the hand waited 0.40 s, 0.4 s in all",
+        "this machine is busy: the hand waited 6.30 s, 6.7 s in all",
+    ]
+
+
 def test_a_duration_is_the_machines(on_late_machine: Build) -> None:
     daemon, machine, _ = on_late_machine("auto")
     begin = machine.now()
