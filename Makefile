@@ -15,6 +15,7 @@ run: $(TO_RUN)
 	@$(BIN)/softfinger run --config config/demo.toml --monitor $(ARGS)
 
 test: $(TO_TEST)
+	@$(BIN)/softfinger compile --all
 	$(BIN)/python -m pytest $(ARGS)
 
 lint: $(TO_TEST)
@@ -32,6 +33,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 	@echo "Setting up $(VENV) once: numpy, numba and six small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --editable .
+	@$(BIN)/softfinger compile --config config/demo.toml
 	@touch $@
 
 $(TO_TEST): $(TO_RUN)
