@@ -61,17 +61,21 @@ class Part(NamedTuple):
 
 
 def parts(settings: Settings) -> list[Part]:
-    """What ``settings`` has kernels for, the contact table first, then the longest first."""
+    """What ``settings`` has kernels for, in the order in which two processes best share them.
+
+    One has the estimator, the longest; the other the contact table and then what looks up in it,
+    whose kernels it has compiled in part by then.
+    """
     simulated = "simulated" in (settings.servos.backend, settings.tactile.backend)
     found = [_TABLE]
     if settings.tactile.backend != "none":
         found.append(_ESTIMATOR)
     if simulated:
         found.append(_HAND)
-    if settings.tactile.backend == "simulated":
-        found.append(_SENSOR)
     if settings.servos.backend != "none":
         found.append(_CONTROL)
+    if settings.tactile.backend == "simulated":
+        found.append(_SENSOR)
     return found
 
 

@@ -1,9 +1,9 @@
 """One soft hemispherical fingertip of constant modulus against a plane: the exact formulas.
 
 Holds the fingertip's geometry, the closed forms of force, energy, their partials and the contact's
-moments, as scalar kernels, and array front ends of them. The tip is a hemisphere of radius a on a
-rigid base; a spring stands on each point of the base, normal to it. The object's face is pressed in
-by d along its normal, which is tilted by θ against the base's normal. With h = a − d:
+moments over arrays, and as kernels those that other kernels call. The tip is a hemisphere of radius
+a on a rigid base; a spring stands on each point of the base, normal to it. The object's face is
+pressed in by d along its normal, which is tilted by θ against the base's normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
@@ -117,122 +117,127 @@ def closed_form(
     return force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
 
 
-@inner_kernel
-def closed_form_seconds(
-    modulus: float, d: float, theta: float
-) -> tuple[float, float, float, float, float, float]:
-    """(F_dd, F_dθ, F_θθ, U_dd, U_dθ, U_θθ) of a constant modulus; zeros for d ≤ 0."""
-    if d <= 0.0:
-        zero = 0.0 * theta
-        return zero, zero, zero, zero, zero, zero
-    c = math.cos(theta)
-    slope = math.sin(theta) / c
-    force = math.pi * modulus * d * d / c
-    energy = force * d / (3.0 * c)
-    slope2 = slope * slope
-    return (
-        2.0 * force / (d * d),
-        2.0 * force * slope / d,
-        force * (1.0 + 2.0 * slope2),
-        6.0 * energy / (d * d),
-        6.0 * energy * slope / d,
-        energy * (2.0 + 6.0 * slope2),
+def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
+    """Broadcast to one shape; returns it and each argument flat, contiguous and in float64."""
+    arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values))
+    shape = arrays[0].shape
+    return shape, [np.ascontiguousarray(array).reshape(-1) for array in arrays]
+
+
+# What is no number is told by NaN in the result.
+_quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
+
+
+def _pressed(d: FloatArray, theta: FloatArray, *values: FloatArray) -> tuple[FloatArray, ...]:
+    """``values`` where the tip is pressed (d > 0), zero where it is not, NaN for NaN."""
+    nothing = 0.0 * theta + np.where(np.isnan(d), d, 0.0)
+    return tuple(np.where(d > 0.0, value, nothing)[()] for value in values)
+
+
+@_quiet
+def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
+    """Force, energy and first partials of a constant ``modulus`` [Pa]; d [m], θ [rad] broadcast.
+
+    Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
+    """
+    if type(d) is float and type(theta) is float:
+        return cast(Closed, _closed(*map(np.float64, closed_form(float(modulus), d, theta))))
+    depth, tilt = _broadcast(d, theta)
+    inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)
+    force_d = 2.0 * np.pi * float(modulus) * depth * inverse
+    force = 0.5 * depth * force_d
+    energy_d = force * inverse
+    energy = energy_d * depth / 3.0
+    six = force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
+    return Closed(*_pressed(depth, tilt, *six))
+
+
+@_quiet
+def closed_seconds(modulus: float, d: ArrayLike, theta: ArrayLike) -> Seconds:
+    """Second partials of the closed forms; d [m], θ [rad] broadcast. Zeros for d ≤ 0."""
+    depth, tilt = _broadcast(d, theta)
+    inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)
+    square = slope * slope
+    force_dd = 2.0 * np.pi * float(modulus) * inverse
+    energy_dd = force_dd * depth * inverse
+    return Seconds(
+        *_pressed(
+            depth,
+            tilt,
+            force_dd,
+            force_dd * depth * slope,
+            0.5 * force_dd * depth**2 * (1.0 + 2.0 * square),
+            energy_dd,
+            energy_dd * depth * slope,
+            energy_dd * depth**2 * (1.0 + 3.0 * square) / 3.0,
+        )
     )
 
 
-@inner_kernel
-def contact_moments(
-    radius: float, d: float, theta: float
-) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """The fields of :class:`Moments` in their order. Zeros for d ≤ 0; valid up to θ's limit."""
-    if d <= 0.0:
-        zero = 0.0 * theta
-        return zero, zero, zero, zero, zero, zero, zero, zero, zero
-    s = math.sin(theta)
-    c = math.cos(theta)
-    h = radius - d
-    rho2 = d * (radius + h)
-    rho = math.sqrt(rho2)
-    across = d * (4.0 * radius - d) / 12.0
-    along = across - s * s * d * (12.0 * radius - 5.0 * d) / 36.0
+@_quiet
+def moments(tip: Fingertip, d: ArrayLike, theta: ArrayLike) -> Moments:
+    """Centroid, second moments, footprint and peak strain; d [m], θ [rad] broadcast.
+
+    Centroid and moments are those of a constant modulus; the footprint and the peak strain are the
+    geometry's own and hold for any. Zeros for d ≤ 0; the peak strain is NaN past θ's limit.
+    """
+    radius = tip.radius
+    depth, tilt = _broadcast(d, theta)
+    s, c = np.sin(tilt), np.cos(tilt)
+    h = radius - depth
+    across = depth * (4.0 * radius - depth) / 12.0
+    along = across - s * s * depth * (12.0 * radius - 5.0 * depth) / 36.0
+    rho2 = depth * (radius + h)
+    rho = np.sqrt(rho2)
     # h² − a²s² = a²c² − ρ², and the peak strain is 1 − √(1 − g) with g = ρ²/(a²c²).
     g = rho2 / (radius * c) ** 2
-    peak = g / (1.0 + math.sqrt(1.0 - g)) if g <= 1.0 else math.nan
-    position = radius * radius * s / h if h > 0.0 else radius * s
-    return (
-        (radius - d / 3.0) * s,
-        along,
-        across,
-        h * s,
-        rho * c,
-        rho,
-        math.pi * rho2 * c,
-        peak,
-        position,
+    peak = g / (1.0 + np.sqrt(1.0 - g))
+    position = np.where(h > 0.0, radius * radius * s / h, radius * s)
+    return Moments(
+        *_pressed(
+            depth,
+            tilt,
+            (radius - depth / 3.0) * s,
+            along,
+            across,
+            h * s,
+            rho * c,
+            rho,
+            math.pi * rho2 * c,
+            peak,
+            position,
+        )
     )
 
 
-@inner_kernel
-def tangential_energy(modulus: float, d: float, theta: float, d_t: float) -> float:
-    """U = πE[d³/(3 cos² θ) + d² d_t tan θ + d d_t²] [J] with tangential displacement d_t [m].
+@_quiet
+def tangential(
+    modulus: float, d: ArrayLike, theta: ArrayLike, d_t: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """(U, T): energy [J] and stick force along the face [N] with tangential displacement d_t [m].
 
-    The parallel-distributed model's form: each spring is bent by d_t along the face as well as
-    compressed. Zero for d ≤ 0.
+    U = πE[d³/(3 cos² θ) + d² d_t tan θ + d d_t²] and T = ∂U/∂d_t = πE(d² tan θ + 2 d d_t), the
+    parallel-distributed model's forms: each spring is bent by d_t along the face as well as
+    compressed. The normal force of the pair is N = ∂U/∂d − T tan θ. Arguments broadcast; zeros for
+    d ≤ 0.
     """
-    if d <= 0.0:
-        return 0.0 * theta
-    slope = math.tan(theta)
-    square = 1.0 + slope * slope
-    return math.pi * modulus * d * (d * d * square / 3.0 + d * d_t * slope + d_t * d_t)
+    depth, tilt, shear = _broadcast(d, theta, d_t)
+    slope, push = np.tan(tilt), np.pi * float(modulus) * depth
+    energy = push * (depth**2 * (1.0 + slope**2) / 3.0 + depth * shear * slope + shear**2)
+    force = push * (depth * slope + 2.0 * shear)
+    energy, force = _pressed(depth, tilt, energy, force)
+    return energy, force
 
 
-@inner_kernel
-def tangential_force(modulus: float, d: float, theta: float, d_t: float) -> float:
-    """T = ∂U/∂d_t = πE(d² tan θ + 2 d d_t) [N], the stick contact's force along the face."""
-    if d <= 0.0:
-        return 0.0 * theta
-    return math.pi * modulus * d * (d * math.tan(theta) + 2.0 * d_t)
+def theta_limits(radius: float, d: ArrayLike) -> FloatArray:
+    """Largest |θ| [rad] at displacement d [m], shape of d; π/2 for d ≤ 0, 0 for d ≥ a.
 
-
-@kernel
-def _closed_forms(modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray) -> None:
-    for i in range(d.shape[0]):
-        (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i], out[5, i]) = closed_form(
-            modulus, d[i], theta[i]
-        )
-
-
-@kernel
-def _seconds(modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray) -> None:
-    for i in range(d.shape[0]):
-        (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i], out[5, i]) = closed_form_seconds(
-            modulus, d[i], theta[i]
-        )
-
-
-@kernel
-def _moments(radius: float, d: FloatArray, theta: FloatArray, out: FloatArray) -> None:
-    for i in range(d.shape[0]):
-        (
-            out[0, i],
-            out[1, i],
-            out[2, i],
-            out[3, i],
-            out[4, i],
-            out[5, i],
-            out[6, i],
-            out[7, i],
-            out[8, i],
-        ) = contact_moments(radius, d[i], theta[i])
-
-
-@kernel
-def _tangential(
-    modulus: float, d: FloatArray, theta: FloatArray, d_t: FloatArray, out: FloatArray
-) -> None:
-    for i in range(d.shape[0]):
-        out[0, i] = tangential_energy(modulus, d[i], theta[i], d_t[i])
-        out[1, i] = tangential_force(modulus, d[i], theta[i], d_t[i])
+    To the bit what the kernels take for the limit.
+    """
+    shape, (depth,) = flatten(d)
+    out = np.empty_like(depth)
+    _limits(radius, depth, out)
+    return out.reshape(shape)
 
 
 @kernel
@@ -241,58 +246,5 @@ def _limits(radius: float, d: FloatArray, out: FloatArray) -> None:
         out[i] = theta_limit(radius, d[i])
 
 
-def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
-    """Broadcast to one shape; returns it and each argument flat, contiguous and in float64."""
-    arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values))
-    shape = arrays[0].shape
-    return shape, [np.ascontiguousarray(array).reshape(-1) for array in arrays]
-
-
-def _mapped(function: Any, rows: int, scalar: float, *values: ArrayLike) -> list[FloatArray]:
-    shape, arrays = flatten(*values)
-    out = np.empty((rows, arrays[0].size))
-    function(scalar, *arrays, out)
-    return [row.reshape(shape) for row in out]
-
-
-def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
-    """Force, energy and first partials of a constant ``modulus`` [Pa]; d [m], θ [rad] broadcast.
-
-    Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
-    """
-    if type(d) is float and type(theta) is float:
-        return cast(Closed, _closed(*map(np.float64, closed_form(float(modulus), d, theta))))
-    return Closed(*_mapped(_closed_forms, 6, float(modulus), d, theta))
-
-
-def closed_seconds(modulus: float, d: ArrayLike, theta: ArrayLike) -> Seconds:
-    """Second partials of the closed forms; d [m], θ [rad] broadcast. Zeros for d ≤ 0."""
-    return Seconds(*_mapped(_seconds, 6, float(modulus), d, theta))
-
-
-def moments(tip: Fingertip, d: ArrayLike, theta: ArrayLike) -> Moments:
-    """Centroid, second moments, footprint and peak strain; d [m], θ [rad] broadcast.
-
-    Centroid and moments are those of a constant modulus; the footprint and the peak strain are the
-    geometry's own and hold for any. Zeros for d ≤ 0; the peak strain is NaN past θ's limit.
-    """
-    return Moments(*_mapped(_moments, 9, tip.radius, d, theta))
-
-
-def tangential(
-    modulus: float, d: ArrayLike, theta: ArrayLike, d_t: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    """(U, T): energy [J] and stick force along the face [N] with tangential displacement d_t [m].
-
-    The normal force of the pair is N = ∂U/∂d − T tan θ. Arguments broadcast.
-    """
-    energy, force = _mapped(_tangential, 2, float(modulus), d, theta, d_t)
-    return energy, force
-
-
-def theta_limits(radius: float, d: ArrayLike) -> FloatArray:
-    """Largest |θ| [rad] at displacement d [m], shape of d; π/2 for d ≤ 0, 0 for d ≥ a."""
-    shape, (depth,) = flatten(d)
-    out = np.empty_like(depth)
-    _limits(radius, depth, out)
-    return out.reshape(shape)
+def _broadcast(*values: ArrayLike) -> list[FloatArray]:
+    return list(np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values)))
