@@ -87,6 +87,7 @@ class _Workers:
         self._waiting = list(missing)
         self._total = sum(part.kernels for part in missing)
         self._begun = 0  # kernels
+        self._started = time.monotonic()
         self._tell = tell
         self.failed = False
         self._workers: dict[int, _Worker] = {}  # by the file that it is read from
@@ -119,7 +120,8 @@ class _Workers:
                         for line in lines:
                             self._take(worker, line)
                 at = "; ".join(filter(None, (each.at for each in self._workers.values())))
-                bar(self._begun, f"{self._begun} of about {self._total}, {at}")
+                took = time.monotonic() - self._started
+                bar(self._begun, f"{self._begun} of about {self._total}, {took:.0f} s: {at}")
 
     def _hand_out(self) -> bool:
         """Give each idle process the next part that need not wait; False when none has one."""

@@ -8,7 +8,7 @@ import time
 from types import TracebackType
 
 _STEP = 0.1  # s between two pictures
-_WIDTH = 30
+_WIDTH = 20
 
 
 class Progress:
@@ -17,21 +17,18 @@ class Progress:
     def __init__(self, what: str, total: int) -> None:
         self._what = what
         self._total = max(total, 1)
-        self._began = time.monotonic()
         self._shown = -1.0
         self._on = sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """So much of the total is behind; ``note`` says what is at work, and then the time, too."""
+        """So much of the total is behind; ``note`` says more than the share does."""
         if not self._on or time.monotonic() - self._shown < _STEP:
             return
         self._shown = time.monotonic()
         share = min(done / self._total, 1.0)
         full = round(share * _WIDTH)
         bar = "█" * full + "·" * (_WIDTH - full)
-        line = f"{self._what} {bar} {share:4.0%}"
-        if note:
-            line += f"  {time.monotonic() - self._began:.0f} s  {note}"
+        line = f"{self._what} {bar} {note or f'{share:4.0%}'}"
         columns = shutil.get_terminal_size().columns
         print(f"\r{line[: columns - 1]}\x1b[K", end="", file=sys.stderr, flush=True)
 
