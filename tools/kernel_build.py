@@ -23,7 +23,7 @@ from tools.progress import Progress
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).resolve().parent.parent
-_MEMORY = 600e6  # bytes that a process needs at most
+_MEMORY = 400e6  # bytes that a process needs at most
 _LOOK = 0.2  # s between two looks at the time
 
 
@@ -75,8 +75,13 @@ def build_kernels(
 def _jobs(missing: list[Part]) -> int:
     """As many processes as there are cores, parts, and memory for."""
     cores = len(os.sched_getaffinity(0))
-    available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return max(1, min(cores, len(missing), int(available / _MEMORY)))
+    return max(1, min(cores, len(missing), int(_available() / _MEMORY)))
+
+
+def _available() -> float:
+    """Memory that may be taken without swapping [bytes]."""
+    _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
+    return 1024.0 * float(rest.split()[0])
 
 
 class _Workers:
