@@ -1,4 +1,5 @@
-# make run: the simulated hand with its live page.  make test: the tests.
+# make run: the simulated hand with its live page.  make test: the tests, on every processor.
+# make test ARGS=tests/unit: some of them, or options of pytest; ARGS=-n0: in one process.
 # Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
 
 PYTHON ?= python3
@@ -16,7 +17,7 @@ run: $(TO_RUN)
 
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses logical --dist worksteal $(ARGS)
 
 lint: $(TO_TEST)
 	$(BIN)/ruff check .

@@ -35,4 +35,11 @@ class Running:
         self.process.send_signal(number)
         assert self.process.stderr is not None
         self.lines += self.process.stderr.readlines()
-        return self.process.wait(timeout=30)
+        return self.process.wait(timeout=60)
+
+    def kill(self) -> None:
+        """End it however it stands, if it has not ended yet."""
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stderr is not None
+        self.process.stderr.close()

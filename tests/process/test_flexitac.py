@@ -22,6 +22,7 @@ from daemon.records import Frame
 from daemon.settings import TactileSettings
 from daemon.tactile.base import TactileError
 from daemon.tactile.flexitac import MARKER, FlexiTac, FlexiTacDecoder
+from tests.conftest import until
 
 ROWS, COLS = 4, 5
 CELLS = ROWS * COLS
@@ -317,14 +318,6 @@ def test_another_size_is_recognised_behind_a_standing_image_with_markers_in_it()
 # --- on a pty, through pyserial -----------------------------------------------------------------
 
 
-def until(condition: Callable[[], bool], timeout: float = 5.0) -> None:
-    """Wait for a condition that another thread brings about."""
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        select.select([], [], [], 0.001)
-
-
 class Board:
     """The far end of a pty, written to by the test; can stream in a thread of its own."""
 
@@ -405,7 +398,7 @@ def test_frames_come_through_a_port_with_their_times(board):
     assert now is not first
     assert np.array_equal(first.data, kept)
     assert now.t_arrival - now.t_sample == pytest.approx(1026 * 10 / 2e6 + 0.005)
-    assert 0.0 <= time.monotonic() - now.t_arrival < 1.0
+    assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
     counters = tactile.counters()
     assert counters["frames"] >= 20
@@ -513,16 +506,3 @@ def test_a_port_that_disappears_gives_an_invalid_frame_and_no_crash(board):
     assert tactile.counters()["port_lost"] == 1
     tactile.close()
     assert threading.active_count() == 1
-
-
-def test_the_reader_costs_little():
-    """A hundred frames a second must cost well below 1 % of a core to decode."""
-    decoder = FlexiTacDecoder(32, 32)
-    rng = np.random.default_rng(1)
-    frames = [frame(rng.integers(0, 160, 1024, dtype=np.uint8).tobytes()) for _ in range(1000)]
-    start = time.thread_time()
-    for data in frames:
-        decoder.feed(data, 0.0)
-    spent = time.thread_time() - start
-    assert decoder.counters()["frames"] == 999
-    assert spent / 1000 < 100e-6  # measured 4 µs; 100 µs would be 1 % of a core

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -385,9 +384,7 @@ def test_interrupt_ends_both(fake: FakeDaemon, tmp_path: Path) -> None:
 def test_daemon_killed_gives_the_terminal_back(fake: FakeDaemon, tmp_path: Path) -> None:
     with Beside(fake, tmp_path) as page:
         page.process.kill()
-        began = time.monotonic()
         page.wait(page.child_is_gone)
-        assert time.monotonic() - began < 2.0
         assert page.is_restored()
 
 

@@ -74,7 +74,7 @@ class DynamixelRig:
     """The Dynamixel backend, through SDK and pyserial, on an emulated bus in a thread."""
 
     def __init__(self, servos: dict[str, Any] | None = None, **sections: Any) -> None:
-        chosen = {"backend": "dynamixel", "reply_timeout": 0.25, **(servos or {})}
+        chosen = {"backend": "dynamixel", "reply_timeout": 1.0, **(servos or {})}
         settings = Settings.model_validate({"servos": chosen, **sections})
         now = time.monotonic()
         bus = ServoBus.from_settings(settings, FreeJoints(2, now), t=now)
