@@ -66,15 +66,20 @@ def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
     context.destroy(linger=0)
 
 
-@pytest.fixture
-def addresses() -> tuple[str, str]:
-    """Two TCP addresses that are this test's alone: stream and commands.
+def own_addresses() -> tuple[str, str]:
+    """Two TCP addresses that nobody else has: stream and commands.
 
-    This process has a loopback host to itself, by its number, and each test takes new ports there.
+    This process has a loopback host to itself, by its number, and takes new ports there each time.
     """
     number = os.getpid()
     host = f"127.{64 + (number >> 16)}.{number >> 8 & 255}.{number & 255}"
     return f"tcp://{host}:{next(_PORTS)}", f"tcp://{host}:{next(_PORTS)}"
+
+
+@pytest.fixture
+def addresses() -> tuple[str, str]:
+    """Two TCP addresses that are this test's alone."""
+    return own_addresses()
 
 
 @pytest.fixture
