@@ -101,7 +101,7 @@ class Daemon:
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
         context: zmq.Context[Any] = zmq.Context()
-        self._closers.append(context.term)
+        self._closers.append(context.destroy)  # sockets that a signal left half made, too
         stream, commands = self.settings.stream, self.settings.commands
         access = self.settings.access
         keys = load_server(Path(access.keys)) if access.keys else None

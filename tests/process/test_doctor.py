@@ -114,7 +114,8 @@ def test_boards_are_listened_to(emulated, capsys):
     status, lines = hand.doctor(capsys)
     assert status == 0, lines
     for side in ("left", "right"):
-        assert [line for line in lines if f"pass   tactile {side}: 32 × 32 cells, " in line]
+        # On a busy machine they may be told as slow, which is no failure.
+        assert [line for line in lines if f" tactile {side}: 32 × 32 cells, " in line]
     hand.emulator.tell("left:wrong-size")
     status, lines = hand.doctor(capsys)
     assert status == 1

@@ -14,8 +14,10 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon import assembly
 from daemon.clock import VirtualClock
 from daemon.commands import CommandServer, NoAnswer, Refused, decode, send
+from daemon.settings import Settings
 from daemon.sockets import AddressError, Guard
 from daemon.stream import Publisher
 from tests.conftest import until
@@ -313,3 +315,19 @@ def test_an_ipc_file_has_the_rights_that_were_set(
     server.close()
     stream.close()
     assert list(folder.iterdir()) == []
+
+
+def test_a_signal_while_the_sockets_are_made_ends_the_start(
+    monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, str]
+) -> None:
+    made: list[zmq.Socket[Any]] = []
+
+    def interrupted(context: zmq.Context[Any], *_: Any) -> None:
+        made.append(context.socket(zmq.ROUTER))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(assembly, "CommandServer", interrupted)
+    wire = {"stream": {"address": addresses[0]}, "commands": {"address": addresses[1]}}
+    with pytest.raises(KeyboardInterrupt):
+        assembly.Daemon(Settings.model_validate(wire))
+    assert made[0].closed
