@@ -55,9 +55,9 @@ def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
     if how == "exception":
         call[1:3] = ["-c", BREAKS_AT_THE_TENTH_PAGE]
     with TerminalProcess(call) as page:
-        page.wait(lambda: termios.tcgetattr(page.slave) != page.attributes)
-        if how != "exception":
+        if how not in ("exception", "duration"):
             page.shows("HOLDING")
+            assert termios.tcgetattr(page.slave) != page.attributes
             assert not page.is_restored()
         if how in ("q", "ctrl-c"):
             page.type(b"q" if how == "q" else b"\x03")
@@ -286,7 +286,7 @@ def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
         assert "tick 500 Hz" in text
         assert any("warning mode: grasping → holding" in line for line in lines)
         plain.terminate()
-        assert plain.wait(10.0) == 0
+        assert plain.wait(60.0) == 0
 
 
 def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
@@ -294,7 +294,7 @@ def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
         assert plain.stdout is not None
         plain.stdout.readline()
         plain.stdout.close()
-        assert plain.wait(10.0) == 0
+        assert plain.wait(60.0) == 0
         assert plain.stderr is not None
         assert plain.stderr.read() == b""
 
@@ -333,7 +333,7 @@ over = threading.Event()
 signal.signal(signal.SIGINT, lambda *_: over.set())
 with start_beside(sys.argv[1], sys.argv[2], on_end=over.set) as page:
     open(sys.argv[3], "w").write(str(page.process.pid))
-    over.wait(60.0)
+    over.wait(300.0)
 print("ended", over.is_set(), flush=True)
 """
 
