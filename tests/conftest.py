@@ -31,6 +31,7 @@ hypothesis.settings.register_profile("search", deadline=None)
 hypothesis.settings.load_profile("same")
 
 _PORTS = itertools.count(9872)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
 def pytest_configure() -> None:
@@ -52,9 +53,12 @@ def pytest_unconfigure() -> None:
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """Ends the processes that a test started and left, however it ended itself."""
+    """Ends the processes that a test started and left, and gives Ctrl-C back to pytest."""
     before = descendants.running()
+    handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield
+    for each, handler in handlers.items():
+        signal.signal(each, handler)
     descendants.end(descendants.running() - before)
 
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
+from daemon.client import Refused
 from daemon.commands import send
 
 SOFTFINGER = [sys.executable, "-m", "tools.cli"]
@@ -35,6 +38,38 @@ def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
         reply = send(address, {"command": name, **numbers}, timeout=120.0)
         if reply["ok"] or "send it again" not in reply["error"]:
             return reply
+
+
+def until_it_says(words: Sequence[str | Path], text: str, stream: str = "stdout") -> str:
+    """What a process says up to the line with ``text``; it is ended then, and must end well."""
+    process = subprocess.Popen(
+        [*SOFTFINGER, *map(str, words)], text=True, **{stream: subprocess.PIPE}
+    )
+    pipe = getattr(process, stream)
+    said = ""
+    for line in pipe:
+        said += line
+        if text in line:
+            process.terminate()
+            break
+    else:
+        raise AssertionError(said)
+    said += pipe.read()
+    pipe.close()
+    assert process.wait(120.0) == 0, said
+    return said
+
+
+def insist(command: Callable[[], object]) -> None:
+    """Give a client's command, again where the daemon was held up and says so."""
+    while True:
+        try:
+            command()
+        except Refused as refused:
+            if "send it again" not in str(refused):
+                raise
+        else:
+            return
 
 
 class Running:

@@ -6,9 +6,22 @@ import contextlib
 import ctypes
 import os
 import signal
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 _PR_SET_CHILD_SUBREAPER = 36  # from <linux/prctl.h>
+
+
+@contextlib.contextmanager
+def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
+    """A process that is killed at the end, where ``with`` alone would wait for it for ever."""
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def adopt_orphans() -> None:

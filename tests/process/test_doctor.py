@@ -26,6 +26,7 @@ from daemon.servos import registers as reg
 from daemon.servos.scanning import scan
 from daemon.settings import Settings
 from daemon.simulation.emulator import Emulator
+from tests.harness.descendants import ending
 from tools import doctor
 from tools.cli import main
 
@@ -219,10 +220,11 @@ def test_who_has_a_port_is_named(terminal, locked):
         "print('open', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", script, path], **pipes) as other:
+    with ending(subprocess.Popen([sys.executable, "-c", script, path], **pipes)) as other:
         assert other.stdout.readline() == "open\n"
         found = ports.check_port(path, "servos.port")
         other.stdin.close()
+        other.wait(60)
     assert found.status == "FAIL"
     assert f"in use by process {other.pid} (python" in found.text
     assert found.mend == f"kill {other.pid}"

@@ -18,6 +18,7 @@ import pytest
 from daemon.client import Hand
 from tests.conftest import until
 from tests.harness.daemon_process import Running
+from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon
 from tests.harness.terminal_process import TerminalProcess
 
@@ -271,7 +272,8 @@ def test_resized(fake: FakeDaemon) -> None:
 
 
 def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
-    with subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as plain:
+    process = subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    with ending(process) as plain:
         assert plain.stdout is not None
         lines: list[str] = []
         while sum(" holding  left" in line for line in lines) < 2:
@@ -290,7 +292,8 @@ def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
 
 
 def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
-    with subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as plain:
+    process = subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    with ending(process) as plain:
         assert plain.stdout is not None
         plain.stdout.readline()
         plain.stdout.close()
