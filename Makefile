@@ -9,6 +9,9 @@ INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
 
+# Byte code is kept whatever the environment says: a test run starts hundreds of processes.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: run test lint format clean
 
 run: $(TO_RUN)

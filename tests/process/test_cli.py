@@ -37,7 +37,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
     stream, commands = own_addresses()
     path = tmp_path_factory.mktemp("shared") / "profile.toml"
     text = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
-    path.write_text(text + "stream.state_rate = 500.0\n", encoding="utf-8")
+    path.write_text(text + "loop.rate = 200.0\nstream.state_rate = 200.0\n", encoding="utf-8")
     running = Running("--config", str(path))
     yield Shared(running, path, stream, commands)
     running.kill()
@@ -89,19 +89,15 @@ def test_sigusr1_stops(hand: Shared) -> None:
     until(lambda: ask(hand.commands, "status")["mode"] == "disarmed")
 
 
-def test_duration_ends_by_itself(profile: Profile) -> None:
-    done = softfinger("run", "--config", str(profile("")), "--duration", "0.3")
-    assert done.returncode == 0, done.stderr
-    assert "ended, torque off" in done.stderr
-
-
-def test_settings_from_the_command_line(profile: Profile) -> None:
+def test_duration_ends_by_itself_and_settings_come_from_the_command_line(profile: Profile) -> None:
     path = str(profile(""))
     done = softfinger("run", "--config", path, "--set", "loop.rate=quick", "--set", "tip.radius=9")
     assert done.returncode == 2
     assert done.stderr.startswith('--set: loop.rate: found "quick", expected a number')
-    done = softfinger("run", "--config", path, "--set", "loop.rate=100", "--duration", "0.1")
-    assert done.returncode == 0
+    done = softfinger("run", "--config", path, "--set", "loop.rate=100", "--duration", "0.3")
+    assert done.returncode == 0, done.stderr
+    assert "simulated, 100 Hz" in done.stderr
+    assert "ended, torque off" in done.stderr
 
 
 def test_a_second_daemon_says_so_and_ends(hand: Shared) -> None:
@@ -258,8 +254,8 @@ def test_subscribers_that_come_late_stop_reading_or_die_change_nothing(
     late.subscribe("hand/state")
     late.connect(hand.stream)
     seen = []
-    for count in range(800):
-        if count == 300:
+    for count in range(400):
+        if count == 150:
             dying.kill()
         assert late.poll(60_000)
         seen.append(msgpack.unpackb(late.recv_multipart()[1])["seq"])

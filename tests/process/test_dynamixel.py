@@ -603,9 +603,7 @@ def test_goal_current_minus_one_and_goal_velocity_minus_three(
     assert (bytes(data), result, error) == (bytes(goals), sdk.COMM_SUCCESS, 0)
 
 
-@hypothesis_settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@hypothesis_settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     data=st.lists(st.sampled_from([0xFF, 0xFD, 0x12, 0x00]), min_size=1, max_size=28).map(bytes),
     fast=st.booleans(),

@@ -6,14 +6,15 @@ import asyncio
 import re
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from daemon.client import AsyncHand, Hand, NoStream
 from daemon.keys import make_keys
-from tests.conftest import until
+from tests.conftest import own_addresses, until
 from tests.harness.daemon_process import SOFTFINGER, Running, insist, softfinger, until_it_says
 from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
@@ -22,17 +23,29 @@ from tools.recordings.republish import Wire
 Profile = Callable[[str], Path]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    make_keys(tmp_path / "keys", ["alice"])
-    return tmp_path / "keys"
-
-
-@pytest.fixture
-def guarded(profile: Profile, folder: Path, start: Callable[..., Running]) -> Running:
+class Guarded(NamedTuple):
     """A daemon that lets in the clients of ``folder`` alone."""
-    text = f'access.keys = "{folder}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n'
-    return start("--config", str(profile(text)))
+
+    folder: Path
+    addresses: tuple[str, str]
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    place = tmp_path_factory.mktemp("guarded")
+    make_keys(place / "keys", ["alice"])
+    stream, commands = own_addresses()
+    (place / "profile.toml").write_text(
+        f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
+        f'access.keys = "{place / "keys"}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n',
+        encoding="utf-8",
+    )
+    daemon = Running("--config", str(place / "profile.toml"))
+    yield Guarded(place / "keys", (stream, commands))
+    try:
+        assert daemon.end() == 0
+    finally:
+        daemon.kill()
 
 
 def record(path: Path, *words: str) -> None:
@@ -44,9 +57,8 @@ def record(path: Path, *words: str) -> None:
     assert Recording(path).counts["hand/state"] > 0
 
 
-def test_tools_with_keys_see_and_command_the_hand(
-    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
-) -> None:
+def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Path) -> None:
+    folder, addresses = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
     path, shown = tmp_path / "a.mcap", tmp_path / "a.rrd"
@@ -68,13 +80,12 @@ def test_tools_with_keys_see_and_command_the_hand(
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"
-    assert guarded.end() == 0
 
 
 def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
-    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+    guarded: Guarded, tmp_path: Path
 ) -> None:
-    stream, commands = addresses
+    stream, commands = guarded.addresses
     path = tmp_path / "b.mcap"
     tools = [
         subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
@@ -95,14 +106,13 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
     assert done.returncode == 1
     assert "softfinger keys" in done.stderr
     assert not path.exists()
-    assert guarded.end() == 0
 
 
 def test_a_daemon_with_keys_records_itself(
-    profile: Profile, folder: Path, start: Callable[..., Running], tmp_path: Path
+    profile: Profile, guarded: Guarded, start: Callable[..., Running], tmp_path: Path
 ) -> None:
     path = tmp_path / "own.mcap"
-    config = profile(f'access.keys = "{folder}"\n')
+    config = profile(f'access.keys = "{guarded.folder}"\n')
     daemon = start("--config", str(config), "--record", str(path), "--duration", "1")
     assert daemon.process.wait(120) == 0
     recording = Recording(path)
@@ -111,11 +121,10 @@ def test_a_daemon_with_keys_records_itself(
 
 
 def test_a_recording_is_replayed_to_holders_of_keys(
-    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+    guarded: Guarded, addresses: tuple[str, str], tmp_path: Path
 ) -> None:
-    path = tmp_path / "run.mcap"
-    record(path, "--address", addresses[0], "--keys", str(folder))
-    assert guarded.end() == 0
+    path, folder = tmp_path / "run.mcap", guarded.folder
+    record(path, "--address", guarded.addresses[0], "--keys", str(folder))
     replay = subprocess.Popen(
         [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--keys", str(folder)],
         stdout=subprocess.PIPE,

@@ -120,14 +120,24 @@ def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
         send(addresses[1], {"command": "arm"}, timeout=0.05)
 
 
-@given(st.binary(max_size=64))
-@settings(max_examples=300, deadline=None)
-def test_random_bytes_are_decoded_or_refused(payload: bytes) -> None:
+values = st.one_of(st.none(), st.integers(0, 300), st.floats(allow_nan=False), st.text(max_size=5))
+maps = st.dictionaries(st.text(max_size=5), values, max_size=3)
+
+
+@given(
+    st.one_of(
+        st.binary(max_size=64),
+        st.builds(lambda more, name: msgpack.packb({**more, "command": name}), maps, values),
+    )
+)
+@settings(max_examples=300)
+def test_any_bytes_are_decoded_or_refused(payload: bytes) -> None:
     try:
         request = decode(payload)
     except Refused:
         return
     assert isinstance(request["command"], str)
+    assert request == msgpack.unpackb(payload)
 
 
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])

@@ -168,7 +168,7 @@ def test_a_goal_current_rises_slowly_from_nothing_and_falls_at_once() -> None:
 
 
 @given(st.lists(st.tuples(*[st.floats(width=32) for _ in range(6)]), min_size=1, max_size=20))
-@hypothesis_settings(max_examples=200, deadline=None)
+@hypothesis_settings(max_examples=200)
 def test_no_goal_leaves_its_limits_whatever_is_asked(asked: list[tuple[float, ...]]) -> None:
     judge, state, hand, limits = safety(), sound(), SETTINGS.hand, SETTINGS.safety
     last = [0.0, 0.0]
