@@ -41,9 +41,9 @@ class Hand:
         self.settings = load(HIL, folder)
         self.emulator = Emulator(self.settings, folder, **options)
         ready = threading.Event()
-        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,))
+        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,), daemon=True)
         self._thread.start()
-        assert ready.wait(60.0)
+        assert ready.wait(200)
 
     def registers(self) -> list[bytes]:
         """What the servos hold, but for the registers that live."""

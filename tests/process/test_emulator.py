@@ -95,7 +95,7 @@ def thread(folder: Path, *faults: str, settings: Settings | None = None) -> Iter
     """An emulator in a thread of this process, where a test wants several."""
     made = Emulator(settings or Settings(), folder, faults=faults)
     ready = threading.Event()
-    runner = threading.Thread(target=made.run, args=(ready.set,))
+    runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
     runner.start()
     try:
         assert ready.wait(READY_WITHIN)
