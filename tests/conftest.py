@@ -22,7 +22,7 @@ import zmq
 from daemon.assembly import Daemon
 from daemon.settings import Settings
 from tests.harness import descendants
-from tests.harness.daemon_process import Running, softfinger
+from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 
 # The same examples on every machine, however slow; --hypothesis-profile=search looks for others.
@@ -40,12 +40,6 @@ def pytest_configure() -> None:
     """End as on Ctrl-C when asked to; orphans of what tests started come to this process."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Kernels are compiled once, before the processes that run the tests start."""
-    if session.config.getoption("numprocesses", None):
-        softfinger("run", "--set", "loop.clock=virtual", "--duration", "0.1", timeout=600.0)
 
 
 def pytest_unconfigure() -> None:

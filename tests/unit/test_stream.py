@@ -43,7 +43,7 @@ def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zm
 
 
 def receive(socket: zmq.Socket[Any]) -> tuple[bytes, dict[str, Any]]:
-    assert socket.poll(5000)
+    assert socket.poll(60_000)
     topic, payload = socket.recv_multipart()
     return topic, msgpack.unpackb(payload)
 
