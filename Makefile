@@ -6,6 +6,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
+WORKERS := $(shell expr $$(nproc) + 1) # one waits for something while the others compute
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
 
@@ -20,7 +21,7 @@ run: $(TO_RUN)
 
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
-	$(BIN)/python -m pytest --numprocesses logical --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(ARGS)
 
 lint: $(TO_TEST)
 	$(BIN)/ruff check .

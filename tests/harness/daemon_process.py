@@ -40,24 +40,14 @@ def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
             return reply
 
 
-def until_it_says(words: Sequence[str | Path], text: str, stream: str = "stdout") -> str:
-    """What a process says up to the line with ``text``; it is ended then, and must end well."""
-    process = subprocess.Popen(
-        [*SOFTFINGER, *map(str, words)], text=True, **{stream: subprocess.PIPE}
-    )
-    pipe = getattr(process, stream)
-    said = ""
-    for line in pipe:
-        said += line
-        if text in line:
-            process.terminate()
-            break
-    else:
-        raise AssertionError(said)
-    said += pipe.read()
-    pipe.close()
-    assert process.wait(120.0) == 0, said
-    return said
+def until_it_says(words: Sequence[str | Path], text: str) -> None:
+    """Run a tool until it prints a line with ``text``; it is ended then, and must end well."""
+    process = subprocess.Popen([*SOFTFINGER, *words], text=True, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert any(text in line for line in process.stdout), f"{text!r} never came"
+    process.terminate()
+    process.communicate(timeout=120.0)
+    assert process.returncode == 0
 
 
 def insist(command: Callable[[], object]) -> None:
