@@ -19,10 +19,13 @@ _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
                    both boards, or one: left:silent, right:torn=0.2
+  to the servos    lose, lose-writes =PROBABILITY that an instruction reaches none of them
   servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY
-  servos           silent, answer, reboot, overheat, overload, undervoltage, recover =ID
+  servos           silent, answer, reboot, overheat, overload, undervoltage =ID; their readings:
+                   stuck (angle stands, velocity and current read 0), jump (by 0.2 rad), frozen
+                   (all registers stand, their time too), refuse (an error for each); recover =ID
   ports            unplug, plug for the servos'; left:unplug, right:plug … for a board's
-  all well again   well for servo replies and boards, left:well for one board
+  all well again   well for the servos' line and boards, left:well for one board
   @SECONDS         when it starts; at once without
 
 softfinger emulate --dir DIR --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
@@ -41,6 +44,7 @@ begins the record anew, --send "report forget" does both without a gap:
     goals_refused  how many writes with a goal the servo refused
     torque_on      count, t of the last; far: how often the goal was more than 0.05 rad away,
                    farthest [rad], current: greatest goal current in force [A]
+    torque_off     when it was last switched off, null before
     quiet, longest_quiet
                    time since the last instruction with torque on, null while it is off, and the
                    longest such [s]

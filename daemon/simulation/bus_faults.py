@@ -1,7 +1,8 @@
-"""Faults on demand for the emulated servo bus: what may go wrong with replies and with servos.
+"""Faults on demand for the emulated servo bus: what may go wrong on the line and with servos.
 
-Replies are dropped, late, cut, damaged or doubled with given probabilities from a seeded source.
-Everything can be set by a word of text, so that a flag and a control socket use the same terms.
+Instructions are lost on their way, replies are dropped, late, cut, damaged or doubled, with given
+probabilities from a seeded source. Everything can be set by a word of text, so that a flag and a
+control socket use the same terms.
 """
 
 from __future__ import annotations
@@ -17,32 +18,53 @@ class FaultError(ValueError):
 
 
 @dataclass(slots=True)
-class ReplyFaults:
-    """Probabilities, 0 … 1, for each reply."""
+class LineFaults:
+    """Probabilities, 0 … 1, for each instruction and each reply."""
 
-    drop: float = 0.0  # it never comes
+    lose: float = 0.0  # an instruction reaches no servo
+    lose_writes: float = 0.0  # one that asks for no reading reaches none, besides
+    drop: float = 0.0  # a reply never comes
     late: float = 0.0  # it comes LATE seconds later
     truncate: float = 0.0  # its end is missing
     corrupt: float = 0.0  # one bit is flipped
     duplicate: float = 0.0  # it comes twice
 
 
-REPLY_FAULTS = tuple(field.name for field in fields(ReplyFaults))
-SERVO_FAULTS = ("silent", "answer", "reboot", "overheat", "overload", "undervoltage", "recover")
+LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
+SERVO_FAULTS = (
+    "silent",
+    "answer",
+    "reboot",
+    "overheat",
+    "overload",
+    "undervoltage",
+    "stuck",
+    "jump",
+    "frozen",
+    "refuse",
+    "recover",
+)
 
 
 class FaultSource:
-    """Applies :class:`ReplyFaults` to replies, the same way for the same seed."""
+    """Applies :class:`LineFaults`, the same way for the same seed."""
 
     def __init__(self, seed: int = 1) -> None:
-        self.rates = ReplyFaults()
+        self.rates = LineFaults()
         self._random = random.Random(seed)
 
     @property
     def active(self) -> bool:
-        """Whether any probability is above 0."""
+        """Whether anything may happen to replies."""
         rates = self.rates
         return bool(rates.drop or rates.late or rates.truncate or rates.corrupt or rates.duplicate)
+
+    def loses(self, reads: bool) -> bool:
+        """Whether the next instruction reaches no servo; ``reads``: it asks for a reading."""
+        rates = self.rates
+        if rates.lose and self._random.random() < rates.lose:
+            return True
+        return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
         """What comes of a reply: (extra delay [s], bytes), none when it was dropped."""
@@ -68,17 +90,17 @@ def parse_fault(text: str) -> tuple[str, float]:
         FaultError: unknown kind, no number, a probability outside 0 … 1.
     """
     kind, equals, value = text.strip().partition("=")
-    known = REPLY_FAULTS + SERVO_FAULTS
+    known = LINE_FAULTS + SERVO_FAULTS
     if kind not in known or not equals:
         raise FaultError(
-            f"fault {text!r}: expected KIND=PROBABILITY with {', '.join(REPLY_FAULTS)}, "
+            f"fault {text!r}: expected KIND=PROBABILITY with {', '.join(LINE_FAULTS)}, "
             f"or KIND=ID with {', '.join(SERVO_FAULTS)}"
         )
     try:
         number = float(value)
     except ValueError:
         raise FaultError(f"fault {text!r}: {value!r} is not a number") from None
-    if kind in REPLY_FAULTS and not 0.0 <= number <= 1.0:
+    if kind in LINE_FAULTS and not 0.0 <= number <= 1.0:
         raise FaultError(f"fault {text!r}: a probability lies in 0 … 1")
     if kind in SERVO_FAULTS and (number != int(number) or not 0 <= number <= 252):
         raise FaultError(f"fault {text!r}: an ID is a whole number in 0 … 252")

@@ -21,7 +21,7 @@ from typing import Any
 from daemon.model import make_material, make_table
 from daemon.records import FINGERS
 from daemon.settings import Settings, TactileSettings
-from daemon.simulation.bus_faults import FaultError, ReplyFaults
+from daemon.simulation.bus_faults import FaultError, LineFaults
 from daemon.simulation.control_port import ControlPort
 from daemon.simulation.encoders import ENCODERS, encoder_for
 from daemon.simulation.fault_words import SERVOS, Event, Faults
@@ -313,7 +313,7 @@ class Emulator:
             if servos.fileno() < 0:
                 servos.plug()
         elif event.what == "well":
-            servos.bus.faults.rates = ReplyFaults()
+            servos.bus.faults.rates = LineFaults()
         else:
             servos.bus.fault(event.what, t)
 

@@ -30,7 +30,7 @@ class Faults:
       boards, with ``left:`` or ``right:`` before it for one; see :class:`BoardFault`.
     - ``drop=0.01``, ``silent=2`` … for the servos; see :meth:`ServoBus.fault`.
     - ``unplug`` and ``plug`` for the servos' port, ``left:unplug`` … for a board's.
-    - ``well`` ends what is wrong with replies and boards, ``left:well`` with one board.
+    - ``well`` ends what is wrong with the servos' line and boards, ``left:well`` with one board.
 
     ``@SECONDS`` behind it says when it starts. ``events`` has them in time's order, and as they
     were given where they start at once.

@@ -24,6 +24,7 @@ from daemon.simulation.table_backup import TableBackup
 from daemon.simulation.wire_watch import WireWatch
 
 REBOOT_TIME = 0.34  # s without an answer
+JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
 # Registers whose writing does more than change them.
 _EFFECTIVE = frozenset(
     (
@@ -45,8 +46,9 @@ class EmulatedServo:
     """A servo on joint ``joint`` of ``plant``, factory-new unless ``prepared``.
 
     ``prepared`` brings it up as the backend wants it: in operating mode ``mode`` where the model
-    has it, and with no return delay. What ``health`` has may be set from outside, and ``silent``
-    makes it deaf and dumb.
+    has it, and with no return delay. What ``health`` has may be set from outside; ``silent`` makes
+    it deaf and dumb, with ``frozen`` what it measures stands still, its time included, and with
+    ``refuses`` it answers every reading with an error.
     """
 
     def __init__(
@@ -67,7 +69,7 @@ class EmulatedServo:
         self.firmware = model.firmware if firmware is None else firmware
         self.fast_reads = model.fast_read(self.firmware)  # answers fast sync and fast bulk read
         self.table = ControlTable(model, self.firmware)
-        self.silent = False
+        self.silent = self.frozen = self.refuses = False
         self.health = ServoHealth(model)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.watch = WireWatch(t)
@@ -178,8 +180,10 @@ class EmulatedServo:
     def read(self, address: int, length: int, t: float) -> bytes | None:
         """The bytes of a span, or None when it does not lie inside the table."""
         table = self.table
-        if not table.holds(address, length):
+        if not table.holds(address, length) or self.refuses:
             return None
+        if self.frozen:
+            return table.read(address, length)
         if address >= reg.PRESENT_CURRENT and address + length <= _MOTION_END:
             self._joint.refresh_motion()
         elif table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
@@ -201,6 +205,8 @@ class EmulatedServo:
             self._next_step = min(self._next_step, t + STEP)
         if limp and self.torque_on:
             self._note_torque(t)
+        elif not limp and not self.torque_on:
+            self.watch.torque_off(t)
         self._joint.drive()
         return protocol.OK
 
@@ -297,9 +303,22 @@ class EmulatedServo:
             **self.watch.report(t, self._joint, self.torque_on),
         }
 
+    def stick(self) -> None:
+        """Its encoder and its current's sensor stand still from now on: angle kept, the rest 0."""
+        self._joint.stuck = self._joint.encoder()
+
+    def jump(self) -> None:
+        """Its encoder's zero jumps, as by a magnet that slips."""
+        self._joint.shift += JUMP
+
     def recover(self) -> None:
-        """Cool down and bring the supply back; a latched hardware error stays until a reboot."""
+        """Cool down, bring the supply back and measure well again.
+
+        A latched hardware error stays until a reboot.
+        """
         self.health.recover()
+        self.frozen = self.refuses = False
+        self._joint.stuck, self._joint.shift = None, 0
 
     # --- rules of writing ------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from daemon.servos.units import JointScale
 from daemon.settings import Settings
 from daemon.simulation import protocol
 from daemon.simulation.bus_faults import (
-    REPLY_FAULTS,
+    LINE_FAULTS,
     FaultError,
     FaultSource,
     parse_fault,
@@ -167,6 +167,8 @@ class ServoBus:
         replies: list[Reply] = []
         for packet in self.parser.feed(data, t):
             self.packets += 1
+            if self.faults.loses(packet.instruction in _READS):
+                continue
             listening = [
                 servo for servo in self.servos if servo.awake(t) and baud in (0, servo.baud)
             ]
@@ -198,8 +200,8 @@ class ServoBus:
         """
         kind, number = parse_fault(text)
         self._due = -math.inf
-        if kind in REPLY_FAULTS:
-            setattr(self.faults.rates, kind, number)
+        if kind in LINE_FAULTS:
+            setattr(self.faults.rates, kind.replace("-", "_"), number)
             return
         servo = next((servo for servo in self.servos if servo.id == number), None)
         if servo is None:
@@ -213,6 +215,14 @@ class ServoBus:
             servo.fail(5)
         elif kind == "undervoltage":
             servo.health.voltage = (model.voltage_min - 10) * reg.VOLTAGE_UNIT
+        elif kind == "stuck":
+            servo.stick()
+        elif kind == "jump":
+            servo.jump()
+        elif kind == "frozen":
+            servo.frozen = True
+        elif kind == "refuse":
+            servo.refuses = True
         elif kind == "recover":
             servo.recover()
         else:

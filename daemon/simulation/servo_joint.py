@@ -49,6 +49,8 @@ class ServoJoint:
         self._plant = plant
         self._joint = joint
         self._scale = scale
+        self.stuck: int | None = None  # where the encoder stands still [counts]
+        self.shift = 0  # counts that it tells too many
         self._turns = 0  # whole turns that the position has forgotten
         self._load = scale.direction / model.stall_current  # share of stall current, counts' sign
         self._speed = scale.direction * reg.VELOCITY_UNIT / scale.velocity / model.no_load_speed
@@ -72,18 +74,21 @@ class ServoJoint:
 
     # --- position ----------------------------------------------------------------------------
 
-    def _encoder(self) -> int:
-        return self._scale.position_counts(self._plant.q.item(self._joint))
+    def encoder(self) -> int:
+        """What the encoder tells, in counts of all turns."""
+        if self.stuck is not None:
+            return self.stuck
+        return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
 
     def forget_turns(self) -> int:
         """Bring the position into one turn; by how many counts it fell."""
         before = self._turns
-        self._turns = self._encoder() // reg.COUNTS_PER_TURN
+        self._turns = self.encoder() // reg.COUNTS_PER_TURN
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
 
     def position(self) -> int:
         """Present position in counts, as register 132 tells it."""
-        within = self._encoder() - self._turns * reg.COUNTS_PER_TURN
+        within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
         memory = self._table.memory
         if memory[reg.DRIVE_MODE] & 1:
             within = -within
@@ -168,6 +173,8 @@ class ServoJoint:
 
     def _motion(self) -> tuple[int, int, int]:
         """Registers 126, 128 and 132: current (or load), velocity, position."""
+        if self.stuck is not None:
+            return 0, 0, self.position()
         plant, joint, scale = self._plant, self._joint, self._scale
         sign = self.sign
         ampere = plant.current.item(joint)

@@ -31,6 +31,7 @@ class WireWatch:
         self._quiet = 0.0  # s, longest with torque on
         self._fired = 0
         self._fired_t: float | None = None
+        self._off_t: float | None = None
 
     def goal(self, address: int, value: int) -> None:
         """A value for a register was on the wire."""
@@ -56,6 +57,10 @@ class WireWatch:
             away = abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))
             self._far += away > FAR
             self._farthest = max(self._farthest, away)
+
+    def torque_off(self, t: float) -> None:
+        """Torque was switched off at time t."""
+        self._off_t = t
 
     def heard(self, t: float, torque: bool) -> None:
         """A packet that the servo understood went by at time t."""
@@ -84,6 +89,7 @@ class WireWatch:
                 "farthest": self._farthest,
                 "current": self._current,
             },
+            "torque_off": self._off_t,
             "quiet": quiet if torque else None,
             "longest_quiet": max(self._quiet, quiet) if torque else self._quiet,
             "watchdog_fired": {"count": self._fired, "t": self._fired_t},
