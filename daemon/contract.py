@@ -161,12 +161,15 @@ _INPUT = (
     Field("reading.valid", "bool", "", "this tick's is good"),
     Field("reading.alert", "int", "", "bit i: servo of finger i reports a hardware error"),
     Field("reading.error", "str", "", "what the bus failed with, or empty"),
+    Field("reading.lost", "int", "", "bit i: servo of finger i holds none of the last goals sent"),
+    Field("reading.frozen", "int", "", "bit i: servo of finger i measures nothing new"),
     *(
         part._replace(name=f"{finger}.{part.name}", meaning=f"{finger} finger: {part.meaning}")
         for finger in FINGERS
         for part in _TAKEN
     ),
     Field("write_error", "str", "", "what the bus failed with when written to, or empty"),
+    Field("torque_off", "bool", "", "the servos confirmed at this tick that torque is off"),
 )
 
 _TRUE = (

@@ -1,7 +1,10 @@
-"""The servos as the loop drives them: torque on and off, and tried again where off fails.
+"""Torque on and off as the loop drives it: off counts once the servos have confirmed it.
 
-Holds who may believe what about torque: from the moment it is asked for it counts as on, until the
-servos have answered that it is off.
+From the moment torque is asked for it counts as on. From the moment off is wanted it is sent at
+every tick until the servos' own registers say so. Where they do not within half of their bus
+watchdog's time, nothing at all is sent for as long as that watchdog takes to stop the motors: a
+servo that hears the daemon's readings, and none of its writes, would drive on for ever. Then it is
+tried again.
 """
 
 from __future__ import annotations
@@ -9,99 +12,173 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from daemon.records import State
-from daemon.safety import Safety
+from daemon.records import Reading, State
+from daemon.safety import BUS, TORQUE_OFF, Safety
 from daemon.servos.base import ServoError, Servos
+from daemon.servos.registers import WATCHDOG_UNIT
+from daemon.settings import ServoSettings
 
-_RETRY = 0.5  # s between two tries to turn torque off
+_TRY = 0.5  # of the watchdog's time in which torque off is tried before the bus falls silent
+_TRY_UNGUARDED = 0.05  # s that it is tried before that is told, with servos.watchdog = 0
+_LAST_TRIES = 15  # when the daemon ends
 
 
 class Drive:
-    """One hand's servos, or none. It tells ``state.torque`` and ``state.write_error``."""
+    """One hand's servos, or none. Keeps ``state.torque``, ``torque_off`` and ``write_error``."""
 
     def __init__(
         self,
         servos: Servos | None,
+        settings: ServoSettings,
         state: State,
         safety: Safety,
-        fail: Callable[[str], None],
+        fail: Callable[[str, str], None],
         emit: Callable[[str, str, str], None],
     ) -> None:
-        """``fail`` latches a fault for a reason, ``emit`` tells an event."""
+        """``fail`` latches a fault for a reason and its row's name, ``emit`` sends an event."""
         self.servos = servos
         self._state = state
         self._safety = safety
         self._fail = fail
         self._emit = emit
-        self._off_again = False  # torque off is asked for although the state says so already
-        self._next_try = -math.inf  # when torque off may be tried again after it failed
+        watchdog = settings.watchdog
+        self._patience = _TRY * watchdog or _TRY_UNGUARDED
+        # The servo counts in whole units, and may be one late.
+        units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
+        self._silence = units * WATCHDOG_UNIT
+        self._tried_since = math.inf  # torque off is wanted and not confirmed since then
+        self._silent_until = -math.inf
+        self._first = math.inf  # when off was first asked for
+        self._told = False
+        self._last_try = -1  # seq of the tick with the last try
+        self._aside = Reading()  # what is read after the tick has decided goes here
+
+    @property
+    def pending(self) -> bool:
+        """Whether torque off is wanted and not confirmed."""
+        return self._tried_since < math.inf
+
+    def read(self, reading: Reading) -> None:
+        """As `Servos.read`; while torque off is pending it is asked for on the way.
+
+        Raises ServoError as that does.
+        """
+        state, servos = self._state, self.servos
+        state.torque_off = False
+        if servos is None:
+            return
+        if not self.pending:
+            servos.read(reading)
+        elif self._is_silent():
+            reading.valid = False
+        else:
+            self._try(servos, reading)
 
     def write(self, wanted: bool, now: float) -> None:
         """Bring torque to what is ``wanted`` at this tick, and the goal to the servos."""
         state, servos = self._state, self.servos
         if servos is None:
             return
-        if wanted and not state.torque:
+        if not wanted:
+            if state.torque and not self.pending:
+                self.off()
+        elif not state.torque:
             self._on(servos)
-        elif not wanted and (state.torque or self._off_again):
-            self._off_again = False
-            self._off(servos)
-        elif wanted and state.goal.valid:
+        elif state.goal.valid:
             state.goal.seq = state.seq
             state.goal.t = now
             try:
                 self._safety.write(servos, state)
             except ServoError as error:
-                self._fall(servos, error)
+                self._fall(error)
 
-    def forget(self) -> None:
-        """Turn torque off at the next tick whatever the state says: another may have put it on."""
-        self._off_again = True
-        self._next_try = -math.inf
+    def off(self) -> bool:
+        """Ask for torque off now, whatever the state says; whether the servos have confirmed it.
+
+        It waits for one reply at most. Where that does not come, each tick tries again.
+        """
+        state, servos = self._state, self.servos
+        if servos is None:
+            return True
+        if not self.pending:
+            state.torque = True  # as far as is known: another program may have put it on
+            self._first = self._tried_since = state.t
+            self._silent_until = -math.inf
+        if self._last_try != state.seq and not self._is_silent():
+            try:
+                self._try(servos, self._aside)
+            except ServoError as error:
+                state.write_error = str(error)
+        return not state.torque
 
     def end(self) -> None:
-        """Turn torque off now if it may be on."""
-        self._next_try = -math.inf
-        if self.servos is not None and self._state.torque:
-            self._off(self.servos)
+        """Turn torque off now if it may be on; where that fails, the end is the bus's silence."""
+        for _ in range(_LAST_TRIES):
+            if not self._state.torque:
+                return
+            self._last_try = -1
+            self.off()
+
+    def reconnect(self) -> None:
+        """Connect servos that have gone silent anew, as after an unplug. Raises ServoError."""
+        if self.servos is not None:
+            self.servos.connect()
+            self.servos.read(self._state.reading)
+            if self._state.torque:
+                # It may still be on where the port went away before it could be turned off.
+                self._silent_until, self._tried_since = -math.inf, self._state.t
+                self._last_try = -1
+                self.off()
 
     def _on(self, servos: Servos) -> None:
         self._state.torque = True  # from here on it may be on, whatever the servos answer
         try:
-            servos.set_torque(True)
+            servos.torque_on()
         except ServoError as error:
-            self._fall(servos, error)
+            self._fall(error)
 
-    def _fall(self, servos: Servos, error: ServoError) -> None:
+    def _fall(self, error: ServoError) -> None:
         self._state.write_error = str(error)
-        self._fail(str(error))
-        self._off(servos)
+        self._fail(str(error), BUS)
+        self.off()
 
-    def _off(self, servos: Servos) -> None:
-        """Turn torque off; when that fails, again every half second. The first failure is told."""
+    def _try(self, servos: Servos, reading: Reading) -> None:
+        self._last_try = self._state.seq
+        if not servos.torque_off(reading):
+            return
         state = self._state
-        if state.t < self._next_try:
-            return
-        state.torque = True  # as far as is known, until they have answered
-        try:
-            servos.set_torque(False)
-        except ServoError as error:
-            state.write_error = str(error)
-            if self._next_try < 0.0:
-                self._emit("error", "servos", f"torque could not be turned off: {error}")
-            self._next_try = state.t + _RETRY
-        else:
-            state.torque = False
-            self._next_try = -math.inf
+        state.torque, state.torque_off = False, True
+        self._tried_since = math.inf
+        if self._told:
+            self._told = False
+            waited = state.t - self._first
+            self._emit(
+                "info", TORQUE_OFF, f"torque off confirmed by the servos after {waited:.2f} s"
+            )
 
-    def reconnect(self) -> None:
-        """Connect servos that have gone silent anew, as after an unplug. Raises ServoError."""
-        state, servos = self._state, self.servos
-        if servos is None:
+    def _is_silent(self) -> bool:
+        """Whether nothing may be sent at this tick, so that the servos' watchdogs act."""
+        t = self._state.t
+        if t < self._silent_until:
+            return True
+        if t - self._tried_since < self._patience:
+            return False
+        self._silent_until = self._tried_since = t + self._silence
+        self._tell()
+        return self._silence > 0.0
+
+    def _tell(self) -> None:
+        """That torque off is not confirmed: once, and as a fault where none is latched."""
+        if self._told:
             return
-        servos.connect()
-        servos.read(state.reading)
-        if state.torque:
-            # It may still be on where the port went away before it could be turned off.
-            servos.set_torque(False)
-            state.torque = False
+        self._told = True
+        state = self._state
+        text = f"torque off not confirmed by the servos for {state.t - self._first:.2f} s: "
+        if self._silence:
+            text += "the bus is kept silent until their watchdogs stop them"
+        else:
+            text += "cut their power (servos.watchdog = 0: nothing else stops them)"
+        if state.fault:
+            self._emit("error", TORQUE_OFF, text)
+        else:
+            self._fail(text, TORQUE_OFF)

@@ -152,6 +152,8 @@ class InputMap(FixedMap):
             reading.t,
             FALSE + reading.valid,
             reading.alert,
+            reading.lost,
+            reading.frozen,
         ]
         for finger, frame in enumerate(frames):
             numbers += (
@@ -166,4 +168,5 @@ class InputMap(FixedMap):
                 numbers += (0, 0.0, 0.0, FALSE)
             else:
                 numbers += (frame.seq, frame.t_sample, frame.t_arrival, FALSE + frame.valid)
+        numbers.append(FALSE + state.torque_off)
         return self.pack((state.read_error, state.write_error), numbers)

@@ -104,6 +104,20 @@ def servo_alert(view: View, state: State, _: float) -> str:
     return f"servos: hardware error reported by {' and '.join(told)}"
 
 
+def _named(view: View, bits: int) -> str:
+    return " and ".join(FINGERS[index] for index in view.fingers if bits >> index & 1)
+
+
+def servo_frozen(view: View, state: State, _: float) -> str:
+    frozen = _named(view, state.reading.frozen)
+    return f"servos: {frozen} answers with old readings: its own clock stands still" * bool(frozen)
+
+
+def goal_lost(view: View, state: State, _: float) -> str:
+    lost = _named(view, state.reading.lost)
+    return f"servos: {lost} holds none of the goals sent lately: check its cable" * bool(lost)
+
+
 def joint_angle(view: View, state: State, _: float) -> str:
     for index in view.fingers:
         q = state.reading.q[index]

@@ -46,8 +46,10 @@ _T: Literal["sensors"] = "sensors"
 ROWS: tuple[Row, ...] = (
     Row("servos.bus", "the port is there, the servos obey and were not stopped by their watchdog",
         "fault", ("servos.watchdog",)),
-    Row("servos.silent", "age of the last good servo reading", "fault", ("servos.fault_after",),
-        by.servos_silent, _S, True),
+    Row("servos.silent", "age of the last good servo reading; an error for answer is none",
+        "fault", ("servos.fault_after",), by.servos_silent, _S, True),
+    Row("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",
+        "fault", (), by.servo_frozen, _S, True),
     Row("servos.alert", "hardware error that a servo reports", "fault", (),
         by.servo_alert, _S, True),
     Row("servos.temperature", "temperature of a servo", "warn", ("safety.temperature_warn",),
@@ -66,6 +68,10 @@ ROWS: tuple[Row, ...] = (
         ("safety.stall_error", "safety.stall_time"), by.joint_stall, _S, lasts="stall_time"),
     Row("joint.strained", "grip that takes all the current there may be", "warn",
         ("safety.current_max",), by.joint_strained, _S, lasts=1.0),
+    Row("torque.off", "torque off not confirmed within half the watchdog's time: the bus is kept "
+        "silent until the watchdog stops the servos", "fault", ("servos.watchdog",)),
+    Row("goal.lost", "servo that for 0.05 s holds none of the goals sent to it", "fault", (),
+        by.goal_lost, _S, True),
     Row("goal.number", "goal that is no number: it is not sent", "fault", (),
         by.no_number, _S, True),
     Row("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),

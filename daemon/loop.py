@@ -79,7 +79,9 @@ class Loop:
         self._safety = Safety(
             settings, servos is not None, sensors, self._held, self._frames, perceptions
         )
-        self._drive = Drive(servos, self.state, self._safety, self._fail, self.emit)
+        self._drive = Drive(
+            servos, settings.servos, self.state, self._safety, self._fail, self.emit
+        )
         self._orders = Orders(
             settings,
             self.state,
@@ -227,12 +229,10 @@ class Loop:
         return done
 
     def _read(self) -> None:
-        state, reading, servos = self.state, self.state.reading, self._drive.servos
-        if servos is None:
-            return
+        state, reading = self.state, self.state.reading
         state.read_error = state.write_error = ""
         try:
-            servos.read(reading)
+            self._drive.read(reading)
         except ServoError as error:
             reading.valid = False
             state.read_error = str(error)

@@ -190,10 +190,13 @@ def input_message(state: State, frames: tuple[Frame | None, Frame | None]) -> di
             "valid": reading.valid,
             "alert": reading.alert,
             "error": state.read_error,
+            "lost": reading.lost,
+            "frozen": reading.frozen,
         },
         "left": left,
         "right": right,
         "write_error": state.write_error,
+        "torque_off": state.torque_off,
     }
 
 

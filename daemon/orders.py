@@ -62,7 +62,7 @@ class Orders:
         reply = control.command(command)
         self._lease.renew(command, state.t)
         if command.name in ("stop", "disarm"):
-            self._drive.forget()
+            reply["torque_off"] = "confirmed" if self._drive.off() else "unconfirmed"
         if command.name == "tare":
             for perception in self._perceptions:
                 perception.tare()
@@ -81,6 +81,8 @@ class Orders:
         silent = state.t - state.reading.t > self._silent_after
         if self._drive.servos is None or not silent:
             return
+        if self._drive.pending and not state.read_error:
+            return  # the port is there: connecting would only disturb the silence on it
         try:
             self._drive.reconnect()
         except ServoError as error:
@@ -114,7 +116,10 @@ class Orders:
         state = self._state
         if name in ("arm", "clear"):
             if state.torque and not self._control.torque:
-                raise Refused(f"{name}: torque could not be turned off yet")
+                raise Refused(
+                    f"{name}: the servos have not confirmed torque off yet: check their cable and "
+                    "their power"
+                )
             cause = self._safety.cause(state, gripping=name == "clear")
             if cause:
                 raise Refused(f"{name}: {cause}")

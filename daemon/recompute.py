@@ -137,6 +137,8 @@ class _Servos:
         reading.t = said["t"] if said["t"] is not None else -math.inf
         reading.valid = said["valid"]
         reading.alert = said["alert"]
+        reading.lost = said.get("lost", 0)
+        reading.frozen = said.get("frozen", 0)
         for finger, name in enumerate(FINGERS):
             part = taken[name]
             reading.q[finger] = part["q"]
@@ -148,8 +150,13 @@ class _Servos:
         if said["error"]:
             raise ServoError(said["error"])
 
-    def set_torque(self, on: bool) -> None:
+    def torque_on(self) -> None:
         self._fail_as_recorded()
+
+    def torque_off(self, reading: Reading) -> bool:
+        self.read(reading)
+        confirmed: bool = self.taken.get("torque_off", not self.taken["write_error"])
+        return confirmed
 
     def write(self, goal: Goal) -> None:
         self._fail_as_recorded()

@@ -31,6 +31,8 @@ class Reading:
     dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
     current: list[float] = field(default_factory=_pair)  # motor current [A], positive closes
     alert: int = 0  # bit i: servo of finger i reports a hardware error
+    lost: int = 0  # bit i: it holds none of the goals that were sent to it lately
+    frozen: int = 0  # bit i: its own clock stands still, and so does what it measures
     hardware: list[int] = field(default_factory=lambda: [0, 0])  # its error bits, 0 if not known
     temperature: list[float] = field(default_factory=_pair)  # [°C], 0 while not known
     voltage: list[float] = field(default_factory=_pair)  # of the supply [V], likewise
@@ -118,7 +120,8 @@ class State:
     mode: str = "disarmed"
     fault: str = ""
     fault_name: str = ""  # the row of `daemon.limits` it stands in
-    torque: bool = False
+    torque: bool = False  # on, or not confirmed to be off
+    torque_off: bool = False  # the servos confirmed at this tick that it is off
     read_error: str = ""  # what the servos' bus failed with at this tick, reading and writing
     write_error: str = ""
     reading: Reading = field(default_factory=Reading)

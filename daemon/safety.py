@@ -25,6 +25,7 @@ _AGAIN = 1.0  # s after which a warning that was over may be told again
 _EASE = 0.95  # of a bound: what was told stands until it is below
 
 BUS = "servos.bus"  # the row of what the servo backend itself refuses
+TORQUE_OFF = "torque.off"  # the row of torque off that is not confirmed, `daemon.drive`
 
 
 class Finding(NamedTuple):
@@ -161,7 +162,9 @@ class Safety:
         """
         t, reading = state.t, state.reading
         if self._joints:
-            if not t - reading.t <= self._age or reading.alert:
+            if not t - reading.t <= self._age:
+                return False
+            if reading.alert or reading.lost or reading.frozen:
                 return False
             q, dq, current = reading.q, reading.dq, reading.current
             velocity, most = self._velocity, self._current

@@ -43,8 +43,18 @@ class Servos(Protocol):
         Temperature and voltage need not be fresher than a second.
         """
 
-    def set_torque(self, on: bool) -> None:
-        """Torque on (goal first set to the present angle) or off. Raises ServoError on failure."""
+    def torque_on(self) -> None:
+        """Torque on, verified; the goal is set to the present angle first.
+
+        Raises ServoError when it could not be done or not be verified: it may be on then.
+        """
+
+    def torque_off(self, reading: Reading) -> bool:
+        """Ask once for torque off and read, as `read` does; whether the servos say that it is off.
+
+        It waits no longer than `read`, so that the loop can ask at every tick until it is True.
+        Raises ServoError when the port is gone.
+        """
 
     def write(self, goal: Goal) -> None:
         """Send the goal angle and the current bound of each joint."""

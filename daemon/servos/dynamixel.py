@@ -1,10 +1,11 @@
 """The hand's joints through dynamixel-sdk: check at connect, one read and one write a tick.
 
 Current, velocity, position and the alert bit of all servos come in one fast sync read (sync read
-where a firmware is older); four times a second that read reaches on to supply voltage and
-temperature, which costs 11 bytes a servo and no exchange. Goal current and goal position go in one
-sync write, side by side (:mod:`daemon.servos.torque`); in current and position mode there is one
-goal and no indirection. What a servo must be set to in EEPROM is checked and never changed here.
+where a firmware is older). Now and then that read reaches further, which costs no exchange: every
+10 ms to the goals the servo holds, its bus watchdog and its own clock, 28 bytes a servo more, and
+four times a second to supply voltage and temperature, 11 bytes. Goal current and goal position go
+in one sync write, side by side (:mod:`daemon.servos.torque`); in current and position mode there is
+one goal and no indirection. What a servo must be set to in EEPROM is checked and never changed.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import logging
 import math
 import struct
 import time
+from collections import deque
 
 from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 
@@ -29,23 +31,33 @@ from daemon.servos.line import ServoLine
 from daemon.servos.models import ServoModel, by_name
 from daemon.servos.modes import mode_number
 from daemon.servos.packets import PacketHandler
-from daemon.servos.port import PortGone, SerialPort
+from daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
 from daemon.servos.torque import Torque
 from daemon.servos.units import JointScale
 from daemon.settings import Settings
 
 _log = logging.getLogger(__name__)
 
-_PRESENT = struct.Struct("<hii")  # current, velocity, position
-_SPAN = reg.PRESENT_POSITION + 4 - reg.PRESENT_CURRENT
-_HEALTH = struct.Struct("<hii8xHB")  # the same, supply voltage, temperature
-_HEALTH_SPAN = reg.PRESENT_TEMPERATURE + 1 - reg.PRESENT_CURRENT
+_MOTION = struct.Struct("<hii").unpack_from  # current, velocity, position
+_SUPPLY = struct.Struct("<HB").unpack_from  # voltage, temperature
+_CLOCK = struct.Struct("<H").unpack_from
+# Registers that one exchange reads, first and last: most ticks' own; with the goals and the bus
+# watchdog; with the supply; from torque enable on.
+_PRESENT = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
+_CHECK = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
+_HEALTH = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
+_ENABLED = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 _HEALTH_EVERY = 0.25  # s
+_CHECK_EVERY = 0.01  # s
+_CHECK_SHARE = 0.05  # of the line's time that checks may take
+_KEPT = 0.035  # s for which a goal counts as sent lately
+_FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must go on
 # A reply may come after its deadline, and be taken for the next question's. So after a question
 # without an answer the next ones ask for spans of different lengths, which tell replies apart.
-_MARKS = range(1, _HEALTH_SPAN - _SPAN)  # bytes more than are needed
+_MARKS = 11  # lengths of each span: as much as is needed, and up to ten registers before it
 _DOUBTFUL = 32  # questions
 _PATIENCE = 0.02  # s that a reply may take while the servos are checked: nothing hurries there
+_LAST_TRIES = 10  # of torque off, at the end
 
 
 class DynamixelServos:
@@ -63,12 +75,12 @@ class DynamixelServos:
         self._handler = PacketHandler()
         self._joints: list[Joint] = []
         self._line: ServoLine | None = None
-        self._present: GroupRead | None = None
-        self._health: GroupRead | None = None
-        self._marked: list[GroupRead] = []
+        self._spans: dict[tuple[int, int], list[GroupRead]] = {}
+        self._errors: GroupRead | None = None
         self._turn = 0
         self._doubtful = 0  # questions to come whose replies may be mistaken for each other's
-        self._next_health = -math.inf  # time.monotonic() at which it is read in present's place
+        self._next_health = self._next_check = -math.inf  # time.monotonic()
+        self._check_every = _CHECK_EVERY
         self._torque: Torque | None = None
         self._fast = False
         self._retries = 0
@@ -89,8 +101,14 @@ class DynamixelServos:
         except KeyError as error:
             raise ServoError(f"servos.model: {error.args[0]}") from None
         fingers = [FINGERS.index(name) for name in self._profile.scene.fingers]
+        kept = max(2, round(_KEPT * self._profile.loop.rate))
         self._joints = [
-            Joint(finger, servos.ids[finger], JointScale.of(servos, finger, model))
+            Joint(
+                finger,
+                servos.ids[finger],
+                JointScale.of(servos, finger, model),
+                sent=deque(maxlen=kept),
+            )
             for finger in fingers
         ]
         port = SerialPort(servos.port, servos.baud, servos.reply_timeout)
@@ -103,14 +121,17 @@ class DynamixelServos:
             port.closePort()
             raise
         ids = [joint.id for joint in self._joints]
-        self._present = GroupRead(port, self._handler, reg.PRESENT_CURRENT, _SPAN, ids)
-        self._health = GroupRead(port, self._handler, reg.PRESENT_CURRENT, _HEALTH_SPAN, ids)
-        self._marked = [
-            GroupRead(port, self._handler, reg.PRESENT_CURRENT, _SPAN + more, ids)
-            for more in _MARKS
-        ]
+        for span in (_PRESENT, _CHECK, _HEALTH, _ENABLED):
+            first, last = span
+            self._spans[span] = [
+                GroupRead(port, self._handler, first - mark, last + 1 - first + mark, ids)
+                for mark in range(_MARKS)
+            ]
+        self._errors = GroupRead(port, self._handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
+        more = len(ids) * (_PRESENT[0] - _CHECK[0]) * BITS_PER_BYTE / servos.baud
+        self._check_every = max(_CHECK_EVERY, more / _CHECK_SHARE)
         self._doubtful = 0
-        self._next_health = -math.inf
+        self._next_health = self._next_check = -math.inf
         self._torque = torque
         self._line = line
 
@@ -160,93 +181,138 @@ class DynamixelServos:
         """Fill ``reading`` from one group read; a damaged reply is asked for once more in time.
 
         Raises:
-            ServoError: the port is gone.
+            ServoError: the port is gone, or a servo's bus watchdog has stopped it.
         """
-        present, torque = self._present, self._torque
-        if present is None or torque is None:
+        now = time.monotonic()
+        if now >= self._next_check:
+            found = self._exchange(_CHECK, reading)
+            if found is not None:
+                self._next_check = now + self._check_every
+                self._check_torque(found, reading, now)
+        elif now >= self._next_health:
+            found = self._exchange(_HEALTH, reading)
+            if found is not None:
+                self._next_health = now + _HEALTH_EVERY
+                self._take_health(found, reading)
+        else:
+            self._exchange(_PRESENT, reading)
+
+    def _exchange(self, span: tuple[int, int], reading: Reading) -> GroupRead | None:
+        """Read a span that ends with or has the joints' motion in it, and fill ``reading``."""
+        if not self._spans:
             raise ServoError("servos: not connected")
         reading.seq += 1
-        begin = time.monotonic()
-        healthy = begin >= self._next_health
-        if healthy and self._health is not None:
-            self._next_health = begin + _HEALTH_EVERY
-            present = self._health
-        elif self._doubtful:
+        mark = 0
+        if self._doubtful:
             self._doubtful -= 1
-            self._turn = (self._turn + 1) % len(self._marked)
-            present = self._marked[self._turn]
-        result = present.exchange(self._fast)
+            mark = self._turn = self._turn % (_MARKS - 1) + 1
+        group = self._spans[span][mark]
+        result = group.exchange(self._fast)
         if result == COMM_RX_CORRUPT:
             # Once more, with what is left of the first exchange's deadline.
-            port = present.port
+            port = group.port
             port.not_after = port.deadline
             if time.monotonic() < port.deadline:
                 self._retries += 1
-                result = present.exchange(self._fast)
+                result = group.exchange(self._fast)
             port.not_after = math.inf
         reading.valid = result == COMM_SUCCESS
         if not reading.valid:
             self._doubtful = _DOUBTFUL
-            return
+            return None
         reading.t = self._clock.now()
-        torque.heard(begin)
+        at = reg.PRESENT_CURRENT - group.start_address
         alert = 0
         for joint in self._joints:
-            finger, scale, data = joint.finger, joint.scale, present.data_dict[joint.id]
-            if healthy:
-                current, velocity, position, voltage, temperature = _HEALTH.unpack(data)
-                reading.voltage[finger] = voltage * reg.VOLTAGE_UNIT
-                reading.temperature[finger] = float(temperature)
-            else:
-                current, velocity, position = _PRESENT.unpack_from(data)
+            finger, scale = joint.finger, joint.scale
+            current, velocity, position = _MOTION(group.data_dict[joint.id], at)
             reading.q[finger] = joint.q = scale.angle(position)
             reading.dq[finger] = joint.dq = scale.rate(velocity)
             reading.current[finger] = scale.amperes(current)
-            if present.errors[joint.id] & 0x80:
+            if group.errors[joint.id] & 0x80:
                 alert |= 1 << finger
         if alert:
             self._alerts += 1
             if alert != reading.alert:
                 self._ask_errors(reading)
         reading.alert = alert
+        return group
+
+    def _take_health(self, group: GroupRead, reading: Reading) -> None:
+        at = reg.PRESENT_INPUT_VOLTAGE - group.start_address
+        for joint in self._joints:
+            voltage, temperature = _SUPPLY(group.data_dict[joint.id], at)
+            reading.voltage[joint.finger] = voltage * reg.VOLTAGE_UNIT
+            reading.temperature[joint.finger] = float(temperature)
+
+    def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
+        """Whether each servo's own clock goes on, and whether it holds what it was told."""
+        start, torque = group.start_address, self._torque
+        assert torque is not None
+        reading.lost = reading.frozen = 0
+        for joint in self._joints:
+            table = group.data_dict[joint.id]
+            (ticks,) = _CLOCK(table, reg.REALTIME_TICK - start)
+            if ticks != joint.ticks:
+                joint.ticks, joint.ticked = ticks, now
+            elif now - joint.ticked > _FROZEN:
+                reading.frozen |= 1 << joint.finger
+            if not torque.holds_goal(joint, table, start):
+                reading.lost |= 1 << joint.finger
 
     def _ask_errors(self, reading: Reading) -> None:
         """Learn what the servos' alert means, once."""
-        if self._line is not None:
+        errors = self._errors
+        if errors is not None and errors.exchange(self._fast) == COMM_SUCCESS:
             for joint in self._joints:
-                status = self._line.read(joint.id, reg.HARDWARE_ERROR_STATUS, 1)
-                reading.hardware[joint.finger] = status[0] if status else 0
+                reading.hardware[joint.finger] = errors.data_dict[joint.id][0]
 
     def write(self, goal: Goal) -> None:
         """Send goal angles and current bounds; nothing while torque was not switched on here.
 
         Raises:
-            ServoError: the port is gone, or a servo's bus watchdog has stopped it.
+            ServoError: the port is gone.
         """
         torque = self._torque
         if torque is None or torque.goals is None:
             return
-        torque.ask_watchdog_if_quiet(time.monotonic())
         servos, mode, q, current = self._settings, self._mode, goal.q, goal.current
-        values = [
-            joint.goal(servos, mode, q[joint.finger], current[joint.finger])
-            for joint in self._joints
-        ]
-        if torque.goals.send(values) == COMM_SUCCESS:
-            torque.heard(time.monotonic())
+        values = []
+        for joint in self._joints:
+            value = joint.goal(servos, mode, q[joint.finger], current[joint.finger])
+            joint.sent.append(value)
+            values.append(value)
+        torque.goals.send(values)
 
-    def set_torque(self, on: bool) -> None:
-        """Switch torque and make sure of it; on: from the present angle, with no current yet.
+    def torque_on(self) -> None:
+        """Switch torque on and make sure of it: from the present angle, with no current yet.
 
         Raises:
-            ServoError: it could not be done or not be verified; on → off then is tried.
+            ServoError: it could not be done or not be verified, and may be on.
         """
         if self._torque is None:
             raise ServoError("servos: not connected")
-        if on:
-            self._torque.on()
-        else:
-            self._torque.off()
+        self._torque.on()
+
+    def torque_off(self, reading: Reading) -> bool:
+        """Ask for torque off, and read; whether every servo's register says that it is off.
+
+        Raises:
+            ServoError: the port is gone.
+        """
+        torque = self._torque
+        if torque is None:
+            raise ServoError("servos: not connected")
+        torque.ask_off()
+        found = self._exchange(_ENABLED, reading)
+        if found is None:
+            return False
+        at = reg.TORQUE_ENABLE - found.start_address
+        if any(found.data_dict[joint.id][at] for joint in self._joints):
+            return False
+        torque.off()
+        reading.lost = 0
+        return True
 
     # --- the end -----------------------------------------------------------------------------
 
@@ -260,6 +326,7 @@ class DynamixelServos:
             "retries": self._retries,
             "skipped_bytes": handler.skipped_bytes,
             "late": handler.late,
+            "refused": handler.refused,
             "alerts": self._alerts,
         }
 
@@ -268,16 +335,21 @@ class DynamixelServos:
 
         A servo whose torque another program switched on is left as it was found.
         """
-        line, torque = self._line, self._torque
-        self._line = self._present = self._health = self._torque = None
+        line, torque, reading = self._line, self._torque, Reading()
         if line is None or torque is None:
             return
         try:
-            if torque.goals is not None:
-                torque.off()
+            for _ in range(_LAST_TRIES):
+                if not torque.may_be_on:
+                    break
+                self.torque_off(reading)
+            else:
+                _log.error("servos: torque off not confirmed; their bus watchdog stops them")
         except PortGone:
             _log.error("servos: the port went away with torque on; their bus watchdog stops them")
         except Exception as error:
-            _log.error("servos: torque off is not certain: %s", error)
+            _log.error("servos: torque off not confirmed: %s", error)
+        self._line = self._torque = self._errors = None
+        self._spans.clear()
         with contextlib.suppress(Exception):
             line.port.closePort()

@@ -19,6 +19,7 @@ from daemon.servos.port import SerialPort
 
 _HEADER = b"\xff\xff\xfd"
 _CRC = struct.Struct("<H")
+_ERROR = 0x7F  # of a servo's error byte; the bit above is the alert
 
 
 class GroupRead(GroupSyncRead):  # type: ignore[misc]
@@ -74,8 +75,9 @@ class GroupRead(GroupSyncRead):  # type: ignore[misc]
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:
                     return int(result)
-                if len(packet) == SMALLEST:
-                    return int(COMM_RX_CORRUPT)  # an error and no data
+                if packet[8] & _ERROR:
+                    handler.refused += 1
+                    return int(COMM_RX_CORRUPT)
                 if len(packet) != SMALLEST + length:
                     handler.late += 1
                 elif packet[4] == servo_id:
@@ -99,6 +101,9 @@ class GroupRead(GroupSyncRead):  # type: ignore[misc]
         at = 8
         for servo_id in self.data_dict:
             if packet[at + 1] != servo_id:
+                return int(COMM_RX_CORRUPT)
+            if packet[at] & _ERROR:  # its data are no reading
+                self.ph.refused += 1
                 return int(COMM_RX_CORRUPT)
             self.errors[servo_id] = packet[at]
             self.data_dict[servo_id] = packet[at + 2 : at + 2 + length]

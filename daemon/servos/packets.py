@@ -47,6 +47,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         self.crc_errors = 0  # replies that came damaged
         self.torn = 0  # replies of which only a part came
         self.late = 0  # replies to an earlier question
+        self.refused = 0  # readings answered with an error
         self.skipped_bytes = 0  # bytes that belonged to no reply
 
     def updateCRC(self, crc_accum: int, data_blk_ptr: Sequence[int], data_blk_size: int) -> int:

@@ -21,7 +21,7 @@ from dynamixel_sdk.port_handler import PortHandler
 
 from daemon.servos.base import ServoError
 
-_BITS_PER_BYTE = 10
+BITS_PER_BYTE = 10
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
@@ -155,7 +155,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
 
     def setPacketTimeout(self, packet_length: int) -> None:
         """Start the deadline of a reply of so many bytes."""
-        wire = (packet_length + self._sent) * _BITS_PER_BYTE / self.baudrate
+        wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
         # Where a slow rate alone eats the deadline: twice the wire's time and the return delays.
         allowed = max(self.reply_timeout, 2.0 * wire + 0.001)
         self.deadline = min(time.monotonic() + allowed, self.not_after)

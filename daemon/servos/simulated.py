@@ -82,7 +82,7 @@ class SimulatedServos:
             self._look_at_health(reading, current)
         self._seq += 1
         reading.seq = self._seq
-        reading.alert = 0
+        reading.alert = reading.lost = reading.frozen = 0
         reading.valid = True
 
     def _look_at_health(self, reading: Reading, current: list[float]) -> None:
@@ -95,17 +95,25 @@ class SimulatedServos:
             reading.temperature[joint] = float(round(self._temperature[joint]))
             reading.voltage[joint] = self._voltage
 
-    def set_torque(self, on: bool) -> None:
+    def torque_on(self) -> None:
         """Torque on, with the goal at the present count and no current until a goal is written."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
-        if on:
-            for joint in self._joints:
-                scale = self._scales[joint]
-                self._goal_q[joint] = scale.angle(scale.position_counts(float(self._hand.q[joint])))
-                self._goal_current[joint] = 0.0
-        self._switch(on)
+        for joint in self._joints:
+            scale = self._scales[joint]
+            self._goal_q[joint] = scale.angle(scale.position_counts(float(self._hand.q[joint])))
+            self._goal_current[joint] = 0.0
+        self._switch(True)
+
+    def torque_off(self, reading: Reading) -> bool:
+        """Torque off, which nothing can keep from arriving here, and a reading."""
+        if not self._connected:
+            raise ServoError("the simulated servos are not connected")
+        self._exchange()
+        self._switch(False)
+        self.read(reading)
+        return True
 
     def write(self, goal: Goal) -> None:
         """Give each servo its goal angle and current bound, rounded to what a register holds."""

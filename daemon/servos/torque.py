@@ -1,23 +1,22 @@
-"""Torque on and off, each step verified, and the servos' own bus watchdog behind it.
+"""Torque on, each step verified, torque off, and the servos' own bus watchdog behind both.
 
 Torque goes on from the present angle with no current; goal current and goal position are put side
-by side through indirect addresses, which live in RAM and so are set each time. Outside the tick:
-nothing hurries here.
+by side through indirect addresses, which live in RAM and so are set each time.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from daemon.servos import registers as reg
 from daemon.servos.base import ServoError
 from daemon.servos.checks import check_angle
 from daemon.servos.groups import GroupWrite
-from daemon.servos.joints import GOAL_SIZE, Joint
+from daemon.servos.joints import GOAL_SIZE, Joint, goal_in, pack_goal
 from daemon.servos.line import ServoLine
 from daemon.servos.models import ServoModel
 from daemon.settings import Hand, ServoSettings
@@ -30,11 +29,15 @@ _GOAL_BYTES = (
     reg.GOAL_POSITION + 2,
     reg.GOAL_POSITION + 3,
 )
-_ASK_EVERY = 0.5  # s
+_COPIES = 2  # of each packet of torque off: what one loses the next may bring
+_ON_WITHIN = 50  # reply timeouts in which torque must be on: the loop stands still meanwhile
 
 
 class Torque:
-    """The torque of all joints on one line. ``goals`` takes goals while it is on, else None."""
+    """The torque of all joints on one line. ``goals`` takes goals while it is on, else None.
+
+    ``may_be_on`` from before it is switched on until the servos have said that it is off.
+    """
 
     def __init__(
         self,
@@ -46,6 +49,7 @@ class Torque:
         mode: int,
     ) -> None:
         self.goals: GroupWrite | None = None
+        self.may_be_on = False
         self._line = line
         self._model = model
         self._hand = hand
@@ -56,11 +60,15 @@ class Torque:
             ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
             ticks = min(max(ticks, 1), reg.WATCHDOG_MAX)
         self._ticks = ticks
-        self._ask_every = _ASK_EVERY if ticks else math.inf
-        self._quiet_limit = 0.8 * ticks * reg.WATCHDOG_UNIT if ticks else math.inf
-        self._was_quiet = False  # the bus watchdog may have stopped the servos
-        self._next_ask = math.inf  # when they are asked, time.monotonic()
-        self._last_sent = 0.0  # time.monotonic() of the last packet the servos must have heard
+        self._not_after = math.inf  # time.monotonic() at which switching on is given up
+        ids = list(self._joints)
+        self._offs = [self._zero(reg.TORQUE_ENABLE, each) for each in (ids, *([i] for i in ids))]
+        self._watchdog_off = self._zero(reg.BUS_WATCHDOG, ids)
+
+    def _zero(self, address: int, ids: Sequence[int]) -> Callable[[], int]:
+        """What writes 0 into a register of these servos; it is not answered."""
+        group = GroupWrite(self._line.port, self._line.handler, address, 1, ids)
+        return partial(group.send, [b"\x00"] * len(ids))
 
     # --- on and off --------------------------------------------------------------------------
 
@@ -68,21 +76,30 @@ class Torque:
         """Torque on from the present angle, with no current yet.
 
         Raises:
-            ServoError: it could not be done or not be verified; off then was tried.
+            ServoError: it could not be done or not be verified, and may be on.
         """
-        self._refuse_hardware_errors()
+        self._not_after = time.monotonic() + _ON_WITHIN * self._line.port.reply_timeout
         try:
+            self._refuse_hardware_errors()
             self._switch_on()
-        except ServoError:
-            with contextlib.suppress(ServoError):
-                self._store_all(reg.TORQUE_ENABLE, b"\x00", "torque off")
-            raise
+        finally:
+            self._not_after = math.inf
+
+    def ask_off(self) -> None:
+        """Tell the servos to switch torque off: all in one packet, and each in one of its own.
+
+        Nothing is answered and so nothing waited for; whoever asks looks at the registers.
+        """
+        self.goals = None
+        for _ in range(_COPIES):
+            for send in self._offs:
+                send()
 
     def off(self) -> None:
-        """Torque off. Raises ServoError when that could not be verified."""
-        self._store_all(reg.TORQUE_ENABLE, b"\x00", "torque off")
-        self.goals = None
-        self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog off")
+        """The servos have said that torque is off: their watchdogs have nothing to stop."""
+        if self.may_be_on:
+            self._watchdog_off()
+        self.may_be_on = False
 
     def _switch_on(self) -> None:
         # Writing 0 ends a watchdog's stop, in which goals are read-only.
@@ -97,12 +114,13 @@ class Torque:
         if self._mode != reg.CURRENT_MODE:
             packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
             self._store(reg.GOAL_POSITION, packed, "goal position")
+        self.may_be_on = True
         self._store_all(reg.TORQUE_ENABLE, b"\x01", "torque on")
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
-        self._last_sent = time.monotonic()
-        self._next_ask = self._last_sent + self._ask_every
-        self._was_quiet = False
+        for servo_id, joint in self._joints.items():
+            joint.sent.clear()
+            joint.sent.append(pack_goal(self._mode, 0, positions[servo_id]))
         self.goals = goals
 
     def _choose_goals(self) -> GroupWrite:
@@ -176,44 +194,30 @@ class Torque:
         if lines:
             raise ServoError("\n".join(lines))
 
-    # --- bus watchdog ------------------------------------------------------------------------
+    # --- while it is on ----------------------------------------------------------------------
 
-    def heard(self, t: float) -> None:
-        """A packet that the servos must have heard went out at ``t`` (time.monotonic())."""
-        if t - self._last_sent > self._quiet_limit:
-            self._was_quiet = True
-        self._last_sent = t
+    def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
+        """Whether a servo holds a goal that it was sent lately, by its registers from ``start`` on.
 
-    def ask_watchdog_if_quiet(self, t: float) -> None:
-        """Where the line was quiet for long, make sure that no servo's watchdog has stopped it.
-
-        It is asked now and then all the same: what was sent in time may have been held up below,
-        and a servo may have lost its power for less time than silence is borne.
+        True while torque was not switched on here.
 
         Raises:
-            ServoError: one has, or is no longer armed.
+            ServoError: its bus watchdog has stopped it, or is no longer armed.
         """
-        quiet = self._was_quiet or t - self._last_sent > self._quiet_limit
-        if not quiet and t < self._next_ask:
-            return
-        self._next_ask = t + self._ask_every
-        unknown = False
-        for servo_id, joint in self._joints.items():
-            raw = self._line.read(servo_id, reg.BUS_WATCHDOG, 1)
-            if raw is None:
-                unknown = True
-            elif raw[0] == reg.WATCHDOG_ERROR:
-                raise ServoError(
-                    f"{joint.name}: its bus watchdog stopped it, since no packet came in time: "
-                    "clear, then arm"
-                )
-            elif raw[0] != self._ticks:
-                raise ServoError(
-                    f"{joint.name}: its bus watchdog is off, as after a reboot: check its supply, "
-                    "then clear and arm"
-                )
-        self._was_quiet = quiet and unknown
-        self._last_sent = time.monotonic()
+        if self.goals is None:
+            return True
+        watchdog = table[reg.BUS_WATCHDOG - start]
+        if watchdog == reg.WATCHDOG_ERROR:
+            raise ServoError(
+                f"{joint.name}: its bus watchdog stopped it, since no packet came in time: "
+                "clear, then arm"
+            )
+        if watchdog != self._ticks:
+            raise ServoError(
+                f"{joint.name}: its bus watchdog is off, as after a reboot: check its supply, "
+                "then clear and arm"
+            )
+        return goal_in(self._mode, table, start) in joint.sent
 
     # --- verified writes ---------------------------------------------------------------------
 
@@ -221,7 +225,9 @@ class Torque:
         self._store(address, dict.fromkeys(self._joints, data), what)
 
     def _store(self, address: int, values: Mapping[int, bytes], what: str) -> None:
-        failed = self._line.store(address, values)
+        failed: Sequence[int] = list(values)
+        if time.monotonic() < self._not_after:
+            failed = self._line.store(address, values)
         if failed:
             names = ", ".join(self._joints[servo_id].name for servo_id in failed)
             raise ServoError(f"{names}: {what} could not be set or not be verified")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import time
@@ -218,7 +219,7 @@ def test_a_scene_with_one_finger_asks_for_one_servo(running: Callable[..., Runni
     )
     backend = DynamixelServos(settings, RealClock())
     backend.connect()
-    backend.set_torque(True)
+    backend.torque_on()
     reading = go(
         backend,
         Goal(q=[9.0, 0.2], current=[0.5, 0.5]),
@@ -300,7 +301,7 @@ def test_what_is_read_is_what_the_servos_have(
 
 def test_goals_arrive_as_counts_and_bounds_are_kept(bus: RunningBus) -> None:
     backend = connected(bus)
-    backend.set_torque(True)
+    backend.torque_on()
     backend.write(Goal(q=[0.25, -0.1], current=[0.8, 99.0]))
     reading = Reading()
     backend.read(reading)  # the write has no answer; this one comes after it
@@ -324,7 +325,7 @@ def test_torque_on_starts_where_the_joint_is(bus: RunningBus) -> None:
     bus.call(place)
     backend = connected(bus)
     assert sum("bus watchdog had stopped it" in notice for notice in backend.notices) == 2
-    backend.set_torque(True)
+    backend.torque_on()
     for i, direction in ((0, 1), (1, -1)):
         memory = bus.memory(i)
         goal = struct.unpack_from("<i", memory, reg.GOAL_POSITION)[0]
@@ -336,7 +337,7 @@ def test_torque_on_starts_where_the_joint_is(bus: RunningBus) -> None:
     reading = Reading()
     backend.read(reading)
     assert reading.q == pytest.approx([0.4, -0.3], abs=RADIAN)
-    backend.set_torque(False)
+    assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
     assert all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1))
     backend.close()
@@ -350,7 +351,7 @@ def test_torque_is_refused_where_the_joint_can_not_be(bus: RunningBus) -> None:
     backend = connected(bus)
     assert [n for n in backend.notices if "servo 2 (right): the joint is at 229°" in n]
     with pytest.raises(ServoError, match=r"servo 2 \(right\): the joint is at 229°, not in -29°"):
-        backend.set_torque(True)
+        backend.torque_on()
     assert not bus.servo(0).torque_on
     assert not bus.servo(1).torque_on
     backend.close()
@@ -374,7 +375,7 @@ def test_the_joints_go_where_they_are_told(
     )
     backend = DynamixelServos(settings, RealClock())
     backend.connect()
-    backend.set_torque(True)
+    backend.torque_on()
     goal = Goal(q=[0.3, -0.2], current=[0.5, 0.5])
     reading = go(backend, goal, lambda r: r.q == pytest.approx(goal.q, abs=0.01))
     assert reading.valid
@@ -390,7 +391,7 @@ def test_an_alert_is_told_and_arming_is_refused(bus: RunningBus) -> None:
     assert reading.valid
     assert reading.alert == 2
     with pytest.raises(ServoError, match=r"servo 2 \(right\): hardware error: overload"):
-        backend.set_torque(True)
+        backend.torque_on()
     assert not bus.servo(0).torque_on
     backend.close()
 
@@ -494,14 +495,14 @@ def test_a_late_reply_is_not_taken_for_the_next_questions(
 
 def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus: RunningBus) -> None:
     backend = connected(bus, watchdog=0.04)
-    backend.set_torque(True)
+    backend.torque_on()
     goal = Goal(q=[0.9, 0.9], current=[0.05, 0.05])
     backend.write(goal)
     until(lambda: bus.memory(0)[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR)
     with pytest.raises(ServoError, match="its bus watchdog stopped it"):
-        backend.write(goal)
-    backend.set_torque(False)
-    backend.set_torque(True)
+        backend.read(Reading())
+    assert backend.torque_off(Reading())
+    backend.torque_on()
     backend.write(Goal(q=[0.1, 0.1], current=[0.2, 0.2]))
     assert backend.counters()["timeouts"] == 0
     backend.close()
@@ -510,7 +511,7 @@ def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus: RunningBus) ->
 def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(bus: RunningBus) -> None:
     # As where an adapter held packets up that the port had taken.
     backend = connected(bus, watchdog=2.0)
-    backend.set_torque(True)
+    backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
     backend.write(goal)
     servo = bus.servo(1)
@@ -522,43 +523,128 @@ def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(bus: Runnin
 
 def test_a_servo_that_lost_its_power_for_a_moment_is_found(bus: RunningBus) -> None:
     backend = connected(bus, watchdog=2.0)
-    backend.set_torque(True)
+    backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
     backend.write(goal)
     servo = bus.servo(1)
     bus.call(lambda: servo.reboot(time.monotonic()))
     with pytest.raises(ServoError, match=r"right.*: its bus watchdog is off, as after a reboot"):
         until(lambda: backend.read(reading) or backend.write(goal))
-    backend.set_torque(False)
-    backend.set_torque(True)
+    assert backend.torque_off(Reading())
+    backend.torque_on()
     backend.close()
 
 
 def test_a_port_that_goes_away(bus: RunningBus) -> None:
     backend = connected(bus)
-    backend.set_torque(True)
+    backend.torque_on()
     bus.call(bus.port.unplug)
     with pytest.raises(PortGone, match="the port is gone"):
         backend.read(Reading())
     with pytest.raises(ServoError):
-        backend.set_torque(False)
+        backend.torque_off(Reading())
     backend.close()
     backend.close()
 
 
-def test_torque_off_that_can_not_be_verified_is_an_error(bus: RunningBus) -> None:
+def test_torque_off_counts_once_every_servo_says_so(bus: RunningBus) -> None:
     backend = connected(bus, reply_timeout=0.01)
-    backend.set_torque(True)
+    backend.torque_on()
     bus.fault("silent=2")
-    with pytest.raises(ServoError, match=r"servo 2 \(right\): torque off could not be"):
-        backend.set_torque(False)
+    assert not backend.torque_off(Reading())
     assert not bus.servo(0).torque_on
+    bus.fault("answer=2")
+    assert backend.torque_off(Reading())
+    assert not bus.servo(1).torque_on
+    backend.close()
+
+
+def test_writes_that_get_lost_are_never_taken_for_done(bus: RunningBus) -> None:
+    backend = connected(bus, watchdog=0.0)
+    backend.torque_on()
+    bus.fault("lose-writes=1")
+    reading = Reading()
+    for _ in range(5):
+        assert not backend.torque_off(reading)
+        assert reading.valid
+    assert bus.servo(0).torque_on
+    bus.fault("lose-writes=0")
+    assert backend.torque_off(reading)
+    backend.close()
+
+
+@pytest.mark.parametrize("mode", ["current-based position", "current", "position"])
+def test_goals_that_do_not_arrive_are_noticed(
+    running: Callable[..., RunningBus], mode: str
+) -> None:
+    now = time.monotonic()
+    settings = Settings.model_validate({"servos": {"mode": mode}})
+    bus = running(ServoBus.from_settings(settings, FreeJoints(2, now), t=now))
+    backend = connected(bus, mode=mode, watchdog=2.0)
+    backend.torque_on()
+    reading, goal = Reading(), Goal(current=[0.2, 0.2])
+    sent = 0
+
+    def tick() -> Reading:
+        nonlocal sent
+        sent += 1
+        goal.q[:] = [0.5 * math.sin(0.05 * sent)] * 2
+        goal.current[:] = [0.01 + 0.003 * (sent % 50)] * 2
+        backend.read(reading)
+        backend.write(goal)
+        return reading
+
+    begin = time.monotonic()
+    while time.monotonic() < begin + 0.2:
+        assert not tick().lost
+    bus.fault("lose-writes=1")
+    before = sent
+    until(lambda: tick().lost == 0b11)
+    assert sent - before >= 17, "a single goal that was lost is no cause"
+    bus.fault("lose-writes=0")
+    until(lambda: tick().lost == 0)
+    backend.close()
+
+
+def test_a_servo_that_answers_with_the_same_bytes_again_and_again_is_noticed(
+    bus: RunningBus,
+) -> None:
+    backend = connected(bus)
+    reading = Reading()
+    backend.read(reading)
+    bus.fault("frozen=2")
+
+    def frozen() -> bool:
+        backend.read(reading)
+        return reading.frozen == 0b10
+
+    until(frozen)
+    bus.fault("recover=2")
+    until(lambda: not frozen())
+    backend.close()
+
+
+@pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fast sync read"])
+def test_an_answer_with_an_error_is_no_reading(
+    running: Callable[..., RunningBus], firmware: int
+) -> None:
+    plain = make_bus("XM430-W350", firmware=firmware, prepared=True, t=time.monotonic())
+    bus = running(plain)
+    backend = connected(bus)
+    reading = Reading()
+    bus.fault("refuse=2")
+    backend.read(reading)
+    assert not reading.valid
+    assert backend.counters()["refused"] > 0
+    bus.fault("recover=2")
+    backend.read(reading)
+    assert reading.valid
     backend.close()
 
 
 def test_close_turns_torque_off_on_a_bad_line(bus: RunningBus) -> None:
     backend = connected(bus, reply_timeout=0.01)
-    backend.set_torque(True)
+    backend.torque_on()
     bus.fault("drop=0.3")
     backend.close()
     assert not bus.servo(0).torque_on
@@ -572,7 +658,7 @@ def test_nothing_works_before_connect() -> None:
     with pytest.raises(ServoError, match="not connected"):
         backend.read(Reading())
     with pytest.raises(ServoError, match="not connected"):
-        backend.set_torque(True)
+        backend.torque_on()
 
 
 # --- the SDK's traps ---------------------------------------------------------------------------

@@ -129,7 +129,7 @@ def ticks(rig: Rig, goal: Goal, seconds: float) -> list[Reading]:
 
 def armed(rig: Rig) -> Reading:
     rig.servos.connect()
-    rig.servos.set_torque(True)
+    rig.servos.torque_on()
     reading = Reading()
     rig.servos.read(reading)
     return reading
@@ -204,16 +204,16 @@ def test_torque_off_and_close_let_go(make, mode):
     armed(rig)
     goal = Goal(q=[0.05, -0.05], current=[0.5, 0.5])
     ticks(rig, goal, 0.1)
-    rig.servos.set_torque(False)
+    assert rig.servos.torque_off(Reading())
     assert rig.torque() == [False, False]
     assert ticks(rig, goal, 0.1)[-1].current == pytest.approx([0.0, 0.0], abs=CURRENT_UNIT)
-    rig.servos.set_torque(True)
+    rig.servos.torque_on()
     assert rig.torque() == [True, True]
     rig.servos.close()
     assert rig.torque() == [False, False]
     rig.servos.close()
     with pytest.raises(ServoError, match="not connected"):
-        rig.servos.set_torque(True)
+        rig.servos.torque_on()
 
 
 @pytest.mark.parametrize("mode", MODES)

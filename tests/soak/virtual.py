@@ -28,6 +28,7 @@ from daemon.modes import COMMANDS, Mode
 from daemon.records import Frame, Goal, Reading
 from daemon.servos.base import ServoError
 from daemon.settings import Settings
+from daemon.simulation import layout
 
 TICKS = 10_000_000
 _GRIPPING = ("grasping", "holding", "rotating")
@@ -35,7 +36,11 @@ _EVERY = 1500  # ticks between two faults, in the mean
 _COMMAND_EVERY = 150  # ticks between two random commands, in the mean
 _WARM = 0.1  # share of the ticks after which memory counts
 _LOOKS = 50  # at the memory, altogether
-SERVO_FAULTS = ("silent", "gone", "alert", "hot", "low", "fast", "stuck", "strayed")
+# deaf: all that is written gets lost, and readings come.
+SERVO_FAULTS = ("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed")
+_UNHEARD = ("silent", "gone", "deaf")  # no servo hears that torque shall be off
+_WATCHDOG = 100  # ticks, 0.2 s, within which the servos' watchdogs then stop them
+_LOST = 20  # goals in a row that get lost and are noticed
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
 
 
@@ -54,6 +59,7 @@ class FaultyServos:
         self.last_good = -math.inf
         self.torque = False
         self.written = 0
+        self._unheard = 0
 
     def connect(self) -> None:
         if self.fault == "gone":
@@ -84,6 +90,8 @@ class FaultyServos:
             reading.current[finger] = 3.0
         elif fault == "strayed":
             reading.q[finger] = -2.0
+        elif fault == "deaf" and self._unheard > _LOST:
+            reading.lost = 1 << finger
 
     def write(self, goal: Goal) -> None:
         hand, safety = self._settings.hand, self._settings.safety
@@ -101,15 +109,27 @@ class FaultyServos:
             self._current[i] = current
         if self.fault == "gone":
             raise ServoError("the port is gone")
-        if self.fault != "silent":
+        self._unheard += 1
+        if self.fault not in ("silent", "deaf"):
+            self._unheard = 0
             self._servos.write(goal)
 
-    def set_torque(self, on: bool) -> None:
+    def torque_on(self) -> None:
         if self.fault in ("gone", "silent"):
             raise ServoError("torque could not be set")
-        self._servos.set_torque(on)
-        self.torque = on
+        self._servos.torque_on()
+        self.torque = True
         self._current = [0.0, 0.0]
+
+    def torque_off(self, reading: Reading) -> bool:
+        if self.fault == "gone":
+            raise ServoError("the port is gone")
+        if self.fault in ("silent", "deaf"):
+            self.read(reading)
+            return False
+        self._servos.torque_off(reading)
+        self.torque = False
+        return True
 
     def counters(self) -> dict[str, int]:
         return self._servos.counters()
@@ -342,6 +362,13 @@ class Soak:
 
     # What must hold
 
+    def _driven(self) -> bool:
+        """Whether a motor has torque, by the plant's own account."""
+        hand = self.daemon.hand
+        assert hand is not None
+        hand.advance(self.daemon.clock.now())
+        return bool(hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2].any())
+
     def _judge(self, count: int) -> None:
         state, servos, account = self.daemon.loop.state, self.servos, self.account
         mode = str(state.mode)
@@ -361,15 +388,11 @@ class Soak:
     def _judge_torque(self, state: Any, mode: str, count: int) -> None:
         servos = self.servos
         safe = mode in ("disarmed", "fault")
-        # A bus that does not answer can't be told; once it does, it is within the half second
-        # after which torque off is tried again.
-        if not safe or not servos.torque:
+        if not safe or not self._driven():
             self._off_by = math.inf
-        elif servos.fault in ("gone", "silent"):
-            self._off_by = count + 260
         elif self._off_by == math.inf:
-            self._off_by = count + 1
-        assert count <= self._off_by, f"torque is on while {mode}"
+            self._off_by = count + (_WATCHDOG if servos.fault in _UNHEARD else 1)
+        assert count <= self._off_by, f"a motor is driven while {mode}"
         if safe:
             return
         settings, now = self.settings, state.t

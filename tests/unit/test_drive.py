@@ -11,6 +11,7 @@ import zmq
 
 from daemon.assembly import Daemon
 from daemon.commands import CommandServer, Refused
+from daemon.records import Reading
 from daemon.servos.base import ServoError
 from daemon.settings import Settings
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
@@ -46,52 +47,99 @@ def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
         command(daemon, "clear")
 
 
-def test_torque_that_can_not_be_turned_off_is_told_once_and_tried_again(make: Make) -> None:
+def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(
+    make: Make,
+) -> None:
+    """Writes get lost and readings come, which keep the servos' watchdogs from acting."""
     daemon = make()
     events: list[tuple[str, str, str]] = []
     daemon.loop._on_event = lambda *event: events.append(event)
     command(daemon, "arm")
     daemon.loop.advance(0.1)
-    servos = daemon.loop.servos
-    assert servos is not None
-    really, tries = servos.set_torque, []
-
-    def failing(on: bool) -> None:
-        tries.append(on)
-        if len(tries) < 4:
-            raise ServoError("no answer")
-        really(on)
-
-    servos.set_torque = failing  # type: ignore[method-assign]
-    command(daemon, "stop")
-    daemon.loop.advance(1.2)
-    assert daemon.loop.state.torque, "torque was not turned off, and the state says it was"
+    lost = Deaf(daemon)
+    assert command(daemon, "stop")["torque_off"] == "unconfirmed"
+    assert daemon.loop.state.torque
+    daemon.loop.advance(0.17)
+    assert not torque_of(daemon).any(), "1.5 times the watchdog's time, and 20 ms of its own"
+    assert daemon.loop.state.fault_name == "torque.off"
+    assert daemon.loop.state.torque, "it is not confirmed yet"
+    assert "clear: the servos have not confirmed torque off yet" in refusal(daemon, "clear")
     daemon.loop.advance(1.0)
+    lost.mend()
+    daemon.loop.advance(0.2)
     assert not daemon.loop.state.torque
-    assert tries == [False] * 4
-    assert [text for _, kind, text in events if kind == "servos"] == [
-        "torque could not be turned off: no answer"
-    ]
+    told = [text for _, kind, text in events if kind == "torque.off"]
+    assert len(told) == 2, "once when it goes wrong and once when it is well, however long it lasts"
+    assert "the bus is kept silent" in told[0]
+    assert "torque off confirmed" in told[1]
+    command(daemon, "clear")
+    assert command(daemon, "stop")["torque_off"] == "confirmed"
+
+
+def test_without_a_watchdog_nothing_is_gained_by_silence(make: Make) -> None:
+    daemon = make(servos={"watchdog": 0.0})
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    lost = Deaf(daemon)
+    command(daemon, "stop")
+    daemon.loop.advance(0.3)
+    assert "cut their power" in daemon.loop.state.fault
+    assert lost.tries > 140, "at every tick"
+    lost.mend()
+    daemon.loop.advance(2 * daemon.loop.period)
+    assert not torque_of(daemon).any()
+
+
+def test_the_end_tries_to_turn_torque_off_more_than_once(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    lost = Deaf(daemon, tries=5)
+    daemon.loop.run(0.0)
+    assert lost.tries == 6
+    assert not torque_of(daemon).any()
+    assert not daemon.loop.state.torque
+
+
+class Deaf:
+    """Servos that answer, and hear nothing of what is written: so many tries, or until mended."""
+
+    def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
+        assert daemon.loop.servos is not None
+        self._servos = daemon.loop.servos
+        self._really = self._servos.torque_off
+        self._most = tries
+        self.tries = 0
+        self._servos.torque_off = self._try  # type: ignore[method-assign]
+        self._servos.write = lambda goal: None  # type: ignore[method-assign]
+
+    def _try(self, reading: Reading) -> bool:
+        self.tries += 1
+        if self.tries > self._most:
+            return self._really(reading)
+        self._servos.read(reading)
+        return False
+
+    def mend(self) -> None:
+        self._most = 0
 
 
 def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
     daemon = make()
     servos = daemon.loop.servos
     assert servos is not None
-    really, tries = servos.set_torque, []
+    really = servos.torque_on
 
-    def failing(on: bool) -> None:
-        tries.append(on)
-        if on:
-            raise ServoError("overload")
-        really(on)
+    def failing() -> None:
+        really()
+        raise ServoError("overload")
 
-    servos.set_torque = failing  # type: ignore[method-assign]
+    servos.torque_on = failing  # type: ignore[method-assign]
     command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    daemon.loop.advance(daemon.loop.period)
     assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("fault", "overload")
     assert not daemon.loop.state.torque
-    assert tries == [True, False]
+    assert not torque_of(daemon).any()
 
 
 def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make: Make) -> None:
@@ -112,8 +160,8 @@ def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> 
     daemon = make()
     assert daemon.loop.servos is not None
     for name in ("stop", "disarm"):
-        daemon.loop.servos.set_torque(True)  # as another program may have done
-        command(daemon, name)
+        daemon.loop.servos.torque_on()  # as another program may have done
+        assert command(daemon, name)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert daemon.hand is not None
         assert not torque_of(daemon).any()
@@ -140,28 +188,14 @@ def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_han
     server.close()
 
 
-def test_arm_waits_until_a_failing_torque_off_has_worked(make: Make) -> None:
+def test_arm_waits_until_torque_off_is_confirmed(make: Make) -> None:
     daemon = make()
     command(daemon, "arm")
     daemon.loop.advance(0.1)
-    servos = daemon.loop.servos
-    assert servos is not None
-    really = servos.set_torque
-    answers = iter([ServoError("no answer"), None])
-
-    def failing_once(on: bool) -> None:
-        answer = next(answers)
-        if answer is not None:
-            raise answer
-        really(on)
-
-    servos.set_torque = failing_once  # type: ignore[method-assign]
+    Deaf(daemon, tries=3)
     command(daemon, "stop")
-    daemon.loop.advance(0.1)
-    with pytest.raises(Refused, match="arm: torque could not be turned off yet"):
-        command(daemon, "arm")
-    daemon.loop.advance(0.6)
-    servos.set_torque = really  # type: ignore[method-assign]
+    assert "arm: the servos have not confirmed torque off yet" in refusal(daemon, "arm")
+    daemon.loop.advance(3 * daemon.loop.period)
     command(daemon, "arm")
 
 

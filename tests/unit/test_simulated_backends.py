@@ -52,7 +52,7 @@ class Bench:
 
     def grasp(self, current: float = 0.5, seconds: float = 1.0) -> None:
         self.servos.connect()
-        self.servos.set_torque(True)
+        self.servos.torque_on()
         self.goal.q = [0.6] * 2
         self.goal.current = [current] * 2
         self.run(seconds)
@@ -82,7 +82,7 @@ def test_readings_are_whole_counts_of_the_configured_model():
 def test_goals_are_whole_counts_too():
     bench = Bench()
     bench.servos.connect()
-    bench.servos.set_torque(True)
+    bench.servos.torque_on()
     bench.goal.q = [0.1003] * 2
     bench.goal.current = [0.3] * 2
     bench.run(1.0)
@@ -102,7 +102,7 @@ def test_connect_and_torque_on_move_nothing():
     bench.clock.sleep_until(0.5)
     bench.servos.read(bench.reading)
     np.testing.assert_array_equal(bench.hand.q, before)
-    bench.servos.set_torque(True)
+    bench.servos.torque_on()
     bench.clock.sleep_until(0.59)
     bench.servos.read(bench.reading)
     np.testing.assert_array_equal(bench.hand.q, before)
@@ -132,7 +132,7 @@ def test_watchdog_takes_torque_off_in_silence_only():
     with pytest.raises(ServoError, match="bus watchdog stopped the simulated servos"):
         bench.run(0.3)
     assert np.abs(bench.hand.current).max() == pytest.approx(0, abs=1e-6)
-    bench.servos.set_torque(True)
+    bench.servos.torque_on()
     bench.run(1.0)
     assert bench.hand.force.min() > 5
 
@@ -157,7 +157,7 @@ def test_close_takes_torque_off_and_reads_fail_after_it():
     assert not bench.reading.valid
     assert bench.reading.q == q
     with pytest.raises(ServoError, match="not connected"):
-        bench.servos.set_torque(True)
+        bench.servos.torque_on()
 
 
 def test_a_missing_finger_stays_zero():
@@ -312,7 +312,7 @@ def test_registries_make_them_and_two_runs_are_bit_identical():
         sensor = make_sensor(settings, clock, hand, 0)
         servos.connect()
         sensor.open()
-        servos.set_torque(True)
+        servos.torque_on()
         goal, reading = Goal(), Reading()
         goal.q, goal.current = [0.6, 0.6], [0.4, 0.4]
         data = b""

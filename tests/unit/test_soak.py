@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from daemon.records import Goal
+from daemon.records import Goal, Reading
 from tests.soak.virtual import Soak
 
 
@@ -43,16 +43,16 @@ def test_a_goal_beyond_its_limits_ends_it(
 ) -> None:
     servos = soak.servos
     servos.fault = ""
-    servos.set_torque(True)
+    servos.torque_on()
     servos.last_good = soak.daemon.clock.now()
     with pytest.raises(AssertionError, match=told):
         servos.write(Goal(valid=True, q=list(q), current=list(current)))
-    servos.set_torque(False)
+    assert servos.torque_off(Reading())
 
 
 def test_an_old_reading_or_frame_ends_it(soak: Soak) -> None:
     servos, state = soak.servos, soak.daemon.loop.state
-    servos.set_torque(True)
+    servos.torque_on()
     servos.last_good = soak.daemon.clock.now() - 0.1
     with pytest.raises(AssertionError, match="reading"):
         servos.write(Goal(valid=True))
@@ -61,6 +61,6 @@ def test_an_old_reading_or_frame_ends_it(soak: Soak) -> None:
     with pytest.raises(AssertionError, match="frame"):
         soak._judge_torque(state, "holding", 1)
     soak._judge_torque(state, "disarmed", 1)  # as late as the next tick
-    with pytest.raises(AssertionError, match="torque is on"):
+    with pytest.raises(AssertionError, match="a motor is driven"):
         soak._judge_torque(state, "disarmed", 3)
-    servos.set_torque(False)
+    assert servos.torque_off(Reading())

@@ -33,8 +33,13 @@ class CannedServos:
         reading.q[:] = self._q
         reading.current[:] = self._current
 
-    def set_torque(self, on: bool) -> None:
+    def torque_on(self) -> None:
         """Nothing to do."""
+
+    def torque_off(self, reading: Reading) -> bool:
+        """Off it is."""
+        self.read(reading)
+        return True
 
     def write(self, goal: Goal) -> None:
         """Nothing to do."""

@@ -79,7 +79,7 @@ class OurCycle:
         self.clock = RealClock(self.settings.realtime.spin)
         self.servos = DynamixelServos(self.settings, self.clock)
         self.servos.connect()
-        self.servos.set_torque(True)
+        self.servos.torque_on()
         assert self.servos._line is not None
         self.servos._line.port.reply_timeout = self.deadline
         self.reading = Reading()
