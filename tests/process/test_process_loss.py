@@ -52,7 +52,15 @@ class Rig:
 
     def status(self) -> dict[str, Any]:
         """Just after the machine held the daemon up it refuses even this: then once more."""
-        return until(lambda: reply if (reply := self.send("status"))["ok"] else None)
+        found: dict[str, Any] = {}
+
+        def answered() -> bool:
+            found.clear()
+            found.update(self.send("status"))
+            return bool(found["ok"])
+
+        until(answered)
+        return found
 
     def report(self) -> dict[str, Any]:
         report: dict[str, Any] = json.loads(send_words(self.folder, "report"))
