@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.joint_motion import JointMotion
 from daemon.modes import Mode
 from daemon.perception import FingerPerception
 from daemon.prediction import Held
@@ -26,6 +27,10 @@ PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
 _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
 _ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
 _SLOW = 0.05  # rad/s below which a joint stands
+_OFF = 0.05  # rad off its goal from which on a joint must be pulled there …
+_PULL = 2.0  # … with so much current [A/rad]: less than any model's own loop gives
+_FELT = 0.04  # A that must be expected for that to be judged
+_PULLED = 0.25  # of what is expected
 
 
 class View:
@@ -46,6 +51,9 @@ class View:
         self.frames = frames  # what each finger's newest frame alone says
         self.sensors = sensors
         self.frame_period = 1.0 / settings.tactile.rate
+        self.motion = JointMotion(self.fingers, self.limits.velocity_max)
+        servos = settings.servos  # in current mode the pull is the daemon's own
+        self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
         self.no_number = False  # a goal was none since the last judgement
         self.grip_width = math.nan  # of the object when it was gripped [m]
         self.seen: list[Frame | None] = [None, None]
@@ -110,12 +118,12 @@ def _named(view: View, bits: int) -> str:
 
 def servo_frozen(view: View, state: State, _: float) -> str:
     frozen = _named(view, state.reading.frozen)
-    return f"servos: {frozen} answers with old readings: its own clock stands still" * bool(frozen)
+    return f"servos: old readings from {frozen}: its own clock stands still" * bool(frozen)
 
 
 def goal_lost(view: View, state: State, _: float) -> str:
     lost = _named(view, state.reading.lost)
-    return f"servos: {lost} holds none of the goals sent lately: check its cable" * bool(lost)
+    return f"servos: none of the goals sent lately reached {lost}: check the cable" * bool(lost)
 
 
 def joint_angle(view: View, state: State, _: float) -> str:
@@ -131,6 +139,39 @@ def joint_velocity(view: View, state: State, _: float) -> str:
         dq = state.reading.dq[index]
         if not abs(dq) <= view.limits.velocity_max:
             return f"{FINGERS[index]} joint at {dq:.2f} rad/s, too fast"
+    return ""
+
+
+def joint_jump(view: View, state: State, _: float) -> str:
+    jumped = _named(view, view.motion.jumped)
+    if not jumped:
+        return ""
+    return (
+        f"{jumped} joint's angle went where its velocity did not: its encoder, or what turns it, "
+        "has slipped"
+    )
+
+
+def joint_dead(view: View, state: State, _: float) -> str:
+    """Off its goal it stands, and no current pulls it there. A joint that is held back takes some.
+
+    In position mode nothing is known of the current that it should take.
+    """
+    goal, reading = state.goal, state.reading
+    if not (state.torque and goal.valid) or view.settings.servos.mode == "position":
+        return ""
+    for index in view.fingers:
+        error = goal.q[index] - reading.q[index]
+        if abs(error) < _OFF or abs(reading.dq[index]) > _SLOW:
+            continue
+        expected = min(goal.current[index], view.pull * abs(error))
+        toward = math.copysign(1.0, error) * reading.current[index]
+        if expected > _FELT and toward < _PULLED * expected:
+            return (
+                f"{FINGERS[index]} joint stands {math.degrees(abs(error)):.1f}° off its goal and "
+                f"takes {toward:.2f} A of {goal.current[index]:.2f} A to get there: encoder, "
+                "current sensor or motor"
+            )
     return ""
 
 

@@ -62,6 +62,10 @@ ROWS: tuple[Row, ...] = (
         ("hand.q_min", "hand.q_max"), by.joint_angle, _S, True),
     Row("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",),
         by.joint_velocity, _S, True),
+    Row("joint.jump", "joint angle against its velocity, 0.1 rad within 0.1 s, and against the "
+        "greatest velocity", "fault", ("safety.velocity_max",), by.joint_jump, _S, True),
+    Row("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s",
+        "fault", (), by.joint_dead, _S, lasts=0.05),
     Row("joint.current", "measured current", "fault", ("safety.current_fault",),
         by.joint_current, _S, True, lasts=0.1),
     Row("joint.stall", "current at its bound, off the goal, and standing", "fault",

@@ -127,6 +127,8 @@ class Safety:
 
         Warnings that are new are added to ``warnings``.
         """
+        if self._joints:
+            self._view.motion.follow(state.t, state.reading)
         if self._busy or not self._quiet(state):
             self._busy = False
             for watch in self._each_tick:
@@ -164,7 +166,7 @@ class Safety:
         if self._joints:
             if not t - reading.t <= self._age:
                 return False
-            if reading.alert or reading.lost or reading.frozen:
+            if reading.alert or reading.lost or reading.frozen or self._view.motion.jumped:
                 return False
             q, dq, current = reading.q, reading.dq, reading.current
             velocity, most = self._velocity, self._current

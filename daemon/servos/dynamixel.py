@@ -184,16 +184,16 @@ class DynamixelServos:
             ServoError: the port is gone, or a servo's bus watchdog has stopped it.
         """
         now = time.monotonic()
-        if now >= self._next_check:
+        if now >= self._next_health:
+            self._next_health = now + _HEALTH_EVERY
+            found = self._exchange(_HEALTH, reading)
+            if found is not None:
+                self._take_health(found, reading)
+        elif now >= self._next_check:
             found = self._exchange(_CHECK, reading)
             if found is not None:
                 self._next_check = now + self._check_every
                 self._check_torque(found, reading, now)
-        elif now >= self._next_health:
-            found = self._exchange(_HEALTH, reading)
-            if found is not None:
-                self._next_health = now + _HEALTH_EVERY
-                self._take_health(found, reading)
         else:
             self._exchange(_PRESENT, reading)
 

@@ -54,7 +54,7 @@ class Faults:
             fault = BoardFault.parse(rest)
             return [Event(fault.start, side, fault)]
         kind = word.partition("@")[0].partition("=")[0]
-        if kind in BoardFault.KINDS and not word.startswith("silent="):
+        if kind in BoardFault.KINDS and not word.startswith(tuple(f"{k}=" for k in SERVO_FAULTS)):
             fault = BoardFault.parse(word)
             return [Event(fault.start, name, fault) for name in FINGERS]
         text, after = _timed(word)

@@ -500,7 +500,8 @@ def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus: RunningBus) ->
     backend.write(goal)
     until(lambda: bus.memory(0)[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR)
     with pytest.raises(ServoError, match="its bus watchdog stopped it"):
-        backend.read(Reading())
+        for _ in range(2):  # the first one may look at the supply
+            backend.read(Reading())
     assert backend.torque_off(Reading())
     backend.torque_on()
     backend.write(Goal(q=[0.1, 0.1], current=[0.2, 0.2]))

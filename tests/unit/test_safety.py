@@ -234,6 +234,23 @@ def stalled(state: State) -> None:
     state.reading.current = [0.0, 0.39]
 
 
+def dead(state: State) -> None:
+    state.goal = goal((0.3, 0.0), (0.4, 0.4))
+
+
+def pulled_away(state: State) -> None:
+    state.goal = goal((0.3, 0.0), (0.4, 0.4))
+    state.reading.current = [-0.4, 0.0]
+
+
+def old_readings(state: State) -> None:
+    state.reading.frozen = 0b01
+
+
+def deaf(state: State) -> None:
+    state.reading.lost = 0b11
+
+
 def hot(state: State) -> None:
     state.reading.temperature[0] = 71.0
 
@@ -278,6 +295,10 @@ FAULTS: list[tuple[Callable[[State], None], str, str]] = [
     (too_fast, "joint.velocity", "right joint at -7.00 rad/s, too fast"),
     (too_much_current, "joint.current", "right joint takes -1.90 A, above 1.8 A"),
     (stalled, "joint.stall", "right joint has stalled, 17.2° off its goal at 0.39 A"),
+    (dead, "joint.dead", "left joint stands 17.2° off its goal and takes 0.00 A of 0.40 A"),
+    (pulled_away, "joint.dead", "takes -0.40 A of 0.40 A"),
+    (old_readings, "servos.frozen", "servos: old readings from left"),
+    (deaf, "goal.lost", "none of the goals sent lately reached left and right"),
     (hot, "servos.temperature", "left servo at 71 °C"),
     (brown_out, "servos.voltage", "right servo's supply at 9.2 V, outside 9.5 to 16.0 V"),
     (silent_frames, "tactile.silent", "tactile: no frame for 0.1"),
@@ -353,6 +374,7 @@ def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -
     frames = frames_of(0.1 + 0.3, 0.1 - 0.25)
     judge, state = safety(frames=frames), sound()
     state.reading.q = [0.3, 0.25]
+    state.goal.q = [0.3, 0.25]
     assert judged(judge, state, 0.5) == ("", "")
     frames[1].theta += 0.11
     assert judged(judge, state, 0.5) == ("", "")

@@ -1,0 +1,54 @@
+"""Whether a joint's angle goes where its velocity says, and no faster than a joint can.
+
+An encoder whose zero jumps, that stands still while the joint turns, or walks while it rests, says
+angles that the velocity beside them contradicts. One pass of a few operations a tick.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from daemon.records import Reading
+
+_AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way in one reading
+_APART = 0.1  # rad that it may be off the way that the velocity says …
+_MEMORY = 0.1  # … over the last so many s: a velocity lags and readings are late by milliseconds
+_GAP = 0.1  # s without a good reading after which it is begun anew
+
+
+class JointMotion:
+    """Follows the joints' readings; ``jumped`` has a bit for each finger where that is so now."""
+
+    def __init__(self, fingers: Sequence[int], velocity_max: float) -> None:
+        self.jumped = 0
+        self._fingers = tuple(fingers)
+        self._velocity_max = velocity_max
+        self._asked = -math.inf  # when the last good reading was asked for [s]
+        self._t = -math.inf  # and had come
+        self._q = [0.0, 0.0]
+        self._apart = [0.0, 0.0]  # rad
+
+    def follow(self, asked: float, reading: Reading) -> None:
+        """Take a reading in that was asked for at the time ``asked``."""
+        self.jumped = 0
+        t = reading.t
+        if not reading.valid or t == self._t:
+            return
+        dt = t - self._t
+        q, dq, before, apart = reading.q, reading.dq, self._q, self._apart
+        if dt < _GAP:
+            # A reading was taken somewhere between question and answer.
+            most = self._velocity_max * (t - self._asked) + _AT_ONCE
+            keep = 1.0 - dt / _MEMORY
+            for i in self._fingers:
+                step = q[i] - before[i]
+                off = apart[i] = keep * apart[i] + step - dq[i] * dt
+                before[i] = q[i]
+                if not (-most <= step <= most and -_APART <= off <= _APART):
+                    self.jumped |= 1 << i
+                    apart[i] = 0.0
+        else:
+            before[:] = q
+            apart[:] = 0.0, 0.0
+        self._t, self._asked = t, asked

@@ -1,0 +1,166 @@
+"""Angle, velocity and current of a joint, judged together: what is found, and what never is."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.joint_motion import JointMotion
+from daemon.records import Reading
+from daemon.settings import Settings
+from tests.loop_harness import Make, advance_to, command, grasped
+
+TICK = 0.002
+COUNT = 2.0 * math.pi / 4096
+RATE = 0.229 * 2.0 * math.pi / 60.0  # rad/s, a count of the velocity register
+
+
+class Joint:
+    """A joint that turns, as its servo tells it: to whole counts, and late by some milliseconds."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self.reading = Reading(valid=True, t=0.0)
+        self.motion = JointMotion((0, 1), 6.0)
+        self.t = self.q = self.dq = 0.0
+        self.random = random.Random(seed)
+
+    def tick(self, dq: float, lag: float = 0.02) -> int:
+        """Turn at ``dq`` rad/s for a tick; the told velocity follows within ``lag`` s."""
+        self.t += TICK
+        self.q += dq * TICK
+        self.dq += (dq - self.dq) * min(TICK / lag, 1.0)
+        reading = self.reading
+        held = 0.015 if self.random.random() < 0.01 else 0.0  # the process was put aside
+        reading.t = max(reading.t, self.t + self.random.uniform(0.0003, 0.004) + held)
+        reading.q[0] = COUNT * round(self.q / COUNT)
+        reading.dq[0] = RATE * round(self.dq / RATE)
+        self.motion.follow(self.t, reading)
+        return self.motion.jumped
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_joints_do_is_no_jump(seed: int) -> None:
+    joint = Joint(seed)
+    turn = 0.0
+    for k in range(20_000):
+        if k % 100 == 0:
+            turn = joint.random.choice((0.0, 0.0, 0.05, 0.3, -1.0, 1.0, 2.0, -2.0))
+        assert not joint.tick(turn), f"at {joint.t:.3f} s"
+
+
+@pytest.mark.parametrize("jump", [0.2, -0.2, 0.12])
+def test_an_angle_that_jumps_is_found_at_once(jump: float) -> None:
+    joint = Joint()
+    for _ in range(100):
+        joint.tick(0.3)
+    joint.q += jump
+    assert joint.tick(0.3) == 1
+    assert not joint.tick(0.3), "it is a matter of that reading alone"
+
+
+def test_an_encoder_that_walks_while_the_velocity_rests_is_found() -> None:
+    joint = Joint()
+    seconds = next(k * TICK for k in range(200) if joint.tick(2.0, lag=math.inf))
+    assert seconds < 0.1
+
+
+def test_a_velocity_without_a_motion_is_found() -> None:
+    joint = Joint()
+    joint.dq = 2.5
+    seconds = next(k * TICK for k in range(200) if joint.tick(0.0, lag=math.inf))
+    assert seconds < 0.1
+
+
+def test_after_a_gap_it_is_begun_anew() -> None:
+    joint = Joint()
+    for _ in range(10):
+        joint.tick(0.0)
+    joint.t += 0.2
+    joint.q += 1.0
+    assert not joint.tick(0.0)
+
+
+# --- in the loop --------------------------------------------------------------------------------
+
+
+def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
+    """From now on readings are spoilt after they were taken."""
+    servos = daemon.loop.servos
+    assert servos is not None
+    really = servos.read
+
+    def read(reading: Reading) -> None:
+        really(reading)
+        how(reading)
+
+    servos.read = read  # type: ignore[method-assign]
+
+
+def jumped(reading: Reading) -> None:
+    reading.q[1] += 0.2
+
+
+class Stuck:
+    """An encoder and a current's sensor that stand still."""
+
+    def __init__(self) -> None:
+        self.q: float | None = None
+
+    def __call__(self, reading: Reading) -> None:
+        if self.q is None:
+            self.q = reading.q[1]
+        reading.q[1], reading.dq[1], reading.current[1] = self.q, 0.0, 0.0
+
+
+@pytest.mark.parametrize(
+    ("how", "name", "within"),
+    [(jumped, "joint.jump", 0.01), (Stuck(), "joint.dead", 0.12)],
+    ids=["jumped", "stuck"],
+)
+def test_a_grip_ends_when_a_joint_can_not_be_believed(
+    make: Make, how: Callable[[Reading], None], name: str, within: float
+) -> None:
+    daemon = grasped(make(), 8.0)
+    spoil(daemon, how)
+    advance_to(daemon, "fault", within)
+    assert daemon.loop.state.fault_name == name
+
+
+@pytest.mark.parametrize("mode", ["current-based position", "current"])
+def test_grips_turns_rests_and_pushes_are_believed(make: Make, mode: str) -> None:
+    """Holding still for long, at a joint's stop, on an object, and pushed off the goal."""
+    daemon = make(servos={"mode": mode})
+    hand: Any = daemon.hand
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.5, right=-0.5)
+    daemon.loop.advance(3.0)
+    hand.push(0.0, 0.0)
+    command(daemon, "grasp", force=6.0)
+    advance_to(daemon, "holding", 6.0)
+    for angle in (0.1, -0.1, 0.0):
+        command(daemon, "rotate", angle=angle)
+        daemon.loop.advance(1.5)
+    hand.push(1.0, 0.5, 0.02)
+    daemon.loop.advance(1.0)
+    hand.push(0.0, 0.0)
+    daemon.loop.advance(5.0)
+    command(daemon, "release")
+    daemon.loop.advance(2.0)
+    assert daemon.loop.state.fault_name == ""
+
+
+def test_position_mode_knows_nothing_of_the_current_it_should_take() -> None:
+    settings = Settings.model_validate(
+        {"loop": {"clock": "virtual"}, "servos": {"mode": "position", "model": "XL430-W250"}}
+    )
+    with Daemon(settings, wire=False) as daemon:
+        daemon.loop.advance(0.1)
+        command(daemon, "arm")
+        command(daemon, "move", left=0.3, right=0.3)
+        daemon.loop.advance(2.0)
+        assert daemon.loop.state.fault_name == ""
