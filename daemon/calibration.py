@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from daemon.own_files import write_text
 from daemon.settings import Finite, Positive, Settings
 from daemon.tactile.base import TactileError
 from kinematics.material import Material
@@ -199,7 +200,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     text = json.dumps(calibration.model_dump(mode="json"), ensure_ascii=False) + "\n"
     temporary = path.with_name(path.name + ".new")
     try:
-        with temporary.open("w", encoding="utf-8") as file:
+        with write_text(temporary) as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())

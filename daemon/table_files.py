@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+from daemon.own_files import write_bytes
 from kinematics.contact import Fingertip
 from kinematics.material import Material
 from kinematics.table import ContactTable, TableError, table_key
@@ -28,7 +29,8 @@ def save_table(file: Path, table: ContactTable, tip: Fingertip, material: Materi
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f"{file.name}.{os.getpid()}.part")
     try:
-        part.write_bytes(table.to_bytes(tip, material))
+        with write_bytes(part) as written:
+            written.write(table.to_bytes(tip, material))
         part.replace(file)
     except OSError:
         with contextlib.suppress(OSError):

@@ -9,8 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daemon.own_files import require_own, runtime_folder
 from daemon.profiles import load
-from daemon.settings import Settings
+from daemon.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
     from daemon.keys import ClientKeys
@@ -20,7 +21,10 @@ def add_profile(parser: argparse.ArgumentParser) -> None:
     """``--config``, ``--set`` and ``--dir``: which hand. `profile` reads what they say."""
     add_settings(parser)
     parser.add_argument(
-        "--dir", type=Path, metavar="DIR", help="what {dir} in the ports stands for"
+        "--dir",
+        type=Path,
+        metavar="DIR",
+        help="what {dir} in the ports stands for; without it the folder of `softfinger emulate`",
     )
 
 
@@ -38,7 +42,22 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 def profile(arguments: argparse.Namespace) -> Settings:
     """The settings that `add_profile`'s arguments name. Raises SettingsError with the report."""
-    return load(arguments.config, arguments.dir, arguments.set)
+    return load(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
+
+
+def own_runtime_folder() -> Path:
+    """Where a stand-in hand links its ports without ``--dir``.
+
+    Raises SettingsError when another user has made that folder.
+    """
+    folder = runtime_folder()
+    try:
+        require_own(folder)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise SettingsError(f"{folder}: {error.strerror}, or choose another by --dir") from None
+    return folder
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:

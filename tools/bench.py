@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+from daemon.own_files import write_text
+
 MEASUREMENTS = {
     "contact": "the contact model, run time against error",
     "estimator": "pressure grid to d and tilt, run time against error",
@@ -94,7 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
             "python": platform.python_version(),
             "rows": report,
         }
-        arguments.json.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        with write_text(arguments.json) as file:
+            file.write(json.dumps(content, indent=2) + "\n")
     return 1 if failed else 0
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from daemon.settings import ServoSettings, Settings, SettingsError
-from tools.arguments import add_settings, profile
+from tools.arguments import add_settings, own_runtime_folder, profile
 
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
@@ -28,7 +28,7 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
   all well again   well for the servos' line and boards, left:well for one board
   @SECONDS         when it starts; at once without
 
-softfinger emulate --dir DIR --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
+softfinger emulate --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
 
 the object, where it slipped away: --send place puts it back, at rest.
 
@@ -59,9 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dir",
         type=Path,
-        required=True,
         metavar="DIR",
-        help="where servos, tactile-left and tactile-right are linked; made if absent",
+        help="where servos, tactile-left and tactile-right are linked, a folder of your own, made "
+        "if absent; without it one in your runtime folder",
     )
     add_settings(parser)
     parser.add_argument("--model", metavar="NAME", help="the servos' model")
@@ -126,9 +126,10 @@ def _ids(text: str) -> tuple[int, ...]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
-    if arguments.send is not None:
-        return _send(arguments.dir, arguments.send)
     try:
+        arguments.dir = arguments.dir or own_runtime_folder()
+        if arguments.send is not None:
+            return _send(arguments.dir, arguments.send)
         settings = _settings(arguments)
     except SettingsError as error:
         print(error, file=sys.stderr)

@@ -19,6 +19,8 @@ from collections import deque
 from pathlib import Path
 from typing import TextIO
 
+from daemon.own_files import write_text
+
 _KEPT = 1000  # lines that wait for a slow reader; older ones are dropped
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
@@ -34,7 +36,7 @@ class EventLog:
         self._json = form == "json"
         self._file: TextIO | None = None
         if file is not None:
-            self._file = file.open("a", encoding="utf-8")
+            self._file = write_text(file, append=True)
         self._lines: deque[tuple[float, str, str, str]] = deque(maxlen=_KEPT)
         self._news = threading.Event()
         self._closing = False

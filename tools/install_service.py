@@ -11,6 +11,8 @@ import re
 import sys
 from pathlib import Path
 
+from daemon.own_files import write_text
+
 UNIT = "softfinger.service"
 RULES = "70-softfinger.rules"
 # s without a tick after which systemd ends the daemon: `clear` and `arm` may wait for two boards.
@@ -118,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(text, end="")
             return 0
         path = arguments.to / name
-        with path.open("w" if arguments.force else "x", encoding="utf-8") as file:
+        with write_text(path) if arguments.force else path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
         print(f"install-service: {path} is there already; --force writes over it", file=sys.stderr)

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from daemon.own_files import write_text
 from daemon.settings import SettingsError, Stream
 from tools.arguments import moment, seconds, teller
 from tools.recordings.errors import RecordingError
@@ -152,6 +153,7 @@ def _write(path: Path, result: Any) -> None:
     from dataclasses import asdict
 
     try:
-        path.write_text(json.dumps(asdict(result), indent=1) + "\n", encoding="utf-8")
+        with write_text(path) as file:
+            file.write(json.dumps(asdict(result), indent=1) + "\n")
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None

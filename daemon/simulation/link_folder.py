@@ -7,6 +7,8 @@ import fcntl
 import os
 from pathlib import Path
 
+from daemon.own_files import require_own
+
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"
 
@@ -18,6 +20,7 @@ class FolderError(Exception):
 class LinkFolder:
     """The folder with the links to the ptys, held by one emulator at a time.
 
+    It must be this user's, and nobody else's to write in.
     Links that a killed emulator left behind are replaced; anything else in their place is not.
     """
 
@@ -26,7 +29,8 @@ class LinkFolder:
         self.path = path
         self._links: dict[Path, str] = {}
         try:
-            path.mkdir(parents=True, exist_ok=True)
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            require_own(path)
             self._lock = self._take(path / _LOCK)
         except OSError as error:
             raise FolderError(f"{path}: can't be used as --dir: {error.strerror}") from None
@@ -38,7 +42,7 @@ class LinkFolder:
 
     def _take(self, path: Path) -> int:
         while True:
-            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.own_files import write_bytes
 from daemon.tactile import tekscan
 
 FloatArray = NDArray[np.float64]
@@ -64,13 +65,14 @@ def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recordin
 
 def save_recording(path: Path, recording: Recording) -> None:
     """Write a recording as ``.npz``."""
-    np.savez_compressed(
-        path,
-        frames=recording.counts,
-        t=recording.t,
-        live=recording.live,
-        **recording.truths,  # type: ignore[arg-type]
-    )
+    with write_bytes(path) as file:
+        np.savez_compressed(
+            file,
+            frames=recording.counts,
+            t=recording.t,
+            live=recording.live,
+            **recording.truths,  # type: ignore[arg-type]
+        )
 
 
 def _folder(path: Path, scale: float, rate: float) -> Recording:

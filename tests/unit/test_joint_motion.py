@@ -13,7 +13,7 @@ from daemon.assembly import Daemon
 from daemon.joint_motion import JointMotion
 from daemon.records import Reading
 from daemon.settings import Settings
-from tests.loop_harness import Make, advance_to, command, grasped
+from tests.harness.loop import Make, advance_to, command, grasped
 
 TICK = 0.002
 COUNT = 2.0 * math.pi / 4096

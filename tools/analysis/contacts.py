@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.own_files import write_text
 from daemon.perception import FingerPerception
 from daemon.records import FINGERS, Contact, Frame
 from daemon.tactile.given import GivenFrames
@@ -97,7 +98,7 @@ def write_csv(path: Path, contacts: list[Contacts]) -> None:
     names = [f"{name}_{unit}" if unit else name for name, unit, _ in COLUMNS]
     truths = sorted({name for each in contacts for name in each.truths})
     units = {"d": "m", "theta": "rad", "force": "N"}
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with write_text(path, newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         known = [f"{name}_true_{units[name]}" for name in truths]
         writer.writerow(["t_s", "finger", "valid", "contact", *names, *known])

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from daemon.own_files import write_text
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -48,7 +50,7 @@ class Sheet:
     def write(self, folder: Path) -> Path:
         """Write ``folder``/name.csv, one header line with units; returns its path."""
         path = folder / f"{self.name}.csv"
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with write_text(path, newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow([column.header for column in self.columns])
             for row in zip(*(column.values for column in self.columns), strict=True):

@@ -7,12 +7,15 @@ kinds take the colours of Okabe and Ito, each with a marker of its own.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from daemon.own_files import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +82,10 @@ def new_figure(width: float, height: float) -> Figure:
 
 def save(figure: Figure, path: Path) -> None:
     """Write the picture as its suffix says."""
-    figure.savefig(path, dpi=DPI)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=DPI, format=path.suffix.removeprefix(".") or None)
+    with write_bytes(path) as file:
+        file.write(picture.getbuffer())
 
 
 def ordered(count: int) -> list[dict[str, Any]]:

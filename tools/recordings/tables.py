@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from daemon import contract, messages
+from daemon.own_files import write_bytes, write_text
 from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
 
@@ -52,7 +53,7 @@ class CsvTable:
 
     def __init__(self, path: Path, topic: bytes, first: Row) -> None:
         self._names = [name for name, value in _columns(topic, first) if value != "bin"]
-        self._file = path.open("w", newline="", encoding="utf-8")
+        self._file = write_text(path, newline="")
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow(self._names)
 
@@ -88,7 +89,8 @@ class ParquetTable:
         fields = [(name, kinds[kind]) for name, kind in _columns(topic, first) if kind in kinds]
         self._arrow = pyarrow
         self._schema = pyarrow.schema(fields)
-        self._writer = pyarrow.parquet.ParquetWriter(path, self._schema)
+        self._file = write_bytes(path)
+        self._writer = pyarrow.parquet.ParquetWriter(self._file, self._schema)
 
     def write(self, rows: list[Row]) -> None:
         """Append rows."""
@@ -97,6 +99,7 @@ class ParquetTable:
     def close(self) -> None:
         """Finish the file."""
         self._writer.close()
+        self._file.close()
 
 
 def _columns(topic: bytes, first: Row) -> list[tuple[str, str]]:
@@ -164,5 +167,6 @@ def _sorted(grids: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 def _grids(folder: Path, finger: str, times: list[float], frames: list[Any]) -> Path:
     path = folder / f"tactile-{finger}.npz"
     t = np.array(times)
-    np.savez_compressed(path, frames=np.stack(frames), t=t - t[0])
+    with write_bytes(path) as file:
+        np.savez_compressed(file, frames=np.stack(frames), t=t - t[0])
     return path

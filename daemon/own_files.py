@@ -1,0 +1,90 @@
+"""Files and folders that only this user has a hand in, wherever they lie.
+
+In a folder such as /tmp anybody may have put a link or a file where one of ours is to be: what is
+written would go into whatever that leads to.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import tempfile
+from pathlib import Path
+from typing import BinaryIO, Literal, TextIO
+
+_SHARED = stat.S_IWOTH
+
+
+def runtime_folder() -> Path:
+    """Where a stand-in hand links its ports unless it is told: in the user's own runtime folder.
+
+    Without one (XDG_RUNTIME_DIR, /run/user), a folder named after the user where temporary files
+    are; whether that is this user's has to be looked at: `require_own`.
+    """
+    named = os.environ.get("XDG_RUNTIME_DIR", "")
+    for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):
+        if folder.is_absolute() and os.access(folder, os.W_OK | os.X_OK):
+            return folder / "softfinger"
+    return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
+
+
+def require_own(folder: Path) -> None:
+    """Raises PermissionError unless this folder, no link, is this user's and nobody else's to fill.
+
+    Raises FileNotFoundError and NotADirectoryError, too.
+    """
+    found = folder.lstat()
+    if stat.S_ISLNK(found.st_mode):
+        raise PermissionError(errno.EPERM, "is a link; name the folder itself")
+    if not stat.S_ISDIR(found.st_mode):
+        raise NotADirectoryError(errno.ENOTDIR, "is no folder")
+    if found.st_uid != os.geteuid():
+        raise PermissionError(errno.EPERM, "belongs to another user")
+    group = stat.S_IWGRP if found.st_gid != os.getegid() else 0
+    if found.st_mode & (_SHARED | group):
+        raise PermissionError(errno.EPERM, "others may write in it; `chmod go-w` it")
+
+
+def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
+    """Open a file of text, UTF-8, that a person named, to be written anew or on at its end.
+
+    Raises OSError as `open` does, and PermissionError for what another user has put there: a link,
+    or in a folder that all may write in any file.
+    """
+    mode: Literal["a", "w"] = "a" if append else "w"
+    return open(path, mode, encoding="utf-8", newline=newline, opener=_open)
+
+
+def write_bytes(path: Path) -> BinaryIO:
+    """The same for bytes."""
+    return open(path, "wb", opener=_open)
+
+
+def _open(path: str, flags: int) -> int:
+    try:
+        there = os.lstat(path)
+        _refuse_strange(path, there)
+        # Our own link may be followed; none may appear from here on.
+        follow = stat.S_ISLNK(there.st_mode)
+    except FileNotFoundError:
+        follow = False
+    flags = flags & ~os.O_TRUNC | (0 if follow else os.O_NOFOLLOW)
+    descriptor = os.open(path, flags, 0o666)
+    try:
+        found = os.fstat(descriptor)
+        _refuse_strange(path, found)
+        if stat.S_ISREG(found.st_mode) and not flags & os.O_APPEND:
+            os.ftruncate(descriptor, 0)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _refuse_strange(path: str, found: os.stat_result) -> None:
+    strange = found.st_uid not in (os.geteuid(), 0)
+    link = stat.S_ISLNK(found.st_mode)
+    if strange and (link or Path(path).parent.stat().st_mode & _SHARED):
+        what = "a link" if link else "a file in a folder that all may write in"
+        raise PermissionError(errno.EPERM, f"{what}, of another user", path)

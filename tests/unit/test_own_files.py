@@ -1,0 +1,148 @@
+"""What others have put where this user's files are to be is neither followed nor written over."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon import own_files
+from daemon.own_files import require_own, runtime_folder, write_bytes, write_text
+from daemon.simulation.link_folder import FolderError, LinkFolder
+from daemon.table_files import save_table
+from kinematics.contact import Fingertip
+from kinematics.material import Material
+from kinematics.table import ContactTable
+from tools.event_log import EventLog
+
+STRANGER = 54321
+
+
+@pytest.fixture
+def strangers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Gives a file away; who can't does as if this process were somebody else's."""
+
+    def give(path: Path) -> None:
+        if os.geteuid() == 0:
+            os.chown(path, STRANGER, STRANGER, follow_symlinks=False)
+        else:
+            monkeypatch.setattr(own_files.os, "geteuid", lambda: STRANGER)
+
+    return give
+
+
+@pytest.fixture
+def shared(tmp_path: Path) -> Path:
+    """A folder as /tmp is one."""
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    folder.chmod(0o1777)
+    return folder
+
+
+@pytest.mark.parametrize("write", [write_text, write_bytes])
+def test_anothers_link_is_not_followed(
+    shared: Path, strangers: Callable[[Path], None], write: Callable[[Path], object]
+) -> None:
+    victim = shared.parent / "victim"
+    victim.write_text("precious")
+    link = shared / "run.csv"
+    link.symlink_to(victim)
+    strangers(link)
+    with pytest.raises(PermissionError, match="a link, of another user"):
+        write(link)
+    assert victim.read_text() == "precious"
+
+
+def test_anothers_file_where_all_may_write_is_left_alone(
+    shared: Path, strangers: Callable[[Path], None]
+) -> None:
+    file = shared / "run.csv"
+    file.write_text("theirs")
+    strangers(file)
+    with pytest.raises(PermissionError, match="of another user"):
+        write_text(file)
+    assert file.read_text() == "theirs"
+
+
+def test_own_files_and_links_are_written_as_ever(shared: Path) -> None:
+    file, link = shared / "run.csv", shared / "newest"
+    link.symlink_to(file)
+    with write_text(link) as made:
+        made.write("a long first text")
+    with write_text(file) as again:
+        again.write("short")
+    with write_text(file, append=True) as more:
+        more.write(" and more")
+    assert file.read_text() == "short and more"
+    with write_bytes(Path(os.devnull)) as nothing:
+        nothing.write(b"x")
+
+
+def test_the_event_log_and_the_table_use_it(
+    shared: Path, strangers: Callable[[Path], None]
+) -> None:
+    victim = shared.parent / "victim"
+    victim.write_text("precious")
+    tip, material = Fingertip(radius=0.02), Material.constant(0.3e6)
+    table = ContactTable.build(tip, material)
+    for link in (shared / "log", shared / f"table.{os.getpid()}.part"):
+        link.symlink_to(victim)
+        strangers(link)
+    with pytest.raises(PermissionError):
+        EventLog(file=shared / "log")
+    with pytest.raises(PermissionError):
+        save_table(shared / "table", table, tip, material)
+    assert victim.read_text() == "precious"
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o1777])
+def test_a_folder_in_which_others_may_write_is_not_the_stand_in_hands(
+    tmp_path: Path, mode: int
+) -> None:
+    folder = tmp_path / "hand"
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(FolderError, match="others may write in it"):
+        LinkFolder(folder)
+
+
+def test_anothers_folder_or_link_is_not_the_stand_in_hands(
+    tmp_path: Path, strangers: Callable[[Path], None]
+) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    with pytest.raises(FolderError, match="is a link"):
+        LinkFolder(link)
+    folder = tmp_path / "hand"
+    folder.mkdir(mode=0o700)
+    strangers(folder)
+    with pytest.raises(FolderError, match="belongs to another user"):
+        LinkFolder(folder)
+
+
+def test_a_link_in_the_locks_place_is_not_followed(tmp_path: Path) -> None:
+    victim, folder = tmp_path / "victim", tmp_path / "hand"
+    victim.write_text("precious")
+    folder.mkdir(mode=0o700)
+    (folder / ".emulator.lock").symlink_to(victim)
+    with pytest.raises(FolderError):
+        LinkFolder(folder)
+    assert victim.read_text() == "precious"
+
+
+def test_the_runtime_folder_is_the_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert runtime_folder() == tmp_path / "softfinger"
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "relative")
+    monkeypatch.setattr(own_files.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(own_files.os, "access", lambda *_: False)
+    folder = runtime_folder()
+    assert folder == tmp_path / f"softfinger-{os.geteuid()}"
+    LinkFolder(folder).close()
+    require_own(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
