@@ -7,6 +7,7 @@ connected and warmed up before (`daemon.assembly`).
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -100,6 +101,7 @@ class Loop:
         if publisher is not None:
             self._broadcast = Broadcast(settings, publisher, perceptions, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
+        self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
         self._ending = False
         self._stopping = False
         self._began = -math.inf  # the present tick, in the machine's time
@@ -124,6 +126,10 @@ class Loop:
     def stop(self) -> None:
         """Turn torque off at the next tick, as the command does."""
         self._stopping = True
+
+    def report(self, level: str, kind: str, text: str) -> None:
+        """Emit an event at the next tick; any thread may call it."""
+        self._reports.append((level, kind, text))
 
     def tell_truth(self, truth: Truth | None) -> None:
         """Publish what a simulated hand knows, too, to those who ask."""
@@ -281,6 +287,8 @@ class Loop:
         for event in self._control.events:
             self.emit(*event)
         self._control.events.clear()
+        while self._reports:
+            self.emit(*self._reports.popleft())
 
     def _judge(self) -> None:
         state, control, safety = self.state, self._control, self._safety

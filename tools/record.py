@@ -123,8 +123,9 @@ class _Recorder:
         self._files = [arguments.file]
         self._first: float | None = None  # the stream's first timestamp
         self._opened = time.monotonic()
-        self._messages = 0
+        self._messages = 0  # that came and were to be written
         self._bytes = 0  # in the files before this one
+        self._written = 0  # messages in them
         self._unreadable = 0
         self._told_waiting = False
         self._complete = False  # all until --to has come
@@ -260,8 +261,11 @@ class _Recorder:
         following = self._new_writer(path)  # before the old one ends: should it fail, that stands
         self._bytes += writer.size
         self._writer = following
-        writer.close()
         self._files.append(path)
+        try:
+            writer.close()
+        finally:
+            self._written += writer.messages
         self._opened = time.monotonic()
 
     # What is said of it
@@ -292,7 +296,8 @@ class _Recorder:
         return sum(gaps.lost for gaps in self._gaps.values())
 
     def _account(self, failure: str) -> int:
-        if not self._messages:  # nothing came: no file, which would be in the next one's way
+        written = self._written + self._writer.messages
+        if not written:  # no file, which would be in the next one's way
             for path in self._files:
                 path.unlink(missing_ok=True)
         for path in self._files:
@@ -301,7 +306,9 @@ class _Recorder:
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
         )
-        print(f"{self._messages} messages written; lost on the way: {lost or 'none'}")
+        missing = self._messages - written
+        unwritten = f" of {self._messages} that came" if missing else ""
+        print(f"{written} messages written{unwritten}; lost on the way: {lost or 'none'}")
         if self._unreadable:
             print(f"{self._unreadable} messages could not be read and were left out")
         if failure:

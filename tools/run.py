@@ -113,13 +113,16 @@ def _serve(
     if arguments.record is not None:
         for line in recording.close().splitlines():
             log.plain(line)
+        if recording.failed:
+            log.plain(f"softfinger: {arguments.record} does not hold all of this run", "error")
     _tell_times(daemon.loop, log)
     state = daemon.loop.state
     if state.fault:
         log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
         log.plain("softfinger: torque could not be turned off and may still be on", "error")
-    return 1 if state.fault or state.torque else 0
+    unrecorded = arguments.record is not None and recording.failed
+    return 1 if state.fault or state.torque or unrecorded else 0
 
 
 @contextmanager
@@ -154,7 +157,10 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
         daemon.publisher.refresh()
         return bool(daemon.publisher.wants_input)
 
-    return RecorderBeside(path, settings.stream.address, subscribed, settings.access.keys)
+    def ended(why: str) -> None:
+        daemon.loop.report("error", "record", why)
+
+    return RecorderBeside(path, settings.stream.address, subscribed, ended, settings.access.keys)
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:

@@ -264,11 +264,13 @@ def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(
         text=True,
         preexec_fn=small_disk,
     )
-    status, _, error = ended(process)
+    status, out, error = ended(process)
     assert status == 1
     assert "File too large" in error
     assert "--recover" in error
-    assert Recording(path).total > 10
+    total = Recording(path).total
+    assert total > 10
+    assert f"{total} messages written of " in out, "what is in the file counts"
 
 
 def test_ctrl_c_ends_it_with_its_account(fake: FakeDaemon, tmp_path: Path) -> None:

@@ -47,7 +47,8 @@ def _text(value: str) -> bytes:
 class Container:
     """Writes one file that is open at its beginning; any method may raise OSError.
 
-    ``chunk`` bytes of messages are compressed together. ``size`` is the file's so far [bytes].
+    ``chunk`` bytes of messages are compressed together. ``size`` is the file's so far [bytes], of
+    records that the system has taken whole.
     """
 
     def __init__(self, file: BinaryIO, profile: str, library: str, chunk: int) -> None:
@@ -136,6 +137,11 @@ class Container:
         self._parts.clear()
         self._filled = 0
 
+    @property
+    def messages(self) -> int:
+        """How many are in the file."""
+        return sum(self._counts.values())
+
     def attachment(self, when: int, name: str, media_type: str, data: bytes) -> None:
         """Put a file beside the messages."""
         told = struct.pack("<QQ", when, when)
@@ -172,6 +178,7 @@ class Container:
 
     def _write(self, data: bytes) -> None:
         self._file.write(data)
+        self._file.flush()  # a chunk at a time: what counts as written is
         self.size += len(data)
 
     def _append(self, record: bytes) -> None:

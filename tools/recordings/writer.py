@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -58,7 +60,6 @@ class RecordingWriter:
         self._ended = False
         self._newest = math.nan  # time of the newest message [s]
         self._early: list[tuple[bytes, dict[str, Any]]] = []  # told again before any other came
-        self.messages = 0
         self.unfit = 0  # messages that JSON can't hold
         try:
             self._container = Container(self._file, PROFILE, LIBRARY, CHUNK)
@@ -107,7 +108,6 @@ class RecordingWriter:
             self._container.message(channel.number, int(when * 1e9), sequence & 0xFFFFFFFF, data)
         except OSError as error:
             raise self._failed(error) from None
-        self.messages += 1
 
     def _open(self, name: str, topic: bytes) -> _Channel:
         schema = self._schemas.get(topic)
@@ -126,6 +126,11 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     @property
+    def messages(self) -> int:
+        """How many are in the file; a chunk's messages count once it is full."""
+        return self._container.messages
+
+    @property
     def size(self) -> int:
         """Bytes in the file so far; a chunk's messages count once it is full."""
         return self._container.size
@@ -135,7 +140,6 @@ class RecordingWriter:
         assert not self._ended
         try:
             self._container.end_chunk()
-            self._file.flush()
         except OSError as error:
             raise self._failed(error) from None
 
@@ -154,10 +158,11 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        try:
+        with contextlib.suppress(OSError):  # the buffer's rest doesn't fit either, and is dropped
             self._file.close()
-        except OSError:
-            pass  # the buffer's rest doesn't fit either; the descriptor is closed all the same
+        # A record that got in half way is none.
+        with contextlib.suppress(OSError, AttributeError):
+            os.truncate(self.path, self._container.size)
         return RecordingError(
             f"{self.path}: {error.strerror}; what was written until then can be read, "
             f"`softfinger record --recover {self.path}` closes it"
