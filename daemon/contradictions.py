@@ -74,14 +74,6 @@ def _servos(settings: Settings) -> Iterator[str]:
     servos = settings.servos
     if servos.ids[0] == servos.ids[1] and len(settings.scene.fingers) == 2:
         yield f"servos.ids: found {shown(servos.ids)}, expected two different ids"
-    if servos.backend == "none":
-        return
-    from daemon.servos.models import by_name
-
-    try:
-        by_name(servos.model)
-    except KeyError as error:
-        yield f"servos.model: {error.args[0]}"
 
 
 def _timing(settings: Settings) -> Iterator[str]:

@@ -18,6 +18,7 @@ from pydantic_core import ErrorDetails
 from daemon.contradictions import contradictions, shown
 from daemon.settings import Settings, SettingsError
 
+_DEEPEST = 8  # tables and arrays in each other
 _EXPECTED = (
     ("Input should ", ""),
     ("Tuple should have ", ""),
@@ -62,6 +63,7 @@ def load(
 def _read(path: Path, name: str) -> dict[str, Any]:
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return {key: _tuples(item) for key, item in raw.items()}
     except OSError as error:
         raise SettingsError(f"{name}: can't be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
@@ -70,7 +72,6 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits another
         raise SettingsError(f"{name}: not TOML: {error}") from None
-    return {key: _tuples(item) for key, item in raw.items()}
 
 
 def _change(data: dict[str, Any], change: str) -> str:
@@ -80,20 +81,23 @@ def _change(data: dict[str, Any], change: str) -> str:
     if not (equals and dot and section and inner):
         raise SettingsError(f"--set: found {change!r}, expected section.key=value")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
         value = text.strip()  # a text needs no quotes of its own: the shell has taken them
     held = data.setdefault(section, {})
     if isinstance(held, dict):
-        held[inner] = _tuples(value)
+        held[inner] = value
     return f"{section}.{inner}"
 
 
-def _tuples(value: Any) -> Any:
+def _tuples(value: Any, depth: int = 0) -> Any:
+    """Lists as tuples, tables as they are. Raises RecursionError beyond any profile's depth."""
+    if depth > _DEEPEST:
+        raise RecursionError
     if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
+        return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
-        return tuple(_tuples(item) for item in value)
+        return tuple(_tuples(item, depth + 1) for item in value)
     return value
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
 # Every number has an end on both sides: what no hand has is a slip of the pen, and must not reach
 # an integral. Bounds are closed or open as the quantity is.
@@ -35,6 +36,18 @@ ServoMode = Literal["current-based position", "current", "position"]
 
 
 SIMULATED = ("simulated", "replay", "none")  # backends behind which there is no metal
+def _known(name: str) -> str:
+    from daemon.servos.models import MODELS, by_name
+
+    try:
+        by_name(name)
+    except KeyError:
+        known = ", ".join(MODELS)
+        raise PydanticCustomError("servo_model", "one of {known}", {"known": known}) from None
+    return name
+
+
+Model = Annotated[str, AfterValidator(_known)]  # of a servo
 
 
 class SettingsError(Exception):
@@ -95,7 +108,7 @@ class ServoSettings(Section):
     backend: Literal["simulated", "dynamixel", "none"] = "simulated"
     port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
     baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000
-    model: str = "XM430-W350"
+    model: Model = "XM430-W350"
     ids: tuple[Annotated[int, Field(ge=0, le=252)], Annotated[int, Field(ge=0, le=252)]] = (1, 2)
     direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
     zero: tuple[Counts, Counts] = (2048, 2048)  # counts at q = 0
@@ -105,8 +118,8 @@ class ServoSettings(Section):
     stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
     damping: NonNegative = 0.4  # A·s/rad, likewise
     reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
-    fault_after: Seconds = 0.05  # s without a good exchange → fault
-    watchdog: Delay = 0.1  # s, the servo's own bus watchdog; 0 leaves it off
+    fault_after: Annotated[float, Field(gt=0, le=0.5)] = 0.05  # s without a good reading → fault
+    watchdog: Annotated[float, Field(ge=0, le=2.54)] = 0.1  # s, the servo's own; 0 leaves it off
 
 
 class TactileSettings(Section):

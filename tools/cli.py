@@ -6,9 +6,8 @@ A subcommand's module is imported only when it is called, and has two functions:
 
 from __future__ import annotations
 
-import argparse
-import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -46,6 +45,11 @@ def _open_standard_streams() -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``softfinger``; returns the exit status."""
+    # While modules are imported Ctrl-C ends the process as it ends any other: no traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    import argparse
+    import importlib
+
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
@@ -64,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     assert module is not None  # argparse has refused everything else
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         status: int = module.run(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:

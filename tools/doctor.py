@@ -9,7 +9,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 
-from daemon.checkup.addresses import check_addresses
+from daemon.checkup.addresses import check_addresses, daemon_mode
 from daemon.checkup.hand import check_board, check_servos
 from daemon.checkup.kernels import check_kernels
 from daemon.checkup.machine import check_machine
@@ -63,10 +63,11 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
     """All checks in the order of what needs what, with what was mended before them."""
     ports = _ports(settings)
     yield note_ports()
+    running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
     free = {}
     for key, path in ports:
-        found = check_port(path, key)
-        free[path] = not found.failed
+        found = check_port(path, key, running)
+        free[path] = found.status == "pass"
         yield found
         if free[path]:
             yield from _latency(settings, path, fix)

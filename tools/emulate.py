@@ -248,5 +248,6 @@ def _settings(arguments: argparse.Namespace) -> Settings:
             {**settings.servos.model_dump(), "model": arguments.model}
         )
     except ValidationError as error:
-        raise SettingsError(f"--model: {error.errors()[0]['msg']}") from None
+        told = error.errors()[0]["msg"]
+        raise SettingsError(f"--model: found {arguments.model!r}, expected {told}") from None
     return settings.model_copy(update={"servos": servos})

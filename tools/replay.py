@@ -59,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Publish, or recompute; 1 with one line when the recording is no good."""
+    from daemon.tactile.base import TactileError
     from tools.recordings.reader import Recording
 
     try:
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
             if arguments.recompute
             else _publish(arguments, recording)
         )
-    except (RecordingError, SettingsError) as error:
+    except (RecordingError, SettingsError, TactileError) as error:
         print(f"replay: {error}", file=sys.stderr)
         return 1
 

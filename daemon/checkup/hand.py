@@ -35,10 +35,7 @@ def check_servos(
     ``patience`` [s] is given to each reply, ``wait`` [s] to each rate that is searched.
     """
     servos = settings.servos
-    try:
-        model = by_name(servos.model)
-    except KeyError as error:
-        return [Result("FAIL", "servos.model", str(error.args[0]), "set servos.model")]
+    model = by_name(servos.model)
     # The adapter's low-latency mode would be a change, so it is not asked for.
     port = SerialPort(servos.port, servos.baud, patience, low_latency=False)
     try:

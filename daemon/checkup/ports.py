@@ -31,10 +31,11 @@ def note_ports() -> Result:
     return Result("note", "serial ports", ", ".join(found) or "none on this machine")
 
 
-def check_port(path: str, key: str) -> Result:
+def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
     """Whether a port is there, may be opened, and nobody else has it; it is not kept open.
 
-    ``key`` is the setting that names it.
+    ``key`` is the setting that names it, ``mode_of_daemon`` that of the daemon which answers
+    commands here, if one does: it may have the port and shall keep it.
     """
     try:
         mode = Path(path).stat()
@@ -52,19 +53,19 @@ def check_port(path: str, key: str) -> Result:
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         if error.errno == errno.EBUSY:
-            return _busy(path)
+            return _busy(path, mode_of_daemon)
         return Result("FAIL", path, f"can't be opened: {error.strerror}", "plug it in anew")
     try:
         if not os.isatty(descriptor):
             return Result("FAIL", path, "is no serial port", f"set {key}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        return _busy(path)
+        return _busy(path, mode_of_daemon)
     finally:
         os.close(descriptor)
     others = users(path)
     if others:
-        return _busy(path)
+        return _busy(path, mode_of_daemon)
     return Result("pass", path, "there, may be opened, nobody else has it")
 
 
@@ -79,11 +80,24 @@ def _permission(path: str, mode: os.stat_result) -> str:
     return f"sudo usermod -aG {group.gr_name} $USER, then log in again"
 
 
-def _busy(path: str) -> Result:
+def _busy(path: str, mode_of_daemon: str) -> Result:
     others = users(path)
+    daemons = [pid for pid, _ in others if _is_daemon(pid)]
+    if mode_of_daemon and daemons:
+        text = f"the softfinger daemon that runs here has it ({mode_of_daemon}, process "
+        return Result("warn", path, f"{text}{daemons[0]})", "end that one to have its port checked")
     names = ", ".join(f"process {pid} ({name})" for pid, name in others) or "another process"
     mend = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end that one"
     return Result("FAIL", path, f"in use by {names}", mend)
+
+
+def _is_daemon(process: int) -> bool:
+    """Whether it was started as ``softfinger run``."""
+    try:
+        words = (_PROC / str(process) / "cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return False
+    return b"run" in words and any(w.endswith((b"softfinger", b"tools.cli")) for w in words)
 
 
 def users(path: str) -> list[tuple[int, str]]:

@@ -117,7 +117,7 @@ def check_servo(
             f"{name}: current limit is {limit:.3f} A, below safety.current_max {current_max:g} A: "
             f"lower safety.current_max or raise the limit"
         )
-    notices += _notices(name, model, table, firmware)
+    notices += _notices(name, model, table, firmware, watchdog)
     return Findings(tuple(errors), tuple(notices))
 
 
@@ -140,8 +140,12 @@ def _check_range(
     ]
 
 
-def _notices(name: str, model: ServoModel, table: bytes, firmware: int) -> list[str]:
+def _notices(
+    name: str, model: ServoModel, table: bytes, firmware: int, watchdog: float
+) -> list[str]:
     notices = []
+    if not watchdog:
+        notices.append(f"{name}: servos.watchdog = 0: nothing stops it if daemon or line fail")
     if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
         notices.append(f"{name}: its drive mode is reversed; servos.direction comes on top of that")
     if table[reg.TORQUE_ENABLE]:

@@ -96,10 +96,7 @@ class DynamixelServos:
         """
         self.close()
         servos = self._settings
-        try:
-            model = by_name(servos.model)
-        except KeyError as error:
-            raise ServoError(f"servos.model: {error.args[0]}") from None
+        model = by_name(servos.model)
         fingers = [FINGERS.index(name) for name in self._profile.scene.fingers]
         kept = max(2, round(_KEPT * self._profile.loop.rate))
         self._joints = [

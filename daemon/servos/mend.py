@@ -38,10 +38,7 @@ def mend(settings: Settings) -> list[str]:
             that would not take a value, one line each; what could be done was done.
     """
     servos = settings.servos
-    try:
-        model = by_name(servos.model)
-    except KeyError as error:
-        raise ServoError(f"servos.model: {error.args[0]}") from None
+    model = by_name(servos.model)
     done: list[str] = []
     problems: list[str] = []
     if not _all_at_home(settings):

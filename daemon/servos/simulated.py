@@ -51,10 +51,7 @@ class SimulatedServos:
 
     def connect(self) -> None:
         """Take the servos, torque off. Raises ServoError when the model can't do the job."""
-        try:
-            model = by_name(self._settings.servos.model)
-        except KeyError as error:
-            raise ServoError(f"servos.model: {error.args[0]}") from None
+        model = by_name(self._settings.servos.model)
         unfit = check_model(model, self._mode)
         if unfit:
             raise ServoError(f"servos.model: {unfit}")

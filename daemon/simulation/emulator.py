@@ -178,8 +178,6 @@ class Emulator:
             bus = ServoBus.from_settings(
                 settings, self.hand, ids=self._ids, baud=baud, prepared=prepared
             )
-        except KeyError as error:
-            raise EmulatorError(f"servos.model: {error.args[0]}") from None
         except ValueError as error:
             raise EmulatorError(str(error)) from None
         link = self._links.path / "servos"

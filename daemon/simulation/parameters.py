@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from daemon.records import FINGERS
 from daemon.servos.models import by_name
-from daemon.settings import Settings, SettingsError
+from daemon.settings import Settings
 from daemon.simulation import layout
 from daemon.simulation.ledger import LOSSLESS_TOLERANCE
 from daemon.simulation.shapes import shape_of
@@ -119,10 +119,7 @@ def _object(p: FloatArray, settings: Settings) -> None:
 
 def _joints(p: FloatArray, settings: Settings) -> None:
     simulation, servos = settings.simulation, settings.servos
-    try:
-        model = by_name(servos.model)
-    except KeyError as error:
-        raise SettingsError(f"servos.model: {error.args[0]}") from None
+    model = by_name(servos.model)
     inertia, constant = simulation.joint_inertia, settings.control.torque_constant
     p[layout.JOINT_INERTIA] = inertia
     p[layout.JOINT_DAMPING] = simulation.joint_damping

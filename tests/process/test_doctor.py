@@ -220,14 +220,22 @@ def test_who_has_a_port_is_named(terminal, locked):
         "print('open', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with ending(subprocess.Popen([sys.executable, "-c", script, path], **pipes)) as other:
+    # Its command line is that of a daemon's process.
+    words = [sys.executable, "-c", script, path, "softfinger", "run"]
+    with ending(subprocess.Popen(words, **pipes)) as other:
         assert other.stdout.readline() == "open\n"
         found = ports.check_port(path, "servos.port")
+        well = ports.check_port(path, "servos.port", "holding")
         other.stdin.close()
         other.wait(60)
     assert found.status == "FAIL"
     assert f"in use by process {other.pid} (python" in found.text
     assert found.mend == f"kill {other.pid}"
+    assert well.status == "warn", "a daemon that answers is well, and not to be killed"
+    assert (
+        f"the softfinger daemon that runs here has it (holding, process {other.pid})" in well.text
+    )
+    assert "kill" not in well.mend
     assert ports.check_port(path, "servos.port").status == "pass"
 
 

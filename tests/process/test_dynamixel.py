@@ -167,9 +167,14 @@ def test_the_wrong_rate_is_met_with_silence(running: Callable[..., RunningBus]) 
     backend.close()
 
 
-def test_a_missing_port_and_an_unknown_model(bus: RunningBus) -> None:
+def test_a_missing_port(bus: RunningBus) -> None:
     assert "no such port" in refusal(bus, profile("/dev/does-not-exist"))
-    assert "unknown servo model 'AX-12A'" in refusal(bus, model="AX-12A")
+
+
+def test_a_line_without_a_watchdog_is_told(bus: RunningBus) -> None:
+    backend = connected(bus, watchdog=0.0)
+    assert sum("servos.watchdog = 0: nothing stops it" in each for each in backend.notices) == 2
+    backend.close()
 
 
 def test_a_second_daemon_gets_a_clear_error_and_disturbs_nothing(bus: RunningBus) -> None:

@@ -158,6 +158,12 @@ def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
     ]
 
 
+def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> None:
+    lines = report(tmp_path, '[servos]\nmodel = "XM999"\nbaud = 1\n[loop]\nrate = 1.0')
+    assert [line.split(":")[0] for line in lines] == ["servos.baud", "servos.model", "loop.rate"]
+    assert 'found "XM999", expected one of XM430-W350, ' in lines[1]
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -183,6 +189,10 @@ def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
         ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
         ('[task]\nname = "demo"\nforce = 500.0', "task.force: found 500 N, expected above 0.5 to"),
         ("x = " + "[" * 5000, "nested too deeply"),
+        (".".join(["x"] * 3000) + " = 1", "nested too deeply"),
+        ("[" + ".".join(["x"] * 3000) + "]", "nested too deeply"),
+        ("[servos]\nfault_after = 60.0", "servos.fault_after: found 60.0, expected less than or"),
+        ("[servos]\nwatchdog = 3.0", "servos.watchdog: found 3.0, expected less than or equal to"),
         ("x = " + "9" * 5000, "not TOML: "),
         (
             '[material]\nlaw = "points"\nstrain = [0.0, 0.2, 0.1]\nstress = [0.0, 1.0, 2.0]',

@@ -24,6 +24,7 @@ from daemon.modes import Mode
 from daemon.recompute import with_calibrations
 from daemon.records import FINGERS
 from daemon.settings import Settings, SettingsError
+from daemon.tactile.base import TactileError
 from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
 from tools.recordings.recomputed import recorded_settings
@@ -218,7 +219,7 @@ def _model(
     try:
         with tempfile.TemporaryDirectory() as folder:
             models = make_models(with_calibrations(settings, calibrations, Path(folder)), cache)
-    except (SettingsError, ValueError) as error:
+    except (SettingsError, TactileError, ValueError) as error:
         return settings, None, f"its model can't be made: {error}"
     return settings, models, ""
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from daemon import contract, messages
+from daemon.records import FINGERS
 
 ENCODING = "json"
 SCHEMA_ENCODING = "jsonschema"
@@ -15,6 +16,8 @@ PROFILE = "softfinger"
 LIBRARY = "softfinger"
 _IMAGE = "foxglove.RawImage"
 _TACTILE = tuple(field.name for field in contract.TOPICS[messages.TACTILE])  # in their order
+
+_MOST_CELLS = 4096  # in a row or column
 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -92,8 +95,25 @@ def _image(message: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _is_frame(message: dict[str, Any]) -> bool:
+    """Whether a map has what makes a frame of it: whose, when, and as many cells as it says."""
+    rows, cols, stamp = (message.get(name) for name in ("rows", "cols", "timestamp"))
+    return (
+        message.get("finger") in FINGERS
+        and isinstance(stamp, float)
+        and math.isfinite(stamp)
+        and type(rows) is type(cols) is int
+        and 0 < rows <= _MOST_CELLS
+        and 0 < cols <= _MOST_CELLS
+        and len(message["data"]) == 2 * rows * cols
+    )
+
+
 class _Restored:
-    """Nulls are NaN again, bytes are bytes, and an image is the topic's own map."""
+    """Nulls are NaN again, bytes are bytes, and an image is the topic's own map.
+
+    Raises ValueError, TypeError or AttributeError for what is no message of the topic.
+    """
 
     _IMAGE_ALONE = ("timestamp", "frame_id", "width", "height", "encoding", "step")
 
@@ -108,6 +128,8 @@ class _Restored:
             message["timestamp"] = message.pop("unix", math.nan)
             message["data"] = base64.b64decode(message.get("data") or "")
             message = {name: message[name] for name in _TACTILE if name in message} | message
+            if not _is_frame(message):
+                raise ValueError("a tactile frame whose fields do not fit together")
         for path in self._floats:
             place: Any = message
             for part in path[:-1]:

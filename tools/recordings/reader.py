@@ -84,7 +84,7 @@ class Recording:
 
         Times count from the recording's first message. ``progress`` is told the bytes of the file
         that are behind. A truncated file ends where its sound part ends; a damaged chunk is left
-        out.
+        out, and so is what is no message of its topic.
         """
         import orjson
         from mcap.records import Message
@@ -116,7 +116,7 @@ class Recording:
                     message = convert(loads(record.data))
                 except (ValueError, TypeError, AttributeError) as error:
                     self._damaged(error)
-                    return
+                    continue
                 yield topic, message
 
     def _chunks(self, progress: Callable[[int], None] | None = None) -> Iterator[Chunk]:
@@ -152,7 +152,9 @@ class Recording:
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
         nameless = "its end is missing" if self.truncated else "a chunk can't be read"
-        self.damage = self.damage or str(error or "") or nameless
+        # What the format's reader says of a wrong length or checksum helps nobody.
+        told = str(error) if type(error) is ValueError else ""
+        self.damage = self.damage or told or nameless
         if first and self._tell is not None:
             what = "cut short" if self.truncated else "damaged"
             self._tell(f"{self.path}: {what} ({self.damage}); what is sound in it is read")

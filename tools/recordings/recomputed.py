@@ -23,6 +23,9 @@ from tools.recordings.reader import Recording
 _MOMENT = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 
+_SETTINGS = ("settings", "calibration_left", "calibration_right")  # of hand/settings
+
+
 @dataclass(slots=True)
 class Difference:
     """How one field of ``hand/state`` differs: how often, where first, where worst."""
@@ -53,13 +56,16 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
     message = next((each for _, each in recording.messages([messages.SETTINGS])), None)
     if message is None:
         raise RecordingError(f"{recording.path}: no hand/settings in it")
+    text, *calibrations = (message.get(name) for name in _SETTINGS)
+    if not (isinstance(text, str) and all(isinstance(each, str) for each in calibrations)):
+        raise RecordingError(f"{recording.path}: its hand/settings lacks {' or '.join(_SETTINGS)}")
     try:
-        settings = Settings.model_validate_json(message["settings"], strict=False)
+        settings = Settings.model_validate_json(text, strict=False)
     except ValueError as error:
         raise RecordingError(
             f"{recording.path}: its settings are not of this version: {error}"
         ) from None
-    return settings, [message["calibration_left"], message["calibration_right"]]
+    return settings, [str(each) for each in calibrations]
 
 
 def recompute(

@@ -1,0 +1,113 @@
+"""Recordings with messages that are none: told, left out, and never a traceback."""
+
+from __future__ import annotations
+
+import copy
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon import messages
+from daemon.settings import Settings
+from tests.unit.test_contract import sample
+from tools.analysis.contacts import analyse
+from tools.analysis.plots_data import load_run
+from tools.analysis.sources import open_source
+from tools.recordings.errors import RecordingError
+from tools.recordings.reader import Recording
+from tools.recordings.recomputed import recorded_settings
+from tools.recordings.writer import RecordingWriter
+
+SPOILT: dict[str, Any] = {
+    "no finger": ("finger", None),
+    "another finger": ("finger", "thumb"),
+    "no rows": ("rows", None),
+    "rows as a text": ("rows", "44"),
+    "more rows than data": ("rows", 45),
+    "rows beyond memory": ("rows", 2**40),
+    "no time": ("timestamp", [1]),
+    "too little data": ("data", b"\0"),
+}
+
+
+def frame(k: int) -> dict[str, Any]:
+    message = copy.deepcopy(sample(messages.TACTILE))
+    data = np.zeros((44, 44), "<u2").tobytes()
+    return {
+        **message,
+        "seq": k,
+        "timestamp": 1e9 + 0.01 * k,
+        "finger": "left",
+        "rows": 44,
+        "cols": 44,
+        "unit": "count",
+        "data": data,
+    }
+
+
+def settings_message() -> dict[str, Any]:
+    message = copy.deepcopy(sample(messages.SETTINGS))
+    calibrations = {"calibration_left": "", "calibration_right": ""}
+    return {**message, **calibrations, "settings": Settings().model_dump_json()}
+
+
+def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
+    """Ten frames, the fifth of which is spoilt."""
+    writer = RecordingWriter(path)
+    writer.add(messages.SETTINGS, settings_message())
+    for k in range(10):
+        message = frame(k)
+        if spoil is not None and k == 5:
+            name, value = spoil
+            if value is None:
+                del message[name]
+            else:
+                message[name] = value
+        writer.add(messages.TACTILE, message)
+        writer.add(messages.STATE, {**sample(messages.STATE), "seq": k})
+    writer.close()
+    return path
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_a_frame_that_is_none_is_told_and_left_out(tmp_path: Path, spoil: tuple[str, Any]) -> None:
+    path = recording(tmp_path / "a.mcap", spoil)
+    told: list[str] = []
+    found = list(Recording(path, told.append).messages([messages.TACTILE]))
+    assert len(found) == 9
+    assert len(told) == 1
+    assert "what is sound in it is read" in told[0]
+    source = open_source(path, Settings(), None, own=True)
+    contacts = analyse(source, lambda _: None)
+    assert contacts[0].t.size == 9
+    load_run(Recording(path), -np.inf, np.inf, None, lambda _: None)
+
+
+@pytest.mark.parametrize("name", ["settings", "calibration_left"])
+def test_settings_without_their_text_are_told(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path)
+    message = settings_message()
+    del message[name]
+    writer.add(messages.SETTINGS, message)
+    writer.close()
+    with pytest.raises(RecordingError, match="its hand/settings lacks"):
+        recorded_settings(Recording(path))
+
+
+def test_a_file_cut_anywhere_is_told_in_plain_words(tmp_path: Path) -> None:
+    whole = recording(tmp_path / "a.mcap", None).read_bytes()
+    chance = random.Random(1)
+    path = tmp_path / "cut.mcap"
+    for _ in range(60):
+        path.write_bytes(whole[: chance.randrange(1, len(whole))] + chance.randbytes(30))
+        told: list[str] = []
+        try:
+            Recording(path, told.append).check()
+        except RecordingError as error:
+            told.append(str(error))
+        assert told
+        assert not any("record length" in text for text in told), told
