@@ -36,6 +36,8 @@ ServoMode = Literal["current-based position", "current", "position"]
 
 
 SIMULATED = ("simulated", "replay", "none")  # backends behind which there is no metal
+
+
 def _known(name: str) -> str:
     from daemon.servos.models import MODELS, by_name
 
