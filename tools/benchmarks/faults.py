@@ -81,7 +81,7 @@ def known(only: str) -> bool:
 
 
 def _of_case(rig: Rig, case: Case, trials: int) -> Outcome:
-    allowed = case.within if case.expect in ("fault", "dies") else None
+    allowed = case.within if case.expect in ("fault", "dies", "stops") else None
     outcome = Outcome(case.name, case.expect, allowed)
     return _all(outcome, trials, lambda seed: trial(rig, case, seed))
 

@@ -18,7 +18,8 @@ from tools.benchmarks.faults_rig import Rig
 Inject = Callable[[Rig, random.Random], AbstractContextManager[None]]
 # works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints
 # stay where they are, without a fault. dies: the daemon is gone, the servos stop by themselves.
-Expect = Literal["works", "fault", "either", "lets go", "dies"]
+# stops: it is told to stop, and no motor is driven in time, with a fault or without.
+Expect = Literal["works", "fault", "either", "lets go", "dies", "stops"]
 
 _SETTINGS = Settings()
 _SILENT = _SETTINGS.servos.fault_after
@@ -26,6 +27,9 @@ _WATCHDOG = _SETTINGS.servos.watchdog + 0.02  # the servo counts in steps of 20 
 _FRAMES = _SETTINGS.safety.frame_age_fault / 100.0 + 0.01  # of a board of 100 Hz
 _FROZEN = _SETTINGS.safety.frozen_after + 0.05  # judged in turn
 _AT_ONCE = 0.03
+_STOP = 0.2  # s from a stop to no motor driven, whatever gets lost
+_SAME = 0.3  # s in which a hand that holds may send the same goal, of which none is missed
+_JUDGED = 0.1  # s: a row that is judged in turn and must stand for half of that
 _SERVOS = (1, 2)
 _SIDES = ("left", "right")
 
@@ -61,6 +65,10 @@ def told(words: Callable[[random.Random], tuple[str, str]]) -> Inject:
 
 def _reply(kind: str, share: float) -> Inject:
     return told(lambda _: (f"{kind}={share}", "well"))
+
+
+def _lost(share: float) -> Inject:
+    return told(lambda _: (f"lose={share} drop={share}", "well"))
 
 
 def _servo(begin: str, end: str) -> Inject:
@@ -121,6 +129,18 @@ CASES: tuple[Case, ...] = (
     Case("one servo without supply", "fault",
          _servo("undervoltage={0}", "recover={0} reboot={0}"),
          ("servos.alert", "servos.voltage"), _SILENT + _AT_ONCE),
+    Case("one servo's encoder stuck", "fault", _servo("stuck={0}", "recover={0}"),
+         ("joint.dead",), 0.05 / _SETTINGS.control.approach_speed + _JUDGED),
+    Case("one servo's encoder jumped", "fault", _servo("jump={0}", "recover={0}"),
+         ("joint.jump",), _AT_ONCE),
+    Case("one servo's readings frozen", "fault", _servo("frozen={0}", "recover={0}"),
+         ("servos.frozen",), 0.12 + _AT_ONCE),
+    _silent("one servo's readings refused", inject=_servo("refuse={0}", "recover={0}")),
+    Case("writes lost, 100%", "fault", told(lambda _: ("lose-writes=1", "well")),
+         ("goal.lost",), _SAME + 0.05 + _STOP),
+    *(Case(f"stop, {share:.0%} lost each way", "stops", _lost(share), within=_STOP)
+      for share in (0.0, 0.2, 0.5, 0.8, 0.9)),
+    Case("stop, writes lost", "stops", told(lambda _: ("lose-writes=1", "well")), within=_STOP),
     Case("servos' port gone and back", "fault", told(lambda _: ("unplug", "plug")),
          ("servos.bus",), _WATCHDOG),
     _blind("board silent", inject=_board("{}:silent")),

@@ -5,6 +5,7 @@ What was on the servos' wire is judged from the stand-in hand's record with arit
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
 import time
@@ -174,6 +175,9 @@ def _phase(rig: Rig, case: Case, chance: random.Random) -> str:
 def _look(rig: Rig, case: Case, found: Trial) -> None:
     begin = now = time.monotonic()
     modes = set()
+    if case.expect == "stops":
+        with contextlib.suppress(NoAnswer):
+            rig.ask({"command": "stop"})
     while now < begin + case.lasts:
         for state in rig.states():
             t = state["mono_ns"] * 1e-9
@@ -186,7 +190,7 @@ def _look(rig: Rig, case: Case, found: Trial) -> None:
             found.safe_s = report["monotonic"] - begin
         found.aside_s = max(found.aside_s, rig.put_aside())
         safe = not math.isnan(found.safe_s)
-        if safe and (found.fault or case.expect == "dies"):
+        if safe and (found.fault or case.expect in ("dies", "stops")):
             return
         if case.expect == "lets go" and "armed" in modes:
             return
@@ -250,7 +254,7 @@ def _judge(case: Case, found: Trial) -> None:
         return
     if not found.fault and case.expect == "fault":
         found.missed = "no fault"
-    elif found.fault and found.fault not in case.names:
+    elif found.fault and case.expect != "stops" and found.fault not in case.names:
         found.missed = f"{found.fault} instead of {' or '.join(case.names)}"
     elif not safe:
         found.missed = "motors were driven on"
