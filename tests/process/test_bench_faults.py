@@ -111,6 +111,10 @@ def test_a_grip_on_old_frames_is_seen() -> None:
         ("board torn, 10%", Trial(1), ""),
         ("daemon killed", Trial(1, safe_s=0.1), ""),
         ("daemon killed", Trial(1), "driven on"),
+        ("stop, 90% lost each way", Trial(1), "driven on"),
+        ("stop, 90% lost each way", Trial(1, safe_s=0.1), ""),
+        ("stop, 90% lost each way", Trial(1, fault="torque.off", safe_s=0.1), ""),
+        ("stop, writes lost", Trial(1, safe_s=0.3), "driven for 0.300 s, 0.200 s allowed"),
     ],
 )
 def test_what_was_expected_is_told_from_what_was_not(name: str, trial: Trial, missed: str) -> None:

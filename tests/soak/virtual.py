@@ -37,7 +37,11 @@ _COMMAND_EVERY = 150  # ticks between two random commands, in the mean
 _WARM = 0.1  # share of the ticks after which memory counts
 _LOOKS = 50  # at the memory, altogether
 # deaf: all that is written gets lost, and readings come.
-SERVO_FAULTS = ("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed")
+# jumped: the angle is 0.2 rad off. numb: angle, velocity and current stand still.
+SERVO_FAULTS = (
+    *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
+    *("jumped", "numb"),
+)
 _UNHEARD = ("silent", "gone", "deaf")  # no servo hears that torque shall be off
 _WATCHDOG = 100  # ticks, 0.2 s, within which the servos' watchdogs then stop them
 _LOST = 20  # goals in a row that get lost and are noticed
@@ -59,6 +63,7 @@ class FaultyServos:
         self.last_good = -math.inf
         self.torque = False
         self.written = 0
+        self._last = 0.0  # angle at which a numb joint stands [rad]
         self._unheard = 0
 
     def connect(self) -> None:
@@ -75,6 +80,8 @@ class FaultyServos:
             reading.seq += 1
             reading.valid = False
             return
+        if fault != "numb":
+            self._last = reading.q[finger]
         self._servos.read(reading)
         self.last_good = reading.t
         if fault == "alert":
@@ -90,6 +97,10 @@ class FaultyServos:
             reading.current[finger] = 3.0
         elif fault == "strayed":
             reading.q[finger] = -2.0
+        elif fault == "jumped":
+            reading.q[finger] += 0.2
+        elif fault == "numb":
+            reading.q[finger], reading.dq[finger], reading.current[finger] = self._last, 0.0, 0.0
         elif fault == "deaf" and self._unheard > _LOST:
             reading.lost = 1 << finger
 
