@@ -50,6 +50,7 @@ class Drive:
         self._silent_until = -math.inf
         self._first = math.inf  # when off was first asked for
         self._told = False
+        self._gone = False  # the port: nothing can be sent
         self._last_try = -1  # seq of the tick with the last try
         self._aside = Reading()  # what is read after the tick has decided goes here
 
@@ -121,14 +122,14 @@ class Drive:
 
     def reconnect(self) -> None:
         """Connect servos that have gone silent anew, as after an unplug. Raises ServoError."""
-        if self.servos is not None:
-            self.servos.connect()
-            self.servos.read(self._state.reading)
-            if self._state.torque:
-                # It may still be on where the port went away before it could be turned off.
-                self._silent_until, self._tried_since = -math.inf, self._state.t
-                self._last_try = -1
-                self.off()
+        if self.servos is None:
+            return
+        self.servos.connect()
+        self.servos.read(self._state.reading)
+        if self._state.torque:
+            # It may still be on where the port went away before it could be turned off.
+            self._last_try = -1
+            self.off()
 
     def _on(self, servos: Servos) -> None:
         self._state.torque = True  # from here on it may be on, whatever the servos answer
@@ -144,7 +145,10 @@ class Drive:
 
     def _try(self, servos: Servos, reading: Reading) -> None:
         self._last_try = self._state.seq
-        if not servos.torque_off(reading):
+        self._gone = True
+        confirmed = servos.torque_off(reading)
+        self._gone = False
+        if not confirmed:
             return
         state = self._state
         state.torque, state.torque_off = False, True
@@ -163,9 +167,10 @@ class Drive:
             return True
         if t - self._tried_since < self._patience:
             return False
-        self._silent_until = self._tried_since = t + self._silence
         self._tell()
-        return self._silence > 0.0
+        silence = 0.0 if self._gone else self._silence
+        self._silent_until = self._tried_since = t + silence
+        return silence > 0.0
 
     def _tell(self) -> None:
         """That torque off is not confirmed: once, and as a fault where none is latched."""
@@ -174,10 +179,12 @@ class Drive:
         self._told = True
         state = self._state
         text = f"torque off not confirmed by the servos for {state.t - self._first:.2f} s: "
-        if self._silence:
-            text += "the bus is kept silent until their watchdogs stop them"
-        else:
+        if not self._silence:
             text += "cut their power (servos.watchdog = 0: nothing else stops them)"
+        elif self._gone:
+            text += "the port is gone, their watchdogs stop them"
+        else:
+            text += "the bus is kept silent until their watchdogs stop them"
         if state.fault:
             self._emit("error", TORQUE_OFF, text)
         else:

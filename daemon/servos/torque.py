@@ -114,10 +114,11 @@ class Torque:
         if self._mode != reg.CURRENT_MODE:
             packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
             self._store(reg.GOAL_POSITION, packed, "goal position")
-        self.may_be_on = True
-        self._store_all(reg.TORQUE_ENABLE, b"\x01", "torque on")
+        # It measures from torque on, and must stop what can't be verified to be on.
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
+        self.may_be_on = True
+        self._store_all(reg.TORQUE_ENABLE, b"\x01", "torque on")
         for servo_id, joint in self._joints.items():
             joint.sent.clear()
             joint.sent.append(pack_goal(self._mode, 0, positions[servo_id]))
