@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from daemon.settings import Settings, SettingsError
+from daemon.settings import Settings
 from daemon.simulation import layout
 from daemon.simulation.hand import SimulatedHand
 from kinematics.fingers import HandGeometry
@@ -355,8 +355,3 @@ def test_sub_step_divides_the_millisecond_and_shrinks_with_stiffness():
     assert steps[0] == steps[1] == 0.25e-3
     assert steps[1] > steps[2] > steps[3] == 0.05e-3
     assert make(object_mass=0.01, modulus_scale=4.0).step < steps[2]
-
-
-def test_unknown_servo_is_a_settings_error():
-    with pytest.raises(SettingsError, match=r"servos\.model"):
-        SimulatedHand(Settings.model_validate({"servos": {"model": "XM999"}}), table=PAPER)

@@ -164,17 +164,17 @@ def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(
     daemon, machine, _ = on_late_machine("real", task={"name": "demo"})
     servos, state = daemon.loop.servos, daemon.loop.state
     assert servos is not None
-    really = servos.set_torque
+    really = servos.torque_on
 
-    def slowly(on: bool) -> None:
-        really(on)
+    def slowly() -> None:
+        really()
         machine.work(0.3)  # a slow bus
 
-    servos.set_torque = slowly  # type: ignore[method-assign]
+    servos.torque_on = slowly  # type: ignore[method-assign]
     advance_to(daemon, "fault", 2.0)  # the task arms
     assert (state.fault_name, state.timing.busy_s) == ("servos.bus", 0.0)
     assert state.fault.startswith("the bus watchdog")
-    servos.set_torque = really  # type: ignore[method-assign]
+    servos.torque_on = really  # type: ignore[method-assign]
     advance_to(daemon, "grasping", 5.0)
     sensor = daemon.loop.perceptions[0].sensor
     latest = sensor.latest

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,12 +50,12 @@ def test_a_file_appears_whole_or_not_at_all(
     save_table(file, table, TIP, CONSTANT)
     before = file.read_bytes()
 
-    def full(self: Path, content: bytes) -> int:
-        with self.open("wb") as part:
-            part.write(content[:50])
-        raise OSError(28, "No space left on device")
+    class Full(io.FileIO):
+        def write(self, content: Any) -> int:
+            super().write(content[:50])
+            raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(table_files, "write_bytes", lambda path: Full(path, "w"))
     with pytest.raises(OSError, match="No space left"):
         save_table(file, ContactTable.build(TIP, CONSTANT, 1e-3), TIP, CONSTANT)
     assert [path.name for path in tmp_path.iterdir()] == ["tip.table"]
