@@ -67,7 +67,7 @@ def test_arm_grasp_and_stop_from_the_command_line(hand: Shared) -> None:
     assert send("grasp", "force=5") == (0, {"ok": True, "mode": "grasping"})
     until(lambda: send("status")[1]["mode"] == "holding")
     assert send("rotate", "angle=5deg")[1]["mode"] == "rotating"
-    assert send("stop") == (0, {"ok": True, "mode": "disarmed"})
+    assert send("stop") == (0, {"ok": True, "mode": "disarmed", "torque_off": "confirmed"})
     status, reply = send("status")
     assert (status, reply["torque"], reply["fault"]) == (0, False, "")
 

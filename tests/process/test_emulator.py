@@ -329,16 +329,17 @@ def test_links_that_lead_elsewhere_by_now_are_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "status", "told"),
     [
-        (["--fault", "melted"], "wrong-size"),
-        (["--fault", "silent=9"], "no servo has that ID"),
-        (["--model", "AX-12"], "XM430-W350"),
-        (["--baud", "1234"], "baud"),
+        (["--fault", "melted"], 1, "wrong-size"),
+        (["--fault", "silent=9"], 1, "no servo has that ID"),
+        (["--fault", "lose=2"], 1, "a probability lies in 0 … 1"),
+        (["--model", "AX-12"], 2, "XM430-W350"),
+        (["--baud", "1234"], 1, "baud"),
     ],
 )
-def test_what_cannot_be_emulated_is_told_in_one_line(tmp_path, capsys, options, told):
-    assert main(["emulate", "--dir", str(tmp_path), *options]) == 1
+def test_what_cannot_be_emulated_is_told_in_one_line(tmp_path, capsys, options, status, told):
+    assert main(["emulate", "--dir", str(tmp_path), *options]) == status
     err = capsys.readouterr().err
     assert told in err
     assert len(err.splitlines()) == 1
