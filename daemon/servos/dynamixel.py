@@ -340,7 +340,7 @@ class DynamixelServos:
                 if not torque.may_be_on:
                     break
                 self.torque_off(reading)
-            else:
+            if torque.may_be_on:
                 _log.error("servos: torque off not confirmed; their bus watchdog stops them")
         except PortGone:
             _log.error("servos: the port went away with torque on; their bus watchdog stops them")
