@@ -13,17 +13,21 @@ from daemon.records import Reading
 
 _AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way in one reading
 _APART = 0.1  # rad that it may be off the way that the velocity says …
-_MEMORY = 0.1  # … over the last so many s: a velocity lags and readings are late by milliseconds
-_GAP = 0.1  # s without a good reading after which it is begun anew
+_MEMORY = 0.1  # … over the last so many s: a velocity lags
+_LATE = 0.02  # s between two readings, or 3 ticks, from which on a way can't be told: begun anew
+_GAP = 0.1  # s from which on nothing is
 
 
 class JointMotion:
     """Follows the joints' readings; ``jumped`` has a bit for each finger where that is so now."""
 
-    def __init__(self, fingers: Sequence[int], velocity_max: float) -> None:
+    def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
+        """``period`` [s] of the ticks."""
         self.jumped = 0
         self._fingers = tuple(fingers)
         self._velocity_max = velocity_max
+        self._late = max(_LATE, 3.0 * period)
+        self._gap = max(_GAP, self._late)
         self._asked = -math.inf  # when the last good reading was asked for [s]
         self._t = -math.inf  # and had come
         self._q = [0.0, 0.0]
@@ -35,16 +39,16 @@ class JointMotion:
         t = reading.t
         if not reading.valid or t == self._t:
             return
-        dt = t - self._t
-        q, dq, before, apart = reading.q, reading.dq, self._q, self._apart
-        if dt < _GAP:
-            # A reading was taken somewhere between question and answer.
-            most = self._velocity_max * (t - self._asked) + _AT_ONCE
-            keep = 1.0 - dt / _MEMORY
+        # Each was taken somewhere between question and answer.
+        longest, dt = t - self._asked, t - self._t
+        q, before, apart = reading.q, self._q, self._apart
+        if longest < self._gap:
+            most = self._velocity_max * longest + _AT_ONCE
+            keep = 1.0 - dt / _MEMORY if longest < self._late else 0.0
             for i in self._fingers:
                 step = q[i] - before[i]
-                off = apart[i] = keep * apart[i] + step - dq[i] * dt
                 before[i] = q[i]
+                off = apart[i] = keep * (apart[i] + step - reading.dq[i] * dt)
                 if not (-most <= step <= most and -_APART <= off <= _APART):
                     self.jumped |= 1 << i
                     apart[i] = 0.0

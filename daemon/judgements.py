@@ -51,7 +51,7 @@ class View:
         self.frames = frames  # what each finger's newest frame alone says
         self.sensors = sensors
         self.frame_period = 1.0 / settings.tactile.rate
-        self.motion = JointMotion(self.fingers, self.limits.velocity_max)
+        self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
         servos = settings.servos  # in current mode the pull is the daemon's own
         self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
         self.no_number = False  # a goal was none since the last judgement

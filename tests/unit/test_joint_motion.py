@@ -25,17 +25,21 @@ class Joint:
 
     def __init__(self, seed: int = 1) -> None:
         self.reading = Reading(valid=True, t=0.0)
-        self.motion = JointMotion((0, 1), 6.0)
+        self.motion = JointMotion((0, 1), 6.0, TICK)
         self.t = self.q = self.dq = 0.0
         self.random = random.Random(seed)
 
-    def tick(self, dq: float, lag: float = 0.02) -> int:
-        """Turn at ``dq`` rad/s for a tick; the told velocity follows within ``lag`` s."""
+    def tick(self, dq: float, lag: float = 0.02, held: float = 0.0) -> int:
+        """Turn at ``dq`` rad/s for a tick; the told velocity follows within ``lag`` s.
+
+        The answer is taken ``held`` s late.
+        """
         self.t += TICK
         self.q += dq * TICK
         self.dq += (dq - self.dq) * min(TICK / lag, 1.0)
         reading = self.reading
-        held = 0.015 if self.random.random() < 0.01 else 0.0  # the process was put aside
+        if self.random.random() < 0.01:
+            held += 0.015  # the process was put aside
         reading.t = max(reading.t, self.t + self.random.uniform(0.0003, 0.004) + held)
         reading.q[0] = COUNT * round(self.q / COUNT)
         reading.dq[0] = RATE * round(self.dq / RATE)
@@ -76,13 +80,28 @@ def test_a_velocity_without_a_motion_is_found() -> None:
     assert seconds < 0.1
 
 
-def test_after_a_gap_it_is_begun_anew() -> None:
+@pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
+def test_a_machine_that_stood_still_while_a_joint_turned_is_no_jump(seconds: float) -> None:
+    """Whether before the servo was asked, or between its answer and its being taken."""
+    for at_answer in (False, True):
+        joint = Joint()
+        for _ in range(100):
+            joint.tick(3.0)
+        if at_answer:
+            assert not joint.tick(3.0, held=seconds)
+        joint.t += seconds
+        joint.q += 3.0 * seconds
+        for _ in range(100):
+            assert not joint.tick(3.0)
+
+
+def test_a_jump_beside_lost_readings_is_found() -> None:
     joint = Joint()
     for _ in range(10):
         joint.tick(0.0)
-    joint.t += 0.2
-    joint.q += 1.0
-    assert not joint.tick(0.0)
+    joint.t += 0.02
+    joint.q += 0.3
+    assert joint.tick(0.0) == 1
 
 
 # --- in the loop --------------------------------------------------------------------------------
