@@ -120,7 +120,7 @@ class ServoSettings(Section):
     stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
     damping: NonNegative = 0.4  # A·s/rad, likewise
     reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
-    fault_after: Annotated[float, Field(gt=0, le=0.5)] = 0.05  # s without a good reading → fault
+    fault_after: Seconds = 0.05  # s without a good reading → fault
     watchdog: Annotated[float, Field(ge=0, le=2.54)] = 0.1  # s, the servo's own; 0 leaves it off
 
 

@@ -13,7 +13,7 @@ from daemon.servos import registers as reg
 from daemon.servos.models import ServoModel, by_number
 from daemon.servos.modes import mode_number
 from daemon.servos.units import JointScale
-from daemon.settings import Settings
+from daemon.settings import ServoSettings, Settings
 
 # Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
 RETURN_DELAY_MAX = 25
@@ -22,6 +22,7 @@ DRIVE_UNFIT = 0b1010
 DRIVE_REVERSE = 0b0001
 MEND = "`softfinger doctor --fix`"
 WATCHDOG_FIRMWARE = 38
+_LONG = 0.5  # s of silence that are told
 # rad beyond the hand's limits at which a joint's angle is not believed: a wrong zero, or a servo
 # that forgot its turns when it was switched off.
 ANGLE_MARGIN = 0.25
@@ -117,7 +118,7 @@ def check_servo(
             f"{name}: current limit is {limit:.3f} A, below safety.current_max {current_max:g} A: "
             f"lower safety.current_max or raise the limit"
         )
-    notices += _notices(name, model, table, firmware, watchdog)
+    notices += _notices(name, model, table, firmware, settings.servos)
     return Findings(tuple(errors), tuple(notices))
 
 
@@ -141,11 +142,14 @@ def _check_range(
 
 
 def _notices(
-    name: str, model: ServoModel, table: bytes, firmware: int, watchdog: float
+    name: str, model: ServoModel, table: bytes, firmware: int, servos: ServoSettings
 ) -> list[str]:
     notices = []
-    if not watchdog:
+    if not servos.watchdog:
         notices.append(f"{name}: servos.watchdog = 0: nothing stops it if daemon or line fail")
+    if servos.fault_after > _LONG:
+        held = f"servos.fault_after = {servos.fault_after:g} s"
+        notices.append(f"{name}: {held}: without an answer its last reading counts for so long")
     if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
         notices.append(f"{name}: its drive mode is reversed; servos.direction comes on top of that")
     if table[reg.TORQUE_ENABLE]:

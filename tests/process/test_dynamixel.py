@@ -172,8 +172,9 @@ def test_a_missing_port(bus: RunningBus) -> None:
 
 
 def test_a_line_without_a_watchdog_is_told(bus: RunningBus) -> None:
-    backend = connected(bus, watchdog=0.0)
+    backend = connected(bus, watchdog=0.0, fault_after=60.0)
     assert sum("servos.watchdog = 0: nothing stops it" in each for each in backend.notices) == 2
+    assert sum("servos.fault_after = 60 s: without an answer" in n for n in backend.notices) == 2
     backend.close()
 
 
