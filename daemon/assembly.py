@@ -105,9 +105,9 @@ class Daemon:
         stream, commands = self.settings.stream, self.settings.commands
         access = self.settings.access
         keys = load_server(Path(access.keys)) if access.keys else None
-        if keys is not None:
-            self._closers.append(Doorkeeper(context, keys.clients).close)
-        guard = Guard(int(access.ipc_mode, 8), keys)
+        clients = None if keys is None else keys.clients
+        self._closers.append(Doorkeeper(context, clients).close)
+        guard = Guard(int(access.ipc_mode, 8), keys, asks=True)
         publisher = Publisher(context, stream.address, stream.queue, guard)
         self._closers.append(publisher.close)
         server = CommandServer(

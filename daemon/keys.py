@@ -27,6 +27,7 @@ import zmq.utils.z85
 
 LOCAL = "local"  # the client that every folder of keys has
 DOMAIN = b"softfinger"
+HANDSHAKE = 2000  # ms in which a client has to have shown who it is
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _KEY = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"]*)"\s*$', re.MULTILINE)
@@ -54,7 +55,7 @@ class ServerKeys:
         # Without a doorkeeper nobody is let in, rather than everybody.
         socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-        socket.setsockopt(zmq.HANDSHAKE_IVL, 2000)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import zmq
 
-from daemon.keys import ServerKeys
+from daemon.keys import DOMAIN, HANDSHAKE, ServerKeys
 
 _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)  # plain numbers: enum flags cost a microsecond
 
@@ -37,6 +37,7 @@ class Guard:
 
     ipc_mode: int = 0o600
     keys: ServerKeys | None = None
+    asks: bool = False  # a `Doorkeeper`, without keys, too; nobody is let in until there is one
 
 
 OWNER_ONLY = Guard()
@@ -72,6 +73,10 @@ class Bound:
         self.socket.setsockopt(zmq.RCVHWM, queue)
         if guard.keys is not None:
             guard.keys.guard(self.socket)
+        elif guard.asks:
+            self.socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
+            self.socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+            self.socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE)
         # The file comes into being with its rights, so that nobody slips in before.
         before = os.umask(0o777 & ~guard.ipc_mode) if self._file else -1
         try:

@@ -14,7 +14,7 @@ from daemon import messages
 from daemon.contradictions import address_fault
 from daemon.doorkeeper import Doorkeeper
 from daemon.keys import KeyFileError, load_server
-from daemon.sockets import OWNER_ONLY, AddressError, Bound, Guard
+from daemon.sockets import AddressError, Bound, Guard
 from tools.recordings.errors import RecordingError
 
 _QUEUE = 10_000  # messages that wait for a subscriber; what it does not take by then it misses
@@ -37,10 +37,9 @@ class Wire:
         self._settings: dict[str, Any] | None = None
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
         try:
-            guard = OWNER_ONLY
-            if keys is not None:
-                guard = Guard(keys=(server := load_server(keys)))
-                self._doorkeeper = Doorkeeper(self._context, server.clients)
+            server = None if keys is None else load_server(keys)
+            guard = Guard(keys=server, asks=True)
+            self._doorkeeper = Doorkeeper(self._context, None if server is None else server.clients)
             self._bound = Bound(
                 self._context, zmq.XPUB, address, "--address", _QUEUE, _SUBSCRIPTION, guard
             )

@@ -1,0 +1,102 @@
+"""What is no ZeroMQ client of today gets nothing from the daemon: no command in, no message out.
+
+A web page can have a browser POST bytes of its choice to any port of this machine. They can be made
+to read as frames of ZMTP/1.0, which has no handshake that could tell a browser from a client.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import pytest
+import zmq
+
+from daemon.client import Hand
+from tests.harness.daemon_process import Running
+
+
+def old_frame(body: bytes, more: bool = False) -> bytes:
+    """A frame of ZMTP/1.0: a length that counts the flags, flags, body."""
+    return bytes([len(body) + 1, more]) + body
+
+
+def old_command(name: str) -> bytes:
+    """What a REQ socket of ZMTP/1.0 sends, its identity first."""
+    payload = msgpack.packb({"command": name})
+    return old_frame(b"") + old_frame(b"", more=True) + old_frame(payload)
+
+
+def posted(frames: bytes, port: int) -> bytes:
+    """An HTTP request whose head is one part of a message, and whose body is ``frames``."""
+    for padding in range(256):
+        head = (
+            f"POST /{'x' * padding} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n"
+            f"Content-Type: text/plain\r\nContent-Length: {len(frames)}\r\n\r\n"
+        ).encode()
+        at = 0
+        while at < len(head):
+            at += 1 + head[at]
+        if at == len(head):
+            return head + frames
+    raise AssertionError("no padding ends the head with a frame")
+
+
+def said_to(request: bytes, port: int, wait: Callable[[], object]) -> bytes:
+    """Send ``request``, do something else, and return what was answered meanwhile."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as raw:
+        raw.sendall(request)
+        wait()
+        answer = b""
+        with contextlib.suppress(OSError):  # the daemon may have hung up
+            raw.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(ConnectionError):
+            while part := raw.recv(4096):
+                answer += part
+    return answer
+
+
+@pytest.fixture
+def daemon(
+    profile: Callable[..., Path], start: Callable[..., Running], addresses: tuple[str, str]
+) -> tuple[str, str]:
+    start("--config", str(profile()))
+    return addresses
+
+
+@pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
+def test_a_web_page_commands_nothing(
+    daemon: tuple[str, str], wrap: Callable[[bytes, int], bytes]
+) -> None:
+    port = int(daemon[1].rsplit(":", 1)[1])
+    request = wrap(old_command("arm") + old_command("arm")[2:], port)
+    with Hand(*daemon) as hand:
+        answer = said_to(request, port, lambda: [hand.status() for _ in range(20)])
+        assert b"ok" not in answer
+        assert hand.state().mode == "disarmed"
+        hand.arm()  # a client is still heard
+        assert hand.wait_for(lambda state: state.torque).mode == "armed"
+        hand.stop()
+
+
+@pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
+def test_a_web_page_reads_nothing(
+    daemon: tuple[str, str], wrap: Callable[[bytes, int], bytes]
+) -> None:
+    port = int(daemon[0].rsplit(":", 1)[1])
+    request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), port)
+    with Hand(*daemon) as hand:
+        answer = said_to(request, port, lambda: hand.collect(0.5))
+        assert b"hand/" not in answer
+
+
+def test_a_plain_socket_of_today_is_let_in(daemon: tuple[str, str]) -> None:
+    with zmq.Context() as context, context.socket(zmq.REQ) as client:
+        client.setsockopt(zmq.LINGER, 0)
+        client.connect(daemon[1])
+        client.send(msgpack.packb({"command": "status"}))
+        assert client.poll(10_000)
+        assert msgpack.unpackb(client.recv())["ok"] is True
