@@ -18,7 +18,7 @@ from daemon.client.errors import HandFault, NoStream, NotInTime
 from daemon.client.hand import COMMANDS, STREAM, accepted
 from daemon.client.records import Event, HandState, TactileFrame
 from daemon.client.wire import Decoder, nothing_from, prepare, silent
-from daemon.commands import NoAnswer
+from daemon.command_client import NoAnswer
 from daemon.keys import load_client
 from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
 

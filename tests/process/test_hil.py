@@ -13,7 +13,7 @@ import msgpack
 import pytest
 import zmq
 
-from daemon.commands import send
+from daemon.command_client import send
 from tests.conftest import until
 
 SOFTFINGER = [sys.executable, "-m", "tools.cli"]

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from daemon.commands import send
+from daemon.command_client import send
 from daemon.settings import ServoSettings
 from daemon.simulation.control_port import send_words
 from tests.conftest import until

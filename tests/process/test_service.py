@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.commands import send
+from daemon.command_client import send
 from daemon.service import Service
 from tests.harness.daemon_process import SOFTFINGER, softfinger
 from tools.event_log import EventLog
