@@ -20,7 +20,8 @@ def ready(kind: bytes) -> bytes:
 class RawClient:
     """Connected, and its handshake sent; it waits for nothing."""
 
-    def __init__(self, address: str, kind: bytes) -> None:
+    def __init__(self, address: str, kind: bytes, first: bytes | None = None) -> None:
+        """``kind`` is its socket's type; ``first`` is sent instead of a good handshake."""
         scheme, _, place = address.partition("://")
         if scheme == "ipc":
             self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -28,9 +29,10 @@ class RawClient:
         else:
             host, _, port = place.rpartition(":")
             self.socket = socket.create_connection((host, int(port)))
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.socket.setblocking(False)
         self._parser = Parser(1 << 20)
-        self.send(GREETING + ready(kind))
+        self.send(GREETING + ready(kind) if first is None else first)
 
     def send(self, data: bytes) -> None:
         """Bytes, all of them. Raises OSError when it was hung up on, or there is no room."""
@@ -51,6 +53,13 @@ class RawClient:
                     if not command and not more:
                         found.append(msgpack.unpackb(body))
         return found
+
+    def read(self) -> bytes:
+        """The bytes that have come."""
+        try:
+            return self.socket.recv(65536)
+        except BlockingIOError:
+            return b""
 
     def hung_up(self) -> bool:
         """Whether the other side has ended the connection."""
