@@ -59,6 +59,7 @@ class Daemon:
         self.settings = settings
         self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
+        self.gateway: Gateway | None = None  # the process that serves clients
         try:
             self._assemble(on_event, wire, table_cache)
         except BaseException:
@@ -100,7 +101,7 @@ class Daemon:
     def _bind(self) -> tuple[Publisher, CommandServer]:
         stream, commands = self.settings.stream, self.settings.commands
         access = self.settings.access
-        gateway = Gateway(
+        gateway = self.gateway = Gateway(
             Config(
                 stream.address,
                 commands.address,

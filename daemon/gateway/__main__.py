@@ -14,7 +14,7 @@ from pathlib import Path
 
 from daemon.gateway import link
 from daemon.gateway.config import Config
-from daemon.gateway.service import open_service
+from daemon.gateway.service import StartAnew, open_service
 from daemon.sockets import AddressError
 
 _MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
@@ -25,7 +25,10 @@ _STEPS = 0.5  # s between two words that it lives
 
 
 def main(words: list[str]) -> int:
-    """Serve; 0 when the loop has ended, 1 when the sockets could not be bound."""
+    """Serve; 0 when the loop has ended, 1 when the sockets could not be bound.
+
+    `link.ANEW` when all clients are to come in again.
+    """
     end = socket.socket(fileno=int(words[0]))
     config = Config.from_json(words[1])
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -37,11 +40,15 @@ def main(words: list[str]) -> int:
         return 1
     end.send(link.READY)
     lived = 0.0
-    while not service.over:
-        service.step()
-        if service.now - lived > _STEPS:
-            lived = service.now
-            signal.setitimer(signal.ITIMER_REAL, _HUNG)  # SIGALRM is not handled: it ends
+    try:
+        while not service.over:
+            service.step()
+            if service.now - lived > _STEPS:
+                lived = service.now
+                signal.setitimer(signal.ITIMER_REAL, _HUNG)  # SIGALRM is not handled: it ends
+    except StartAnew as reason:
+        end.send(link.NOTICE + str(reason).encode())
+        return link.ANEW
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     service.close()
     return 0

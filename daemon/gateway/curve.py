@@ -20,7 +20,7 @@ from zmq.auth.thread import ThreadAuthenticator
 
 from daemon.gateway.config import Config
 from daemon.gateway.requests import Pace
-from daemon.gateway.service import Service
+from daemon.gateway.service import Service, StartAnew
 from daemon.keys import DOMAIN, KeyFileError, ServerKeys, load_server
 from daemon.sockets import IpcFile, bind_error
 
@@ -35,10 +35,6 @@ _PURGE_LONGEST = 0.25  # … and while there are any
 _LOOK = 0.5  # s between looks at the folder of keys
 _LINGER = 200  # ms for last words
 _SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
-
-
-class Revoked(Exception):
-    """A client's key was taken away: all connections are to end."""
 
 
 class Keys(ThreadAuthenticator):
@@ -61,17 +57,17 @@ class Keys(ThreadAuthenticator):
         return self.server.clients.get(zmq.utils.z85.encode(client_public_key), "")
 
     def look(self, now: float) -> None:
-        """Let in who was added to the folder. Raises Revoked when somebody was taken away."""
+        """Let in who was added to the folder. Raises StartAnew when somebody was taken away."""
         if now < self._at:
             return
         self._at = now + _LOOK
         try:
             found = load_server(self._folder)
         except KeyFileError as error:
-            raise Revoked(str(error)) from None
+            raise StartAnew(str(error)) from None
         gone = [name for key, name in self.server.clients.items() if key not in found.clients]
         if gone or found.secret != self.server.secret:
-            raise Revoked(f"keys were taken away: {', '.join(gone) or 'the daemon'}")
+            raise StartAnew(f"access.keys: shut out: {', '.join(gone) or 'all clients'}")
         self.server = found
 
 

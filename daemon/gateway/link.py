@@ -27,12 +27,15 @@ FAILED = b"!"  # why they are not
 BEGUN = b"B"  # epoch that all connections are in, or will be once they have been read
 WANTED = b"W"  # topics that somebody subscribes to as bits, refused requests
 ASK = b"C"  # epoch, number, request
+NOTICE = b"N"  # what is to be told of the gateway
 STOP = b"S"  # likewise; a stop, which goes before all else
 
 NUMBER = struct.Struct("<I")
 EPOCHS = struct.Struct("<Q")
 WANTS = struct.Struct("<IQ")
 ASKED = struct.Struct("<QI")
+
+ANEW = 3  # status of a gateway that is to be started again, and has said why
 
 LARGEST = 65_536  # bytes of a packet
 _PIECE = 60_000
@@ -150,6 +153,8 @@ class Link:
             self.asked.append(Ask(kind == STOP, epoch, number, packet[1 + ASKED.size :]))
         elif kind == BEGUN:
             (self.begun,) = EPOCHS.unpack_from(packet, 1)
+        elif kind == NOTICE:
+            self.notices.append(packet[1:].decode())
         elif kind == WANTED:
             self.wanted, self.refused = WANTS.unpack_from(packet, 1)
 

@@ -56,6 +56,10 @@ class StreamDoor(AnyDoor, Protocol):
         """One message to all who want its topic."""
 
 
+class StartAnew(Exception):
+    """All connections are to end, and clients to come in again. The message says why."""
+
+
 class Kept:
     """What late subscribers are told: the settings and the latest events, marked as told again."""
 

@@ -18,6 +18,7 @@ from daemon.sockets import AddressError
 
 _ROOT = Path(__file__).parents[2]  # where the package is found
 _PATIENCE = 20.0  # s for a gateway to bind its sockets
+_LASTED = 10.0  # s after which a death counts as the first
 _AGAIN = 0.1, 2.0  # s between a death and the next start, at first and after many
 
 
@@ -87,15 +88,21 @@ class Gateway:
             status = self._process.wait()
             if self._closing.is_set():
                 return
-            self.link.notices.append(f"the process that serves clients ended ({_cause(status)})")
-            if time.monotonic() - began > 10.0:
+            if status != link.ANEW:
+                self.link.notices.append(
+                    f"the process that serves clients ended ({_cause(status)})"
+                )
+            if time.monotonic() - began > _LASTED:
                 wait = _AGAIN[0]
+            told = ""
             while not self._closing.wait(wait):
                 wait = min(2.0 * wait, longest)
                 try:
                     self._process = self._start()
                 except (AddressError, OSError) as error:
-                    self.link.notices.append(f"clients can't be served: {error}")
+                    if str(error) != told:
+                        told = str(error)
+                        self.link.notices.append(f"clients can't be served: {told}")
                 else:
                     break
 

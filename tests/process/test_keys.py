@@ -251,7 +251,7 @@ def test_a_running_daemon_with_keys(
     profile: Callable[..., Path], addresses: tuple[str, str], folder: Path
 ) -> None:
     """Tools with the key work, tools without get no answer; the monitor beside it is let in."""
-    path = profile(f'access.keys = "{folder}"\n')
+    path = profile(f'access.keys = "{folder}"\nsafety.overruns_fault = 100000\n')
     running = Running("--config", str(path))
     try:
         base = [*SOFTFINGER, "send", "status", "--address", addresses[1]]
@@ -289,7 +289,9 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
     folder: Path,
     start: Callable[..., Running],
 ) -> None:
-    running = start("--config", str(profile(f'access.keys = "{folder}"\n')))
+    running = start(
+        "--config", str(profile(f'access.keys = "{folder}"\nsafety.overruns_fault = 100000\n'))
+    )
     with Hand(*addresses, keys=folder / "alice") as alice:
         assert alice.state().mode == "disarmed"
         (folder / "server" / "clients" / "alice.key").unlink()
@@ -302,6 +304,8 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
             return False
 
         until(shut_out)
+        with Hand(*addresses, keys=folder) as local, local.events(timeout=20.0) as told:
+            assert any("shut out: alice" in event.text for event in told)
         with pytest.raises(NoAnswer):
             send(addresses[1], {"command": "arm"}, 0.5, load_client(folder / "alice"))
     make_keys(folder, ["bob"])
