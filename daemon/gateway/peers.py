@@ -21,8 +21,7 @@ from daemon.sockets import Listener
 
 _HANDSHAKE = 2.0  # s in which a peer has to have shown what it is
 _ACCEPTED = 32  # connections at a look
-_READ = 2048  # bytes of one peer at a look
-_READ_BEHIND = 512  # and of one that floods
+_READ = 512  # bytes of one peer at a look
 _REST = 0.05  # s in which one that floods is not read
 _REST_EACH = 5e-4  # s, and longer by this for each other one
 _REPLIES = 256 * 1024  # bytes of replies that a client leaves unread
@@ -55,9 +54,8 @@ class Peer:
 
     def read(self, now: float) -> None:
         """Take in some of what came."""
-        size = self._amount()
         try:
-            data = self.socket.recv(size)
+            data = self.socket.recv(_READ)
         except BlockingIOError:
             return
         except OSError:
@@ -78,11 +76,8 @@ class Peer:
         except Broken:
             self._door.hang_up(self)
             return
-        if len(data) < size:
+        if len(data) < _READ:
             self._emptied()
-
-    def _amount(self) -> int:
-        return _READ
 
     def _command(self, body: bytes) -> None:
         if not self.ready:
@@ -180,9 +175,9 @@ class Commander(Peer):
         self._parts: list[bytes] = []
         super().__init__(door, connection, limit, epoch)
 
-    def _amount(self) -> int:
+    def read(self, now: float) -> None:
         self.pace.begin_read()
-        return _READ_BEHIND if self.pace.behind else _READ
+        super().read(now)
 
     def _part(self, body: bytes, more: bool, now: float) -> None:
         self._parts.append(body)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import select
+import time
+from collections import deque
 from collections.abc import Callable
 
-_READY = 64  # descriptors served at a step
+_READY = 64  # descriptors asked for at once
 
 
 class Poll:
@@ -14,6 +16,7 @@ class Poll:
     def __init__(self) -> None:
         self._epoll = select.epoll()
         self._calls: dict[int, Callable[[int], None]] = {}
+        self._due: deque[tuple[int, int, Callable[[int], None]]] = deque()
 
     def watch(self, fd: int, events: int, call: Callable[[int], None]) -> None:
         """Call ``call`` with what happened, whenever something does."""
@@ -29,12 +32,18 @@ class Poll:
         del self._calls[fd]
         self._epoll.unregister(fd)
 
-    def step(self, seconds: float) -> None:
-        """Wait so long at most, and call."""
-        for fd, events in self._epoll.poll(seconds, _READY):
-            call = self._calls.get(fd)
-            if call is not None:  # else it was hung up on at this step
+    def step(self, seconds: float, most: float) -> None:
+        """Wait for ``seconds`` at most, and call for ``most`` s; the rest is called next time."""
+        if not self._due:
+            for fd, events in self._epoll.poll(seconds, _READY):
+                self._due.append((fd, events, self._calls[fd]))
+        until = time.monotonic() + most
+        while self._due:
+            fd, events, call = self._due.popleft()
+            if self._calls.get(fd) is call:  # else it was hung up on meanwhile
                 call(events)
+            if time.monotonic() > until:
+                return
 
     def close(self) -> None:
         """Forget all."""

@@ -24,11 +24,11 @@ _UNDER_WAY = 4  # requests that the loop has and hasn't answered; a stop goes be
 _WAITING_EACH = 64  # requests of one client that wait here …
 _WAITING = 2048  # … and of all, beyond one of each
 _ALL = 2000.0  # requests a second of all clients together …
-_FEWEST = 4.0  # … but each may send so many
+_FEWEST = 2.0  # … but each may send so many
 _OLDEST = 1.0  # s after which a request that waits is too old to act upon
 _LOST = 2.0  # s after which an answer of the loop is given up
 _NUMBERS = 1 << 30  # that requests are told apart by
-_REFUSALS = 2  # that are answered at one read from a client that floods
+_REFUSALS = 1  # that are answered at one read from a client that floods
 _FULL = "too many commands wait already"
 _OLD = "waited too long for its turn; send it again"
 

@@ -21,7 +21,8 @@ from daemon.sockets import Listener
 _TEND = 0.01  # s between looks at what is due by the time
 _PACKETS = 64  # packets of the loop taken in at a look
 _STACK = 1000  # of them that wait to be sent; the oldest are dropped
-_PUBLISHING = 0.004  # s of sending before clients are looked at again
+_PUBLISHING = 0.004  # s of sending before clients are looked at again, …
+_SERVING = 0.004  # … and of looking at clients before the loop is heard again
 _LATEST = 50  # events that a late subscriber is told
 _LARGEST = 64 << 20  # bytes of a message that comes in pieces
 _LAST_WORDS = 0.2  # s for subscribers to take what waits when the loop has ended
@@ -127,7 +128,8 @@ class Service:
     def step(self, seconds: float = _TEND) -> None:
         """Wait for the loop or a client for so long at most, and serve them."""
         self._set_time()
-        self.poll.step(0.0 if self._stack else seconds)
+        self.poll.step(0.0 if self._stack else seconds, _SERVING)
+        self._hear()
         self._publish_some()
         now = self._set_time()
         if now >= self._tend_at:
@@ -221,7 +223,7 @@ class Service:
         while self._stack and time.monotonic() < deadline:
             self._publish_some()
         while self._stream is not None and self._stream.backlog and time.monotonic() < deadline:
-            self.poll.step(0.01)
+            self.poll.step(0.01, _SERVING)
         for door in self._doors:
             door.close()
         self.poll.close()
