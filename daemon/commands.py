@@ -32,6 +32,9 @@ class Refused(Exception):
 class Local(Protocol):
     """Where a stop comes from past the gateway: `daemon.local_stop.LocalStop`."""
 
+    def fileno(self) -> int:
+        """The descriptor at which it comes."""
+
     def take(self) -> bool:
         """Whether a stop has come."""
 
@@ -47,6 +50,8 @@ class CommandServer:
         self._local = local
         self._stopped: bytes | None = None  # the local answer, until what comes next is heard
         self._answer_by = 0.0
+        if local is not None:
+            link.watch(local.fileno())
 
     @property
     def refused_by_pace(self) -> int:
@@ -65,7 +70,7 @@ class CommandServer:
         """
         link = self._link
         link.look()
-        if self._local is not None:
+        if self._local is not None and (link.called or self._stopped is not None):
             self._serve_local(self._local, handler)
         if not link.asked:
             return
@@ -85,6 +90,7 @@ class CommandServer:
         self._link.begin_epoch()
 
     def _serve_local(self, local: Local, handler: Handler) -> None:
+        self._link.called = False
         if local.take():
             self._link.begin_epoch()
             self._stopped = msgpack.packb({"ok": True, **handler({"command": "stop"})})

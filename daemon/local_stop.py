@@ -7,10 +7,8 @@ folder that only the daemon's user may enter; `daemon.command_client` takes it w
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import hashlib
 import os
-import select
 import socket
 import stat
 import tempfile
@@ -21,7 +19,6 @@ from typing import Any
 
 import msgpack
 
-from daemon.gateway.link import PollFd, poll
 from daemon.sockets import AddressError
 
 _HERE = ("127.0.0.1", "localhost", "[::1]", "*", "0.0.0.0", "[::]")
@@ -52,20 +49,23 @@ class LocalStop:
                 f"{error.strerror or error}"
             ) from None
         self._askers: deque[Any] = deque(maxlen=_ASKERS)
-        self._polled: Any = ctypes.byref(PollFd(self._socket.fileno(), select.POLLIN, 0))
 
     def take(self) -> bool:
-        """Whether a stop has come. Half a microsecond when none has."""
-        if not poll(self._polled, 1, 0):
-            return False
+        """Whether a stop has come."""
+        came = False
         for _ in range(_A_TICK):
             try:
                 _, asker = self._socket.recvfrom(_LONGEST)
-            except OSError:
+            except OSError:  # nothing more
                 break
+            came = True
             if asker:
                 self._askers.append(asker)
-        return True
+        return came
+
+    def fileno(self) -> int:
+        """The descriptor at which it comes."""
+        return self._socket.fileno()
 
     def answer(self, reply: bytes) -> None:
         """Answer all who asked."""

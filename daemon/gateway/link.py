@@ -42,6 +42,7 @@ _PIECE = 60_000
 _ROOM = 1 << 20  # bytes that may be on the way; the kernel may allow less
 _LOOK = 16  # packets taken in at a tick
 _OWED = 64  # replies and epochs that wait for room
+_OURS, _OTHER = 0, 1  # of the descriptors that are looked at
 _NOTICES = 20
 _KEPT = 50  # events that a gateway is given anew
 
@@ -109,11 +110,17 @@ class Link:
         self._offered: socket.socket | None = None
         self._owed: deque[bytes] = deque(maxlen=_OWED)
         self._kept: deque[bytes] = deque(maxlen=_KEPT)
-        self._polled: Any = None
+        self.called = False  # until whoever takes it says otherwise
+        self._polled = (PollFd * 2)(PollFd(-1, select.POLLIN, 0), PollFd(-1, select.POLLIN, 0))
+        self._asked_of: Any = ctypes.byref(self._polled)
 
     def offer(self, end: socket.socket) -> None:
         """Speak over this from the next look on. From any thread."""
         self._offered = end
+
+    def watch(self, descriptor: int) -> None:
+        """Look at another descriptor, too: `called` tells that something waits there."""
+        self._polled[_OTHER].fd = descriptor
 
     def look(self) -> None:
         """Take in what the gateway says. Less than a microsecond when that is nothing."""
@@ -121,7 +128,10 @@ class Link:
             self._adopt()
         if self._owed:
             self._pay()
-        if self._socket is None or not poll(self._polled, 1, 0):
+        if not poll(self._asked_of, 2, 0):
+            return
+        self.called = self._polled[_OTHER].revents != 0
+        if self._socket is None or not self._polled[_OURS].revents:
             return
         for _ in range(_LOOK):
             try:
@@ -163,7 +173,7 @@ class Link:
         self._hang_up()
         self._socket, self._offered = self._offered, None
         assert self._socket is not None
-        self._polled = ctypes.byref(PollFd(self._socket.fileno(), select.POLLIN, 0))
+        self._polled[_OURS].fd = self._socket.fileno()
         for packet in self._kept:
             self._send(packet)
         self.begin_epoch()
@@ -172,6 +182,7 @@ class Link:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+            self._polled[_OURS].fd = -1
         self.wanted = 0
         self.asked.clear()
         self._owed.clear()
