@@ -1,6 +1,6 @@
 """From settings to a running daemon: builds, connects and warms up everything, in the safe order.
 
-Sockets are bound first, so that a second daemon ends before it has touched any hardware. Kernels
+Sockets are bound before any hardware is touched, so that a second daemon ends without. Kernels
 are compiled and warm before the loop exists, and so before torque can be on.
 """
 
@@ -79,6 +79,8 @@ class Daemon:
         self.prediction: Prediction | None = None
         if perceptions and self.servos is not None:
             self.prediction = Prediction(settings, self.tables)
+        if self.gateway is not None:
+            self.gateway.wait()  # a second daemon touches no hardware
         if self.servos is not None:
             self._connect(self.servos)
         for perception in perceptions:

@@ -15,7 +15,7 @@ from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
 
 _log = logging.getLogger(__name__)
 
-_LOCALLY = 0.5  # s for a daemon to answer past all other clients
+LOCALLY = 0.5  # s for a daemon to answer past all other clients
 
 
 class NoAnswer(Exception):
@@ -31,7 +31,7 @@ def send(
     A ``stop`` to a daemon of this user on this machine goes past all other clients.
     """
     if request.get("command") == "stop":
-        stopped = stop_locally(address, min(timeout, _LOCALLY))
+        stopped = stop_locally(address, min(timeout, LOCALLY))
         if stopped is not None:
             return stopped
     context: zmq.Context[Any] = zmq.Context()

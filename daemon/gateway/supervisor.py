@@ -26,20 +26,26 @@ class Gateway:
     """A gateway that runs until it is closed. `link` is the loop's way to it."""
 
     def __init__(self, config: Config) -> None:
-        """Raises AddressError when the sockets can't be bound."""
+        """It starts beside whatever is done until `wait`."""
         self.link = link.Link()
         self._config = config
         self._closing = threading.Event()
-        self._process = self._start()
+        self._thread: threading.Thread | None = None
+        self._process, self._end = self._start()
+
+    def wait(self) -> Gateway:
+        """Be ready. Raises AddressError when the sockets can't be bound."""
+        self._meet()
         self._thread = threading.Thread(target=self._watch, name="gateway", daemon=True)
         self._thread.start()
+        return self
 
     @property
     def process(self) -> int:
         """The process's number."""
         return self._process.pid
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
         ours, theirs = link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
@@ -56,18 +62,11 @@ class Gateway:
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
-        try:
-            self._meet(ours)
-        except AddressError:
-            ours.close()
-            process.kill()
-            process.wait()
-            raise
-        self.link.offer(ours)
-        return process
+        return process, ours
 
-    def _meet(self, ours: socket.socket) -> None:
+    def _meet(self) -> None:
         """Wait until its sockets are bound, and give it what lasts. Raises AddressError."""
+        ours = self._end
         said = b""
         if select.select([ours], [], [], _PATIENCE)[0]:
             with contextlib.suppress(OSError):
@@ -80,6 +79,7 @@ class Gateway:
             link.send_all(ours, self.link.lasting)
         except OSError as error:
             raise AddressError(f"the process that serves clients: {error}") from None
+        self.link.offer(ours)
 
     def _watch(self) -> None:
         wait, longest = _AGAIN
@@ -98,23 +98,32 @@ class Gateway:
             while not self._closing.wait(wait):
                 wait = min(2.0 * wait, longest)
                 try:
-                    self._process = self._start()
+                    self._process, self._end = self._start()
+                    self._meet()
                 except (AddressError, OSError) as error:
+                    self._end.close()
+                    self._process.kill()
+                    self._process.wait()
                     if str(error) != told:
                         told = str(error)
                         self.link.notices.append(f"clients can't be served: {told}")
                 else:
                     break
+            if self._closing.is_set():  # while it was started
+                self._end.close()
 
     def close(self) -> None:
         """Hang up, and wait until all has been sent."""
         self._closing.set()
         self.link.close()
+        self._end.close()
         try:
             self._process.wait(2.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
-        self._thread.join(2.0)
+            self._process.wait()
+        if self._thread is not None:
+            self._thread.join(2.0)
 
 
 def _cause(status: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,6 +26,7 @@ class Script:
         self._due = due
         self._tick = 0
         self.refused = 0
+        self.notices: deque[str] = deque()
 
     def serve(self, handler: Handler) -> None:
         self._tick += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import stat
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from daemon.assembly import Daemon
-from daemon.client import Hand
+from daemon.client import AsyncHand, Hand
 from daemon.command_client import NoAnswer, send
 from daemon.gateway.config import Config
 from daemon.gateway.supervisor import Gateway
@@ -99,7 +100,7 @@ def test_the_gateway_leaves_with_its_daemon(
 
 
 def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
-    gateway = Gateway(Config(*addresses, TOPICS, 100))
+    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
     try:
         first = gateway.process
         os.kill(first, signal.SIGALRM)  # as its own alarm does, which it puts off while it works
@@ -110,7 +111,7 @@ def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
 
 
 def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, str]) -> None:
-    gateway = Gateway(Config(*addresses, TOPICS, 100))
+    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
     try:
         limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
         (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
@@ -123,7 +124,7 @@ def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, 
 def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(
     addresses: tuple[str, str],
 ) -> None:
-    gateway = Gateway(Config(*addresses, TOPICS, 100))
+    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
     try:
         publisher = Publisher(gateway.link)
         gateway.link.look()
@@ -157,6 +158,12 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=10.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
+
+            async def stop() -> bool:
+                async with AsyncHand(*addresses) as other:
+                    return bool(await other.command("stop"))
+
+            assert asyncio.run(stop())
             with pytest.raises(NoAnswer):
                 send(addresses[1], {"command": "status"}, timeout=0.2)
         finally:

@@ -261,7 +261,7 @@ def stuck_subscriber(fill: int = _FILL, more: int = _MORE) -> Kept:
     """The gateway's memory while one subscriber never reads: bounded by its queue."""
     with tempfile.TemporaryDirectory() as folder:
         address = f"ipc://{folder}/stream"
-        gateway = Gateway(Config(address, "", TOPICS, Settings().stream.queue))
+        gateway = Gateway(Config(address, "", TOPICS, Settings().stream.queue)).wait()
         publisher = Publisher(gateway.link)
         try:
             with _running([[sys.executable, "-c", _STUCK, address]]):

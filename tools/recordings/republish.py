@@ -29,11 +29,12 @@ class Wire:
         if fault:
             raise RecordingError(f"--address: {fault}")
         folder = "" if keys is None else str(keys)
+        config = Config(address, "", TOPICS, _QUEUE, keys=folder, stream_key="--address")
+        self._gateway = Gateway(config)
         try:
-            self._gateway = Gateway(
-                Config(address, "", TOPICS, _QUEUE, keys=folder, stream_key="--address")
-            )
+            self._gateway.wait()
         except AddressError as error:
+            self._gateway.close()
             raise RecordingError(str(error)) from None
         self._link = self._gateway.link
         self._link.begin_epoch()
