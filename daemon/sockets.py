@@ -7,11 +7,13 @@ import errno
 import fcntl
 import os
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+_INFO = struct.Struct("=24xI")  # struct tcp_info, of a listener: connections that wait
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _BACKLOG = 1024  # connections that wait to be accepted; the system may allow less
 
@@ -89,6 +91,13 @@ class Listener:
     def accept(self) -> tuple[socket.socket, Any]:
         """As `socket.socket.accept`."""
         return self._socket.accept()
+
+    def waiting(self) -> int:
+        """How many connections wait to be accepted, at most."""
+        if self._socket.family == socket.AF_UNIX:
+            return _BACKLOG
+        known = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO.size)
+        return int(_INFO.unpack(known)[0])
 
     def close(self) -> None:
         """Give the address back."""

@@ -278,6 +278,7 @@ class Door:
         self._peers: dict[int, Peer] = {}  # by descriptor; those first that were silent longest
         self._shaking: dict[Peer, float] = {}  # until when, in the order they came
         self._resting: deque[tuple[float, Peer]] = deque()
+        self._older = 0  # that wait to be accepted, and came before the present epoch
         self.begun = 0  # the epoch of who comes in from now on; none from before waits any more
         self.epoch = 0
         self.now = 0.0
@@ -290,16 +291,25 @@ class Door:
         """Who leaves so that another may come; None: nobody."""
         return next(iter(self._shaking), None)
 
+    def _begin(self) -> None:
+        self._older = 0
+        self.begun = self.epoch
+
     def accept(self) -> None:
         """Take in connections that wait."""
         for _ in range(_ACCEPTED):
             try:
                 connection, _ = self._listener.accept()
             except BlockingIOError:
-                self.begun = self.epoch
+                self._begin()
                 return
             except OSError:  # it has gone already, or the system has no descriptor left
                 return
+            epoch = self.begun
+            if self._older:
+                self._older -= 1
+                if not self._older:
+                    self._begin()
             if len(self._peers) >= self._places:
                 leaving = self._goes()
                 if leaving is None:
@@ -309,7 +319,7 @@ class Door:
             connection.setblocking(False)
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            peer = self._make(connection, self.begun)
+            peer = self._make(connection, epoch)
             if peer.alive:
                 self._peers[peer.fd] = peer
                 self._shaking[peer] = self.now + _HANDSHAKE
@@ -360,6 +370,9 @@ class Door:
     def begin_epoch(self, epoch: int) -> None:
         """Who has nothing waiting is in it; the others once all of that has been read."""
         self.epoch = epoch
+        self._older = self._listener.waiting()
+        if not self._older:
+            self._begin()
         self.accept()
         for peer in list(self._peers.values()):
             peer.freshen()

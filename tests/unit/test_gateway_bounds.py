@@ -177,6 +177,29 @@ def test_answers_that_are_not_read_end_the_connection(addresses: tuple[str, str]
         until(gone)
 
 
+def test_who_comes_after_a_stop_is_heard_while_others_still_wait_to_be_let_in(
+    addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A flood of connections never lets the queue of them be seen empty."""
+    monkeypatch.setattr("daemon.gateway.peers._ACCEPTED", 1)
+    with Served(commands=addresses[1]) as served:
+        before = [RawClient(addresses[1], b"DEALER") for _ in range(3)]
+        for client in before:
+            client.ask(command="arm")
+        served.server.begin_epoch()
+        served.service.step(0.0)  # the gateway hears of it while some of them wait
+        client, *_ = after = [RawClient(addresses[1], b"DEALER") for _ in range(40)]
+        client.ask(command="status")
+        heard: list[dict[str, Any]] = []
+        until(lambda: served.serve(echo) or heard.extend(client.replies()) or heard)
+        assert heard[0]["ok"], "it came after the stop"
+        refused: list[dict[str, Any]] = []
+        for each in before:
+            until(lambda each=each: served.serve(echo) or refused.extend(each.replies()) or refused)
+            assert not refused.pop()["ok"], "it came before"
+        assert len(after) == 40
+
+
 @given(st.lists(st.binary(max_size=40), max_size=8), st.integers(1, 30))
 def test_a_message_arrives_whole_however_it_is_cut(parts: list[bytes], cut: int) -> None:
     wire = GREETING + b"".join(frame(part, more=True) for part in parts) + frame(b"x" * 300)
