@@ -93,7 +93,7 @@ class CommandServer:
         self._link.called = False
         if local.take():
             self._link.begin_epoch()
-            self._stopped = msgpack.packb({"ok": True, **handler({"command": "stop"})})
+            self._stopped = _carry_out({"command": "stop"}, handler)
             self._answer_by = time.monotonic() + _BEGUN_WITHIN
         if self._stopped is not None and (
             self._link.begun == self._link.epoch or time.monotonic() > self._answer_by
@@ -102,11 +102,16 @@ class CommandServer:
             self._stopped = None
 
     def _answer(self, ask: Ask, handler: Handler) -> None:
-        try:
-            reply = msgpack.packb({"ok": True, **handler(msgpack.unpackb(ask.packed))})
-        except Refused as refusal:
-            reply = _refusal(str(refusal))
-        self._link.reply(ask.number, reply)
+        self._link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
+
+
+def _carry_out(request: dict[str, Any], handler: Handler) -> bytes:
+    """The packed reply."""
+    try:
+        reply: bytes = msgpack.packb({"ok": True, **handler(request)})
+    except Refused as refusal:
+        return _refusal(str(refusal))
+    return reply
 
 
 def _refusal(error: str) -> bytes:
