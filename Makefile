@@ -1,12 +1,17 @@
-# make run: the simulated hand with its live page.  make test: the tests.
+# make run: the simulated hand with its live page.  make test: the tests, on every processor.
+# make test ARGS=tests/unit: some of them, or options of pytest; ARGS=-n0: in one process.
 # Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
+WORKERS := $(shell expr $$(nproc) + 1) # one waits for something while the others compute
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
+
+# Byte code is kept whatever the environment says: a test run starts hundreds of processes.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: run test lint format clean
 
@@ -16,7 +21,7 @@ run: $(TO_RUN)
 
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(ARGS)
 
 lint: $(TO_TEST)
 	$(BIN)/ruff check .

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import ipaddress
 import os
 import socket
 import stat
@@ -21,7 +22,7 @@ import msgpack
 
 from daemon.sockets import AddressError
 
-_HERE = ("127.0.0.1", "localhost", "[::1]", "*", "0.0.0.0", "[::]")
+_ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
 _LONGEST = 4096  # bytes
 _ASKERS = 16  # who wait for the answer
 _A_TICK = 4  # taken at one; the system keeps few more
@@ -112,9 +113,10 @@ def _name(address: str) -> str:
     if kind == "ipc":
         return f"stop-{hashlib.sha256(os.path.realpath(place).encode()).hexdigest()[:16]}"
     host, _, port = place.rpartition(":")
-    if host not in _HERE:
+    host = "127.0.0.1" if host in _ANY else host.strip("[]")
+    if not ipaddress.ip_address(host).is_loopback:
         raise ValueError(f"{address} is not of this machine")
-    return f"stop-{port}"
+    return f"stop-{host}-{port}"
 
 
 def _folders() -> Iterator[Path]:

@@ -182,10 +182,10 @@ class Safety:
                     return False
                 if contact.contact:
                     d = contact.d
-                    # asin(x) ≥ x, so that this is inside near·(asin(1 − d/a) − margin)
+                    # asin(x) ≥ x for x ≤ 1, so that this is inside near·(asin(1 − d/a) − margin)
                     if not (
                         contact.force <= self._force
-                        and d <= self._d
+                        and 0.0 <= d <= self._d
                         and abs(contact.theta) <= near - slope * d - margin
                         and contact.inside
                     ):

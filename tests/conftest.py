@@ -1,21 +1,61 @@
-"""What several tests share: free addresses, whole daemons, and conditions to wait for."""
+"""What several tests share: addresses of their own, whole daemons, and conditions to wait for.
+
+Each test process has its own loopback addresses and folders, so that several run beside each
+other; whatever a test started, in this process or below it, ends with the test.
+"""
 
 from __future__ import annotations
 
+import itertools
+import os
 import select
-import socket
+import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 import zmq
 
 from daemon.assembly import Daemon
 from daemon.settings import Settings
+from tests.harness import descendants
 from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
+
+# The same examples on every machine, however slow; --hypothesis-profile=search looks for others.
+hypothesis.settings.register_profile("same", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("search", deadline=None)
+hypothesis.settings.load_profile("same")
+
+pytest_plugins = ["pytester"]  # for the test of this file
+
+_PORTS = itertools.count(9872)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+
+
+def pytest_configure() -> None:
+    """End as on Ctrl-C when asked to; orphans of what tests started come to this process."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    descendants.adopt_orphans()
+
+
+def pytest_unconfigure() -> None:
+    """A test process that crashed leaves what it started to the one that started it."""
+    descendants.end(descendants.running())
+
+
+@pytest.fixture(autouse=True)
+def ended_with_the_test() -> Iterator[None]:
+    """Ends the processes that a test started and left, and gives Ctrl-C back to pytest."""
+    before = descendants.running()
+    handlers = {each: signal.getsignal(each) for each in _SIGNALS}
+    yield
+    for each, handler in handlers.items():
+        signal.signal(each, handler)
+    descendants.end(descendants.running() - before)
 
 
 @pytest.fixture
@@ -26,18 +66,25 @@ def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
     context.destroy(linger=0)
 
 
+def own_addresses() -> tuple[str, str]:
+    """Two TCP addresses that nobody else has: stream and commands.
+
+    This process has a loopback host to itself, by its number, and takes new ports there each time.
+    """
+    number = os.getpid()
+    host = f"127.{64 + (number >> 16)}.{number >> 8 & 255}.{number & 255}"
+    return f"tcp://{host}:{next(_PORTS)}", f"tcp://{host}:{next(_PORTS)}"
+
+
 @pytest.fixture
 def addresses() -> tuple[str, str]:
-    """Two free TCP addresses on the loopback: stream and commands."""
-    with socket.socket() as first, socket.socket() as second:
-        for each in (first, second):
-            each.bind(("127.0.0.1", 0))
-        return tuple(f"tcp://127.0.0.1:{each.getsockname()[1]}" for each in (first, second))
+    """Two TCP addresses that are this test's alone."""
+    return own_addresses()
 
 
 @pytest.fixture
 def profile(tmp_path: Path, addresses: tuple[str, str]) -> Callable[[str], Path]:
-    """Writes a profile on free addresses, with ``text`` added to it."""
+    """Writes a profile on the test's addresses, with ``text`` added to it."""
 
     def write(text: str = "", name: str = "profile.toml") -> Path:
         path = tmp_path / name
@@ -53,6 +100,7 @@ def profile(tmp_path: Path, addresses: tuple[str, str]) -> Callable[[str], Path]
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., Running]]:
+    """Starts daemons that are killed when the test ends before them."""
     started: list[Running] = []
 
     def run(*words: str) -> Running:
@@ -61,15 +109,11 @@ def start() -> Iterator[Callable[..., Running]]:
 
     yield run
     for each in started:
-        if each.process.poll() is None:
-            each.process.kill()
-        each.process.wait()
-        assert each.process.stderr is not None
-        each.process.stderr.close()
+        each.kill()
 
 
-def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    """Call ``condition`` until it holds; fail when it does not in time."""
+def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    """Call ``condition`` until it holds; the time allowed only bounds a hang."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:

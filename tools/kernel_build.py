@@ -23,7 +23,7 @@ from tools.progress import Progress
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).resolve().parent.parent
-_MEMORY = 600e6  # bytes that a process needs at most
+_MEMORY = 400e6  # bytes that a process needs at most
 _LOOK = 0.2  # s between two looks at the time
 
 
@@ -48,14 +48,13 @@ def print_event(_level: str, _kind: str, text: str) -> None:
 
 
 def build_kernels(
-    settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, jobs: int | None = None
+    settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
 ) -> Built:
     """Build what is missing of ``wanted``, all parts of the scene by default.
 
-    Silent and quick when nothing is. A bar goes to a terminal's standard error, events to ``tell``
-    as (level, kind, text). ``jobs`` is the number of processes, at most one a core and a part by
-    default. What can't be built is told; whoever needs it then meets the reason. Nothing is left
-    running when it is interrupted.
+    Silent and quick when nothing is. A bar goes to standard error if that is a terminal and ``bar``
+    allows it, else ``tell`` hears of each part, as (level, kind, text). What fails is told, too;
+    whoever needs it then meets the reason. Nothing is left running when it is interrupted.
     """
     missing = [part for part in wanted or parts(settings) if not is_built(part)]
     if not missing or kernel_folder() is None:
@@ -63,7 +62,7 @@ def build_kernels(
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels, on the first start only: {names}")
     started = time.monotonic()
-    workers = _Workers(settings, missing, jobs or _jobs(missing), tell)
+    workers = _Workers(settings, missing, tell, bar)
     try:
         workers.work()
     finally:
@@ -76,24 +75,30 @@ def build_kernels(
 def _jobs(missing: list[Part]) -> int:
     """As many processes as there are cores, parts, and memory for."""
     cores = len(os.sched_getaffinity(0))
-    available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return max(1, min(cores, len(missing), int(available / _MEMORY)))
+    return max(1, min(cores, len(missing), int(_available() / _MEMORY)))
+
+
+def _available() -> float:
+    """Memory that may be taken without swapping [bytes]."""
+    _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
+    return 1024.0 * float(rest.split()[0])
 
 
 class _Workers:
     """The processes, what each is at, and what is left."""
 
-    def __init__(self, settings: Settings, missing: list[Part], jobs: int, tell: Tell) -> None:
+    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: bool) -> None:
         self._waiting = list(missing)
         self._total = sum(part.kernels for part in missing)
         self._begun = 0  # kernels
         self._started = time.monotonic()
+        self._bar = Progress("compiling kernels", self._total, bar)
         self._tell = tell
         self.failed = False
         self._workers: dict[int, _Worker] = {}  # by the file that it is read from
         self._selector = selectors.DefaultSelector()
         try:
-            for _ in range(jobs):
+            for _ in range(_jobs(missing)):
                 worker = _Worker(settings)
                 self._workers[worker.output] = worker
                 self._selector.register(worker.output, selectors.EVENT_READ)
@@ -109,7 +114,7 @@ class _Workers:
 
     def work(self) -> None:
         """Hand out parts until all are built, or no process is left to build them."""
-        with Progress("compiling kernels", self._total) as bar:
+        with self._bar as show:
             while self._hand_out():
                 for key, _ in self._selector.select(_LOOK):
                     worker = self._workers[key.fd]
@@ -120,8 +125,13 @@ class _Workers:
                         for line in lines:
                             self._take(worker, line)
                 at = "; ".join(filter(None, (each.at for each in self._workers.values())))
-                took = time.monotonic() - self._started
-                bar(self._begun, f"{self._begun} of about {self._total}, {took:.0f} s: {at}")
+                show(self._begun, f"{self._so_far()}: {at}")
+
+    def _so_far(self) -> str:
+        return (
+            f"{min(self._begun, self._total)} of about {self._total}, "
+            f"{time.monotonic() - self._started:.0f} s"
+        )
 
     def _hand_out(self) -> bool:
         """Give each idle process the next part that need not wait; False when none has one."""
@@ -144,6 +154,8 @@ class _Workers:
         elif word in ("done", "failed") and worker.part is not None:
             if word == "failed":
                 self._fail(worker.part, rest)
+            elif not self._bar.on:
+                self._tell("info", "compile", f"{worker.part.name}: {self._so_far()}")
             worker.part = None
 
     def _lost(self, worker: _Worker) -> None:

@@ -14,15 +14,15 @@ _WIDTH = 20
 class Progress:
     """``with Progress("analyse", total) as progress: progress(done)``; written to stderr."""
 
-    def __init__(self, what: str, total: int) -> None:
+    def __init__(self, what: str, total: int, on: bool = True) -> None:
         self._what = what
         self._total = max(total, 1)
         self._shown = -1.0
-        self._on = sys.stderr.isatty()
+        self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
         """So much of the total is behind; ``note`` says more than the share does."""
-        if not self._on or time.monotonic() - self._shown < _STEP:
+        if not self.on or time.monotonic() - self._shown < _STEP:
             return
         self._shown = time.monotonic()
         share = min(done / self._total, 1.0)
@@ -41,5 +41,5 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._on:
+        if self.on:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)

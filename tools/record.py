@@ -34,7 +34,6 @@ _SILENCE = 2.0  # s without a message until the waiting is told
 # s between two looks at the clock and the socket, where what came since then is waiting: waking for
 # each message would cost more than all that is done with it.
 _LOOK = 0.1
-_QUIET = 0.02  # s without a message after which nothing is on its way any more
 _BACKLOG = 10.0  # s for what waits when the end is asked for
 _SHOW = 0.5  # s between two progress lines
 _BATCH = 1000  # messages between two looks at the clock
@@ -214,7 +213,7 @@ class _Recorder:
             age = time.monotonic() - began
             if behind and age < _BACKLOG:
                 continue
-            if age >= until_quiet or not socket.poll(int(_QUIET * 1e3)):
+            if age >= until_quiet or not socket.poll(int((until_quiet - age) * 1e3)):
                 return
 
     def _take(self, frames: list[bytes]) -> None:

@@ -87,7 +87,7 @@ def _serve(
     from tools.kernel_build import build_kernels, table_cache
 
     log.line("info", "start", f"softfinger: {_scene(settings)}")
-    build_kernels(settings, log.line)
+    build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=table_cache())
     except (SettingsError, AddressError, ServoError, TactileError, ValueError) as error:

@@ -61,16 +61,23 @@ def make_bus(
 
 
 class RunningBus:
-    """A bus on a pty, served by a thread until :meth:`close`."""
+    """A bus on a pty, served by a thread until :meth:`close`; its time is that of ``clock``."""
 
-    def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
+    def __init__(
+        self,
+        bus: ServoBus | None = None,
+        baud: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+        **options: Any,
+    ) -> None:
         if bus is None:
-            now = time.monotonic()
+            now = clock()
             bus = ServoBus.from_settings(
                 Settings(), FreeJoints(2, now), baud=baud, t=now, **options
             )
         self.bus = bus
-        self.port = PtyServoBus(bus, baud=baud)
+        self.port = PtyServoBus(bus, baud=baud, clock=clock)
+        self._clock = clock
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake_read, self._wake_write = os.pipe()
         self._running = True
@@ -100,13 +107,13 @@ class RunningBus:
 
         self._jobs.put(run)
         os.write(self._wake_write, b"!")
-        fine, value = done.get(timeout=10)
+        fine, value = done.get(timeout=60)
         if not fine:
             raise value
         return value
 
     def fault(self, text: str) -> None:
-        self.call(lambda: self.bus.fault(text, time.monotonic()))
+        self.call(lambda: self.bus.fault(text, self._clock()))
 
     def close(self) -> None:
         self._running = False
@@ -118,12 +125,11 @@ class RunningBus:
 
     def _serve(self) -> None:
         while self._running:
-            now = time.monotonic()
-            wait = max(0.0, self.port.next_event() - now)
+            wait = max(0.0, self.port.next_event() - self._clock())
             ports = [self.port] if self.port.fileno() >= 0 else []
             ready, _, _ = select.select([*ports, self._wake_read], [], [], wait)
             if self._wake_read in ready:
                 os.read(self._wake_read, 1)
                 while not self._jobs.empty():
                     self._jobs.get()()
-            self.port.service(time.monotonic())
+            self.port.service(self._clock())

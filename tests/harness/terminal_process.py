@@ -57,7 +57,7 @@ class TerminalProcess:
     def text(self) -> str:
         return "\n".join(self.screen.display)
 
-    def wait(self, condition: Callable[[], Any], seconds: float = 15.0) -> None:
+    def wait(self, condition: Callable[[], Any], seconds: float = 60.0) -> None:
         """Follow the page until ``condition`` holds; fail with the page when it doesn't."""
         deadline = time.monotonic() + seconds
         while not condition():
@@ -65,7 +65,7 @@ class TerminalProcess:
             if time.monotonic() > deadline:
                 raise AssertionError(f"not within {seconds:g} s; the page:\n{self.text()}")
 
-    def shows(self, *texts: str, seconds: float = 15.0) -> None:
+    def shows(self, *texts: str, seconds: float = 60.0) -> None:
         self.wait(lambda: all(text in self.text() for text in texts), seconds)
 
     def type(self, keys: bytes) -> None:

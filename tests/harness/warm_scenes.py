@@ -25,15 +25,21 @@ from daemon.settings import Settings
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SCENES: dict[str, dict[str, Any]] = {
     "two fingers": {},
-    "left finger": {"scene": {"fingers": ("left",)}},
+    "left finger, constant modulus": {
+        "scene": {"fingers": ("left",)},
+        "material": {"law": "constant"},
+    },
     "sensors without servos": {"servos": {"backend": "none"}},
     "servos without sensors": {"tactile": {"backend": "none"}},
-    "constant modulus": {"material": {"law": "constant"}},
-    "moments": {"estimator": {"method": "moments"}},
-    "current mode": {"servos": {"mode": "current"}},
+    "moments, imperfect sensors": {
+        "estimator": {"method": "moments"},
+        "simulation": {"tactile_blur": 5e-4, "tactile_jitter": 0.004},
+    },
+    "current mode, two-phase grip": {
+        "servos": {"mode": "current"},
+        "control": {"law": "two_phase"},
+    },
     "position mode": {"servos": {"mode": "position"}},
-    "imperfect sensors": {"simulation": {"tactile_blur": 5e-4, "tactile_jitter": 0.004}},
-    "two-phase grip": {"control": {"law": "two_phase"}},
     "position grip": {"control": {"law": "position"}},
 }
 SCRIPT: list[tuple[float, dict[str, Any]]] = [

@@ -23,12 +23,9 @@ from tools.cli import main
 BY_NAME = {case.name: case for case in CASES}
 SHORT = (
     "replies corrupted, 10%",
-    "replies late, 100%",
     "one servo rebooted",
     "servos' port gone and back",
     "board's port gone and back",
-    "board zero",
-    "command flood",
     "garbage on the command socket",
     "daemon killed",
 )

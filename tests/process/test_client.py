@@ -34,7 +34,7 @@ from daemon.patience import SILENCE
 from daemon.records import State
 from tests.conftest import until
 from tests.harness import fake_daemon
-from tests.harness.daemon_process import Running
+from tests.harness.daemon_process import Running, insist
 from tests.harness.fake_daemon import FakeDaemon
 
 Start = Callable[..., Running]
@@ -50,7 +50,7 @@ def fake() -> Iterator[FakeDaemon]:
 
 @pytest.fixture
 def hand(fake: FakeDaemon) -> Iterator[Hand]:
-    with Hand(fake.state_address, fake.command_address) as hand:
+    with Hand(fake.state_address, fake.command_address, timeout=60.0) as hand:
         yield hand
 
 
@@ -58,41 +58,41 @@ def test_grasp_turn_and_release_on_a_running_daemon(
     start: Start, profile: Profile, addresses: tuple[str, str]
 ) -> None:
     start("--config", str(profile("")))
-    with Hand(*addresses, client="notebook") as hand:
+    with Hand(*addresses, client="notebook", timeout=60.0) as hand:
         assert hand.state().mode == "disarmed"
         with pytest.raises(Refused, match="grasp: not while disarmed; arm first"):
             hand.grasp(force=5.0)
-        hand.arm()
-        with hand.events(timeout=5.0) as events, hand.frames(timeout=5.0) as frames:
-            hand.grasp(force=5.0)
-            held = hand.wait_for(lambda state: state.mode == "holding")
+        insist(hand.arm)
+        with hand.events(timeout=60.0) as events, hand.frames(timeout=60.0) as frames:
+            insist(lambda: hand.grasp(force=5.0))
+            held = hand.wait_for(lambda state: state.mode == "holding", 60.0)
             assert held.left.contact
             assert held.right.contact
             frame = next(frames)
             assert frame.counts.shape == (44, 44)
             assert frame.pressure().sum() > 0.0
             assert any("grasping" in event.text for event in events)
-        hand.rotate(angle=math.radians(5.0))
-        hand.wait_for(lambda state: abs(state.object.angle - math.radians(5.0)) < 5e-3)
+        insist(lambda: hand.rotate(angle=math.radians(5.0)))
+        hand.wait_for(lambda state: abs(state.object.angle - math.radians(5.0)) < 5e-3, 60.0)
         states = hand.collect(0.3)
         columns = to_columns(states)
         assert np.all(np.diff(columns["seq"]) > 0)
         assert columns["left.force"].mean() == pytest.approx(5.0, rel=0.1)
         assert hand.status()["torque"] is True
         hand.stop()
-        assert hand.wait_for(lambda state: not state.torque).mode == "disarmed"
+        assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
 
 
 def test_the_same_from_asyncio(start: Start, profile: Profile, addresses: tuple[str, str]) -> None:
     start("--config", str(profile("")))
 
     async def session() -> tuple[str, int]:
-        async with AsyncHand(*addresses) as hand:
+        async with AsyncHand(*addresses, timeout=60.0) as hand:
             await hand.command("arm")
             with pytest.raises(Refused, match="expected a number"):
                 await hand.command("grasp", force="much")  # type: ignore[arg-type]
             await hand.command("grasp", force=5.0)
-            held = await hand.wait_for(lambda state: state.mode == "holding")
+            held = await hand.wait_for(lambda state: state.mode == "holding", 60.0)
             seen = 0
             async for frame in hand.frames():
                 seen += frame.counts.size
@@ -215,7 +215,7 @@ def test_another_schema_is_told_once_and_its_known_fields_kept(
 ) -> None:
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
-    with hand.stream(timeout=5.0) as states:
+    with hand.stream(timeout=60.0) as states:
         with pytest.warns(UserWarning, match=r"schema 7, this client knows 1") as told:
             state = [next(states), next(states)][-1]
         assert len(told) == 1
@@ -223,7 +223,7 @@ def test_another_schema_is_told_once_and_its_known_fields_kept(
 
 
 def test_what_cannot_be_read_is_counted_and_passed_over(fake: FakeDaemon, hand: Hand) -> None:
-    with hand.stream(timeout=5.0) as states:
+    with hand.stream(timeout=60.0) as states:
         next(states)
         for payload in (b"\xc1", b"", msgpack.packb([1]), b"\x91" * 5000):
             fake.send(b"hand/state", payload)

@@ -22,9 +22,11 @@ from daemon.records import Frame
 from daemon.settings import TactileSettings
 from daemon.tactile.base import TactileError
 from daemon.tactile.flexitac import MARKER, FlexiTac, FlexiTacDecoder
+from tests.conftest import until
 
 ROWS, COLS = 4, 5
 CELLS = ROWS * COLS
+LATE = 1026 * 10 / 2e6 + 0.005  # s that 32 × 32 cells take on the wire, and the latency
 STRIDE = CELLS + 2
 
 payloads = st.binary(min_size=CELLS, max_size=CELLS)
@@ -158,7 +160,7 @@ def test_a_frame_keeps_the_time_its_last_byte_was_read_and_its_own_array():
     assert np.array_equal(first.data, kept)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     images=st.lists(st.one_of(payloads, nasty), min_size=1, max_size=8),
     start=st.integers(0, STRIDE),
@@ -185,7 +187,7 @@ def test_any_cut_of_a_stream_gives_the_same_frames(images, start, cuts):
         assert newest[-1] == expected[-1]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     images=st.lists(nasty, min_size=2, max_size=6),
     start=st.integers(0, STRIDE),
@@ -200,7 +202,7 @@ def test_no_wrong_frame_whatever_the_images_hold(images, start):
     assert images[-1] in found
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     garbage=st.one_of(st.binary(max_size=200), nasty),
     images=st.lists(payloads, min_size=3, max_size=5),
@@ -216,7 +218,7 @@ def test_garbage_before_a_stream_costs_at_most_its_first_frames(garbage, images)
     balance(decoder, sum(map(len, stream)))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     images=st.lists(nasty, min_size=4, max_size=8),
     torn=st.integers(2, 3),
@@ -240,7 +242,7 @@ def test_a_truncated_frame_is_dropped_and_the_stream_found_again(images, torn, k
         assert decoder.counters()["resyncs"] >= 1
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.one_of(st.binary(max_size=300), nasty), max_size=12))
 def test_random_bytes_never_break_the_decoder(pieces):
     decoder = FlexiTacDecoder(ROWS, COLS)
@@ -315,14 +317,6 @@ def test_another_size_is_recognised_behind_a_standing_image_with_markers_in_it()
 
 
 # --- on a pty, through pyserial -----------------------------------------------------------------
-
-
-def until(condition: Callable[[], bool], timeout: float = 5.0) -> None:
-    """Wait for a condition that another thread brings about."""
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        select.select([], [], [], 0.001)
 
 
 class Board:
@@ -404,8 +398,9 @@ def test_frames_come_through_a_port_with_their_times(board):
     now = newest(tactile)
     assert now is not first
     assert np.array_equal(first.data, kept)
-    assert now.t_arrival - now.t_sample == pytest.approx(1026 * 10 / 2e6 + 0.005)
-    assert 0.0 <= time.monotonic() - now.t_arrival < 1.0
+    # A frame that was read alone; one with others behind it in the same read came earlier.
+    until(lambda: (n := newest(tactile)).t_arrival - n.t_sample == pytest.approx(LATE))
+    assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
     counters = tactile.counters()
     assert counters["frames"] >= 20
@@ -513,16 +508,3 @@ def test_a_port_that_disappears_gives_an_invalid_frame_and_no_crash(board):
     assert tactile.counters()["port_lost"] == 1
     tactile.close()
     assert threading.active_count() == 1
-
-
-def test_the_reader_costs_little():
-    """A hundred frames a second must cost well below 1 % of a core to decode."""
-    decoder = FlexiTacDecoder(32, 32)
-    rng = np.random.default_rng(1)
-    frames = [frame(rng.integers(0, 160, 1024, dtype=np.uint8).tobytes()) for _ in range(1000)]
-    start = time.thread_time()
-    for data in frames:
-        decoder.feed(data, 0.0)
-    spent = time.thread_time() - start
-    assert decoder.counters()["frames"] == 999
-    assert spent / 1000 < 100e-6  # measured 4 µs; 100 µs would be 1 % of a core

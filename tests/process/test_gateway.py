@@ -189,7 +189,7 @@ def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, 
 def test_its_folder_and_file_are_the_users_alone(own_folder: Path) -> None:
     local = LocalStop("tcp://127.0.0.1:9")
     assert stat.S_IMODE(own_folder.stat().st_mode) == 0o700
-    assert stat.S_IMODE((own_folder / "stop-9").stat().st_mode) == 0o600
+    assert stat.S_IMODE((own_folder / "stop-127.0.0.1-9").stat().st_mode) == 0o600
     with pytest.raises(AddressError, match="is another softfinger running"):
         LocalStop("tcp://127.0.0.1:9")
     local.close()
@@ -219,7 +219,8 @@ def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(own_folder: Path) 
 
 def test_a_stop_for_another_machine_stops_nothing_here(own_folder: Path) -> None:
     local = LocalStop("tcp://127.0.0.1:9")
-    assert stop_locally("tcp://hand.example:9", 0.1) is None
+    for address in ("tcp://hand.example:9", "tcp://192.0.2.1:9", "tcp://127.0.0.2:9"):
+        assert stop_locally(address, 0.1) is None
     assert not local.take()
     local.close()
 

@@ -52,7 +52,7 @@ def test_the_usual_board_has_2050_bytes_a_frame():
     assert GloveDecoder().frame_bytes == len(encode_glove(counts(1, 32, 32))) == 2050
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     seeds=st.lists(st.integers(0, 99), min_size=1, max_size=5),
     start=st.integers(0, 25),

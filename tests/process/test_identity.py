@@ -157,9 +157,9 @@ class Bus:
         self.settings = load(self.config, folder)
         self.emulator = Emulator(self.settings, folder, faults=faults, **options)
         ready = threading.Event()
-        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,))
+        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,), daemon=True)
         self._thread.start()
-        assert ready.wait(60.0)
+        assert ready.wait(200)
 
     @property
     def servos(self) -> list[Any]:

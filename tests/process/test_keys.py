@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from daemon.client import Hand, NoStream
 from daemon.command_client import NoAnswer, send
 from daemon.keys import KeyFileError, load_client, load_server, make_keys
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running
+from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
 from tests.harness.gateway import Served
 
 
@@ -248,39 +247,28 @@ def test_what_waits_with_keys_dies_with_a_stop_and_the_stops_own_client_goes_on(
 
 
 def test_a_running_daemon_with_keys(
-    profile: Callable[..., Path], addresses: tuple[str, str], folder: Path
+    start: Callable[..., Running],
+    profile: Callable[..., Path],
+    addresses: tuple[str, str],
+    folder: Path,
 ) -> None:
     """Tools with the key work, tools without get no answer; the monitor beside it is let in."""
-    path = profile(f'access.keys = "{folder}"\nsafety.overruns_fault = 100000\n')
-    running = Running("--config", str(path))
-    try:
-        base = [*SOFTFINGER, "send", "status", "--address", addresses[1]]
-        told = subprocess.run(
-            [*base, "--keys", str(folder)], capture_output=True, text=True, timeout=60, check=False
-        )
-        assert told.returncode == 0, told.stderr
-        with pytest.raises(NoAnswer):
-            send(addresses[1], {"command": "status"}, timeout=0.3)
-        # Who could end the daemon may stop it, too.
-        assert send(addresses[1], {"command": "stop"}, timeout=2.0)["ok"]
-        with Hand(*addresses, keys=folder / "alice") as hand:
-            assert hand.state().mode == "disarmed"
-            hand.arm()
-            assert hand.wait_for(lambda state: state.torque, 5.0).mode == "armed"
-        watched = subprocess.run(
-            [
-                *(*SOFTFINGER, "monitor", "--plain", "--duration", "2", "--no-wait"),
-                *("--keys", str(folder / "alice")),
-                *("--state", addresses[0], "--commands", addresses[1]),
-            ],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        assert "armed" in watched.stdout, watched.stderr
-    finally:
-        assert running.end() == 0, running.lines
+    path = profile(f'access.keys = "{folder}"\n')
+    running = start("--config", str(path))
+    words = ("status", "--address", addresses[1], "--keys", str(folder), "--timeout", "60")
+    told = softfinger("send", *words)
+    assert told.returncode == 0, told.stderr
+    with pytest.raises(NoAnswer):
+        send(addresses[1], {"command": "status"}, timeout=0.3)
+    # Who could end the daemon may stop it, too.
+    assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"]
+    with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
+        assert hand.state().mode == "disarmed"
+        insist(hand.arm)
+        assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
+    where = ("--state", addresses[0], "--commands", addresses[1])
+    until_it_says(("monitor", "--plain", "--keys", folder / "alice", *where), "armed")
+    assert running.end() == 0
 
 
 def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
@@ -323,9 +311,8 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
 
 
 def test_the_command_makes_keys_and_refuses_to_make_them_again(tmp_path: Path) -> None:
-    words = [*SOFTFINGER, "keys", str(tmp_path / "keys"), "alice"]
-    first = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
-    again = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    words = ("keys", str(tmp_path / "keys"), "alice")
+    first, again = softfinger(*words), softfinger(*words)
     assert first.returncode == 0
     assert first.stdout.split() == [
         str(tmp_path / "keys" / name) for name in ("server", "local", "alice")

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import re
+import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from daemon.client import AsyncHand, Hand, NoStream
 from daemon.keys import make_keys
-from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running, softfinger
+from tests.conftest import own_addresses, until
+from tests.harness.daemon_process import SOFTFINGER, Running, insist, softfinger, until_it_says
 from tools.recordings.errors import RecordingError
 from tools.recordings.reader import Recording
 from tools.recordings.republish import Wire
@@ -21,53 +23,69 @@ from tools.recordings.republish import Wire
 Profile = Callable[[str], Path]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    make_keys(tmp_path / "keys", ["alice"])
-    return tmp_path / "keys"
-
-
-@pytest.fixture
-def guarded(profile: Profile, folder: Path, start: Callable[..., Running]) -> Running:
+class Guarded(NamedTuple):
     """A daemon that lets in the clients of ``folder`` alone."""
-    text = f'access.keys = "{folder}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n'
-    return start("--config", str(profile(text)))
+
+    folder: Path
+    addresses: tuple[str, str]
 
 
-def test_tools_with_keys_see_and_command_the_hand(
-    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    place = tmp_path_factory.mktemp("guarded")
+    make_keys(place / "keys", ["alice"])
+    stream, commands = own_addresses()
+    (place / "profile.toml").write_text(
+        f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
+        f'access.keys = "{place / "keys"}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n',
+        encoding="utf-8",
+    )
+    daemon = Running("--config", str(place / "profile.toml"))
+    yield Guarded(place / "keys", (stream, commands))
+    try:
+        assert daemon.end() == 0
+    finally:
+        daemon.kill()
+
+
+def record(path: Path, *words: str) -> None:
+    """Record until something was recorded."""
+    process = subprocess.Popen([*SOFTFINGER, "record", path, *words], stdout=subprocess.DEVNULL)
+    until(lambda: path.exists() and path.stat().st_size > 3000)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(120.0) == 0
+    assert Recording(path).counts["hand/state"] > 0
+
+
+def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Path) -> None:
+    folder, addresses = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
-    there = ("--address", stream, "--duration", "1", "--no-wait")
     path, shown = tmp_path / "a.mcap", tmp_path / "a.rrd"
-    done = softfinger("record", str(path), *there, *alice)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert Recording(path).counts["hand/state"] > 10
-    done = softfinger("view", "--save", str(shown), *there, *alice)
-    assert done.returncode == 0, done.stderr
-    done = softfinger("send", "arm", "--address", commands, *alice)
-    assert (done.returncode, done.stderr) == (0, "")
-    words = ("--state", stream, "--commands", commands, "--duration", "1.5", "--no-wait")
-    done = softfinger("monitor", "--plain", *words, *alice)
-    assert " armed  left" in done.stdout, done.stderr
-    with Hand(*addresses, keys=folder / "alice") as hand:
-        assert hand.state().mode == "armed"
+    record(path, "--address", stream, *alice)
+    view = subprocess.Popen([*SOFTFINGER, "view", "--save", shown, "--address", stream, *alice])
+    until(lambda: shown.exists() and shown.stat().st_size > 100_000)
+    view.terminate()
+    assert view.wait(120.0) == 0
+    with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
+        insist(hand.arm)
+        assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         assert hand.status()["torque"] is True
+    where = ("--state", stream, "--commands", commands)
+    until_it_says(("monitor", "--plain", *where, *alice), " armed  left")
 
     async def session() -> str:
-        async with AsyncHand(*addresses, keys=folder / "alice") as hand:
+        async with AsyncHand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
             await hand.command("disarm")
-            return (await hand.wait_for(lambda state: not state.torque)).mode
+            return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"
-    assert guarded.end() == 0
 
 
 def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
-    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+    guarded: Guarded, tmp_path: Path
 ) -> None:
-    stream, commands = addresses
+    stream, commands = guarded.addresses
     path = tmp_path / "b.mcap"
     tools = [
         subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
@@ -79,7 +97,7 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
         )
     ]
     for tool in tools:
-        said = tool.communicate(timeout=60)[1]
+        said = tool.communicate(timeout=120)[1]
         assert tool.returncode in (1, 2), tool.args
         assert "--keys" in said, tool.args
     # Keys that can't be read are told before there is a file.
@@ -88,28 +106,25 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
     assert done.returncode == 1
     assert "softfinger keys" in done.stderr
     assert not path.exists()
-    assert guarded.end() == 0
 
 
 def test_a_daemon_with_keys_records_itself(
-    profile: Profile, folder: Path, start: Callable[..., Running], tmp_path: Path
+    profile: Profile, guarded: Guarded, start: Callable[..., Running], tmp_path: Path
 ) -> None:
     path = tmp_path / "own.mcap"
-    config = profile(f'access.keys = "{folder}"\n')
+    config = profile(f'access.keys = "{guarded.folder}"\n')
     daemon = start("--config", str(config), "--record", str(path), "--duration", "1")
-    assert daemon.process.wait(60) == 0
+    assert daemon.process.wait(120) == 0
     recording = Recording(path)
     first = next(message for _, message in recording.messages([b"hand/input"]))
     assert first["seq"] == 1
 
 
 def test_a_recording_is_replayed_to_holders_of_keys(
-    guarded: Running, addresses: tuple[str, str], folder: Path, tmp_path: Path
+    guarded: Guarded, addresses: tuple[str, str], tmp_path: Path
 ) -> None:
-    path = tmp_path / "run.mcap"
-    words = ("--address", addresses[0], "--duration", "2", "--keys", str(folder))
-    assert softfinger("record", str(path), *words).returncode == 0
-    assert guarded.end() == 0
+    path, folder = tmp_path / "run.mcap", guarded.folder
+    record(path, "--address", guarded.addresses[0], "--keys", str(folder))
     replay = subprocess.Popen(
         [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--keys", str(folder)],
         stdout=subprocess.PIPE,
@@ -118,12 +133,12 @@ def test_a_recording_is_replayed_to_holders_of_keys(
     )
     try:
         with Hand(*addresses, keys=folder / "alice") as hand, Hand(*addresses) as stranger:
-            assert hand.stream(30.0).next(30.0).mode == "disarmed"
+            assert hand.stream(60.0).next(60.0).mode == "disarmed"
             with pytest.raises(NoStream):
                 stranger.state(0.3)
     finally:
         replay.terminate()
-        out, error = replay.communicate(timeout=30)
+        out, error = replay.communicate(timeout=120)
     assert replay.returncode == 0, error
     assert re.search(r"\d+ of \d+ messages published", out)
     assert "waiting up to 10 s for a subscriber" in error

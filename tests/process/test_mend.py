@@ -47,7 +47,7 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def profile(bus: RunningBus, **servos: Any) -> Settings:
-    values = {"backend": "dynamixel", "port": bus.path, "reply_timeout": 0.25} | servos
+    values = {"backend": "dynamixel", "port": bus.path, "reply_timeout": 1.0} | servos
     return Settings.model_validate({"servos": values})
 
 

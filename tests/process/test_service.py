@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.command_client import send
 from daemon.service import Service
-from tests.harness.daemon_process import SOFTFINGER, softfinger
+from tests.harness.daemon_process import SOFTFINGER, ask, softfinger
+from tests.harness.descendants import ending
 from tools.event_log import EventLog
 
 
@@ -30,7 +30,7 @@ class Manager:
         self.path = folder / "notify"
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(self.path))
-        self._socket.settimeout(90.0)
+        self._socket.settimeout(200.0)
 
     def next(self) -> bytes:
         return self._socket.recv(4096)
@@ -126,9 +126,9 @@ def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
         stderr=subprocess.PIPE,
         text=True,
     )
-    with process:
+    with ending(process):
         assert manager.next() == b"READY=1\nWATCHDOG=1"
-        status = send(addresses[1], {"command": "status"})
+        status = ask(addresses[1], "status")
         assert (status["mode"], status["torque"]) == ("disarmed", False), "ready, and no task"
         for _ in range(5):
             assert manager.next() == b"WATCHDOG=1"
@@ -141,7 +141,7 @@ def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
         told = b""
         while told != b"STOPPING=1":
             told = manager.next()
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=60) == 0
         assert process.stderr is not None
         assert process.stderr.read() == "", "all of it went into the file"
     records = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
@@ -293,10 +293,10 @@ def test_the_daemon_runs_with_every_standard_stream_closed(profile: Callable[...
         ["sh", "-c", f"exec {command} >&-"],
         stderr=subprocess.PIPE,
         text=True,
-        timeout=90,
+        timeout=200,
         check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    silent = subprocess.run(["sh", "-c", f"exec {command} <&- >&- 2>&-"], timeout=90, check=False)
+    silent = subprocess.run(["sh", "-c", f"exec {command} <&- >&- 2>&-"], timeout=200, check=False)
     assert silent.returncode == 0

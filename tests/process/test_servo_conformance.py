@@ -6,14 +6,13 @@ The same tests run over both; a backend that joins them is added to ``RIGS``.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import pytest
 
 from daemon.assembly import Daemon
-from daemon.clock import Clock, RealClock, VirtualClock
+from daemon.clock import Clock, VirtualClock
 from daemon.commands import Refused
 from daemon.records import Goal, Reading
 from daemon.servos import make_servos
@@ -71,15 +70,17 @@ class SimulatedRig:
 
 
 class DynamixelRig:
-    """The Dynamixel backend, through SDK and pyserial, on an emulated bus in a thread."""
+    """The Dynamixel backend, through SDK and pyserial, on an emulated bus in a thread.
+
+    Bytes go to and fro in real time; the servos' own time is virtual.
+    """
 
     def __init__(self, servos: dict[str, Any] | None = None, **sections: Any) -> None:
-        chosen = {"backend": "dynamixel", "reply_timeout": 0.25, **(servos or {})}
+        chosen = {"backend": "dynamixel", "reply_timeout": 1.0, **(servos or {})}
         settings = Settings.model_validate({"servos": chosen, **sections})
-        now = time.monotonic()
-        bus = ServoBus.from_settings(settings, FreeJoints(2, now), t=now)
-        self._running = RunningBus(bus)
-        self.clock: Clock = RealClock()
+        self.clock: Clock = VirtualClock()
+        bus = ServoBus.from_settings(settings, FreeJoints(2, 0.0), t=0.0)
+        self._running = RunningBus(bus, clock=self.clock.now)
         port = settings.servos.model_copy(update={"port": self._running.path})
         made = make_servos(settings.model_copy(update={"servos": port}), self.clock, None)
         assert made is not None

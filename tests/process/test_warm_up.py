@@ -9,21 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.descendants import ending
 from tests.harness.warm_scenes import HIL, SCENES
 
 
 def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path: Path) -> None:
     emulate = [*SOFTFINGER, "emulate", "--dir", str(tmp_path), "--config", str(HIL)]
-    with subprocess.Popen(emulate, stdout=subprocess.PIPE, text=True) as hand:
-        try:
-            assert hand.stdout is not None
-            assert hand.stdout.readline() == "ready\n"
-            done = subprocess.run(
-                [sys.executable, "-m", "tests.harness.warm_scenes", str(tmp_path)],
-                capture_output=True, text=True, check=True, timeout=240,
-            )  # fmt: skip
-        finally:
-            hand.terminate()
+    with ending(subprocess.Popen(emulate, stdout=subprocess.PIPE, text=True)) as hand:
+        assert hand.stdout is not None
+        assert hand.stdout.readline() == "ready\n"
+        done = subprocess.run(
+            [sys.executable, "-m", "tests.harness.warm_scenes", str(tmp_path)],
+            capture_output=True, text=True, check=True, timeout=290,
+        )  # fmt: skip
     told: dict[str, dict[str, Any]] = {}
     for line in done.stdout.splitlines():
         scene = json.loads(line)

@@ -132,10 +132,10 @@ def test_silence_and_the_watchdog() -> None:
 def test_a_report_through_the_control_socket(tmp_path, capsys) -> None:
     emulator = Emulator(Settings.model_validate({"tactile": {"backend": "none"}}), tmp_path)
     ready = threading.Event()
-    runner = threading.Thread(target=emulator.run, args=(ready.set,))
+    runner = threading.Thread(target=emulator.run, args=(ready.set,), daemon=True)
     runner.start()
     try:
-        assert ready.wait(60)
+        assert ready.wait(200)
         send = ["emulate", "--dir", str(tmp_path), "--send"]
         assert main([*send, "undervoltage=2 report forget"]) == 0
         told = json.loads(capsys.readouterr().out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +14,13 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon import assembly
 from daemon.clock import VirtualClock
 from daemon.command_client import NoAnswer, send
 from daemon.commands import Refused, decode
+from daemon.gateway.config import Config
+from daemon.gateway.supervisor import Gateway
+from daemon.settings import Settings
 from daemon.sockets import AddressError
 from tests.conftest import until
 from tests.harness.gateway import Served
@@ -39,7 +44,7 @@ def ask(address: str, payload: bytes) -> dict[str, Any]:
     socket.setsockopt(zmq.LINGER, 0)
     socket.connect(address)
     socket.send(payload)
-    assert socket.poll(5000)
+    assert socket.poll(60_000)
     reply = msgpack.unpackb(socket.recv())
     socket.close()
     context.term()
@@ -108,14 +113,24 @@ def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
         send(addresses[1], {"command": "arm"}, timeout=0.05)
 
 
-@given(st.binary(max_size=64))
-@settings(max_examples=300, deadline=None)
-def test_random_bytes_are_decoded_or_refused(payload: bytes) -> None:
+values = st.one_of(st.none(), st.integers(0, 300), st.floats(allow_nan=False), st.text(max_size=5))
+maps = st.dictionaries(st.text(max_size=5), values, max_size=3)
+
+
+@given(
+    st.one_of(
+        st.binary(max_size=64),
+        st.builds(lambda more, name: msgpack.packb({**more, "command": name}), maps, values),
+    )
+)
+@settings(max_examples=300)
+def test_any_bytes_are_decoded_or_refused(payload: bytes) -> None:
     try:
         request = decode(payload)
     except Refused:
         return
     assert isinstance(request["command"], str)
+    assert request == msgpack.unpackb(payload)
 
 
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
@@ -271,3 +286,25 @@ def test_an_ipc_file_has_the_rights_that_were_set(
             assert stat.S_IMODE(Path(f"{folder}/{name}").stat().st_mode) == mode
         assert stat.S_IMODE(Path(f"{folder}/c.lock").stat().st_mode) == 0o600
     assert list(folder.iterdir()) == []
+
+
+def test_a_signal_while_the_sockets_are_made_ends_the_start(
+    monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, str]
+) -> None:
+    made: list[Gateway] = []
+
+    class Noted(Gateway):
+        def __init__(self, config: Config) -> None:
+            super().__init__(config)
+            made.append(self)
+
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(assembly, "Gateway", Noted)
+    monkeypatch.setattr(assembly, "LocalStop", interrupted)
+    wire = {"stream": {"address": addresses[0]}, "commands": {"address": addresses[1]}}
+    with pytest.raises(KeyboardInterrupt):
+        assembly.Daemon(Settings.model_validate(wire))
+    with pytest.raises(ProcessLookupError):
+        os.kill(made[0].process, 0)

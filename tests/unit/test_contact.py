@@ -127,7 +127,7 @@ def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, compl
 
 
 @given(radius=radii, modulus=moduli, part=fractions, share=shares)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_partials_are_the_derivatives(
     radius: float, modulus: float, part: float, share: float
 ) -> None:
@@ -142,7 +142,7 @@ def test_partials_are_the_derivatives(
 
 
 @given(radius=radii, modulus=moduli, part=fractions, share=shares)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_identities(radius: float, modulus: float, part: float, share: float) -> None:
     d = radius * part
     theta = float(theta_limits(radius, d)) * share

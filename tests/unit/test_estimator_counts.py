@@ -36,7 +36,7 @@ def mean_of(model, floor, noise):
     return floor + (model - floor) * above + noise * density, above
 
 
-@pytest.mark.parametrize("floor", [0.0, 2000.0])
+@pytest.mark.parametrize("floor", [0.0, 2000.0, 3250.0])
 def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor):
     noise, gain, g = 1500.0, 1.1, 40.0
     for model in np.linspace(max(floor - 1.9 * noise, 20.0), floor + 6.0 * noise, 9):

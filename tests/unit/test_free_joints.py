@@ -66,7 +66,7 @@ def test_time_in_any_pieces_gives_the_same_bits_and_never_goes_back() -> None:
     assert whole.q[0] == pytest.approx(0.7, abs=0.01)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     start=st.floats(-1000, 1000),
     target=st.floats(-1000, 1000),

@@ -148,7 +148,7 @@ def test_short_curves_go_on_with_their_last_slope() -> None:
     steps=st.lists(st.floats(0.2, 5.0), min_size=5, max_size=20),
     scale=st.floats(1.0, 1e9),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_rising_points_give_a_rising_law_or_a_reason(steps: list[float], scale: float) -> None:
     x = np.linspace(0.0, 1.0, len(steps) + 1)
     y = scale * np.concatenate([[0.0], np.cumsum(steps)])

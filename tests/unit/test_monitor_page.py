@@ -280,7 +280,7 @@ FIELDS += ["timestamp", "mono_ns", "finger", "rows", "cols", "scale", "data", "k
 FIELDS += ["settings", "command", "client", "ok", "error", "again", "wake", "compute"]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.tuples(

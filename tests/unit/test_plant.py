@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from kinematics.kernels import kernel
 from kinematics.lanes import address
 from tests.fuzz.plant import abuse, random_hand
 from tests.harness.plant import (
-    BOUNDED,
     CONSTANT,
     LOSSLESS,
     MODULUS,
@@ -25,7 +23,6 @@ from tests.harness.plant import (
     hold_with,
     make,
     place,
-    run,
 )
 
 # One tip alone.
@@ -209,16 +206,3 @@ def test_energy_without_losses_drifts_at_least_with_the_square_of_the_step(name)
 def test_random_commands_and_extreme_parameters_stay_sound():
     # With the steps that the plant chooses and, one time in three, steps ten times too long.
     assert [wrong for wrong in map(abuse, range(30)) if wrong] == []
-
-
-def test_simulation_is_two_hundred_times_faster_than_real_time():
-    hand = make(TABLE_I)
-    for joint in range(2):
-        hand.drive(joint, BOUNDED, True, 0.6, 0.4)
-    hand.advance(0.1)
-    best = math.inf
-    for _ in range(20):
-        begin = time.perf_counter()
-        run(hand, 0.25)
-        best = min(best, time.perf_counter() - begin)
-    assert 0.25 / best > 200

@@ -130,7 +130,7 @@ def test_moments_of_the_map_are_the_closed_ones():
     assert var_y == pytest.approx(25.3333333333e-6, rel=3e-4)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     d=st.floats(1e-4, 8e-3),
     theta=st.floats(0.0, 0.55),

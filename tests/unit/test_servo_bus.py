@@ -693,7 +693,7 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
 # --- anything at all ---------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(
         st.tuples(

@@ -19,14 +19,14 @@ def soak() -> Iterator[Soak]:
 
 
 def test_random_commands_and_faults_break_nothing(soak: Soak) -> None:
-    account = soak.run(25_000)
-    assert account.ticks == 25_000
-    assert account.written > 5_000
+    account = soak.run(12_000)
+    assert account.ticks == 12_000
+    assert account.written > 2_000
     assert len(account.modes) >= 7
     assert sum(account.injected.values()) > 6
-    assert len(account.faults) >= 3
+    assert len(account.faults) >= 2
     assert account.growth < 0.02
-    assert "25000 ticks" in account.lines()[0]
+    assert "12000 ticks" in account.lines()[0]
 
 
 @pytest.mark.parametrize(

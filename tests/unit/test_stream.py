@@ -56,7 +56,7 @@ def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zm
 def receive(socket: zmq.Socket[Any], served: Served | None = None) -> tuple[bytes, dict[str, Any]]:
     if served is not None:
         until(lambda: [served.settle(), socket.poll(0)][1])
-    assert socket.poll(5000)
+    assert socket.poll(60_000)
     topic, payload = socket.recv_multipart()
     return topic, msgpack.unpackb(payload)
 

@@ -1,0 +1,54 @@
+"""What tests started ends with them: their own children, and what those left behind them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.harness import descendants
+
+PARENT = """
+import subprocess, sys
+child = subprocess.Popen(["sleep", "1000"], start_new_session=True)
+print(child.pid, flush=True)
+if sys.argv[1] == "waits":
+    child.wait()
+"""
+
+
+@pytest.mark.parametrize("parent", ["waits", "ends"])
+def test_all_that_runs_below_a_test_is_ended(parent: str) -> None:
+    before = descendants.running()
+    words = [sys.executable, "-c", PARENT, parent]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    child = psutil.Process(int(process.stdout.readline()))
+    process.stdout.close()
+    if parent == "ends":
+        assert process.wait(60.0) == 0
+        assert child.is_running(), "the orphan is this process's child by now"
+    descendants.end(descendants.running() - before)
+    assert not child.is_running()
+    assert not descendants.running() - before
+
+
+def test_a_test_that_fails_leaves_nothing_running(pytester: pytest.Pytester) -> None:
+    pytester.makeconftest("from tests.conftest import ended_with_the_test")
+    pytester.makepyfile(
+        """
+        import subprocess
+        from pathlib import Path
+
+        def test_fails():
+            process = subprocess.Popen(["sleep", "1000"])
+            Path("pid").write_text(str(process.pid))
+            raise AssertionError
+        """
+    )
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider")
+    result.assert_outcomes(failed=1)
+    assert not psutil.pid_exists(int(Path("pid").read_text()))
