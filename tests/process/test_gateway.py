@@ -61,7 +61,7 @@ def gateway_of(daemon: Daemon) -> Gateway:
 
 def events(hand: Hand, text: str) -> bool:
     """Wait until an event says ``text``."""
-    with hand.events(timeout=20.0) as told:
+    with hand.events(timeout=60.0) as told:
         return any(text in event.text for event in told)
 
 
@@ -70,9 +70,9 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
     ticking: Daemon, addresses: tuple[str, str], number: int
 ) -> None:
     gateway, loop = gateway_of(ticking), ticking.loop
-    with Hand(*addresses, timeout=10.0) as hand:
+    with Hand(*addresses, timeout=60.0) as hand:
         hand.arm()
-        stream = hand.stream(timeout=20.0)
+        stream = hand.stream(timeout=60.0)
         next(stream)
         first, ticks = gateway.process, loop.state.seq
         os.kill(first, number)
@@ -152,11 +152,11 @@ def test_it_imports_neither_numpy_nor_libzmq() -> None:
 def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
     ticking: Daemon, addresses: tuple[str, str]
 ) -> None:
-    with Hand(*addresses, timeout=10.0) as hand:
+    with Hand(*addresses, timeout=60.0) as hand:
         hand.arm()
         os.kill(gateway_of(ticking).process, signal.SIGSTOP)  # nobody is served
         try:
-            assert send(addresses[1], {"command": "stop"}, timeout=10.0)["ok"] is True
+            assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
 
             async def stop() -> bool:
@@ -175,7 +175,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
 
 
 def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
-    send(addresses[1], {"command": "arm"}, timeout=10.0)
+    send(addresses[1], {"command": "arm"}, timeout=60.0)
     os.kill(gateway_of(ticking).process, signal.SIGSTOP)
     try:
         done = softfinger("send", "stop", "--address", addresses[1])

@@ -30,11 +30,11 @@ def old_command(name: str) -> bytes:
     return old_frame(b"") + old_frame(b"", more=True) + old_frame(payload)
 
 
-def posted(frames: bytes, port: int) -> bytes:
+def posted(frames: bytes, address: str) -> bytes:
     """An HTTP request whose head is one part of a message, and whose body is ``frames``."""
     for padding in range(256):
         head = (
-            f"POST /{'x' * padding} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n"
+            f"POST /{'x' * padding} HTTP/1.1\r\nHost: {address.removeprefix('tcp://')}\r\n"
             f"Content-Type: text/plain\r\nContent-Length: {len(frames)}\r\n\r\n"
         ).encode()
         at = 0
@@ -45,9 +45,15 @@ def posted(frames: bytes, port: int) -> bytes:
     raise AssertionError("no padding ends the head with a frame")
 
 
-def said_to(request: bytes, port: int, wait: Callable[[], object]) -> bytes:
+def place(address: str) -> tuple[str, int]:
+    """Host and port."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    return host, int(port)
+
+
+def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
     """Send ``request``, do something else, and return what was answered meanwhile."""
-    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as raw:
+    with socket.create_connection(place(address), timeout=60.0) as raw:
         raw.sendall(request)
         wait()
         answer = b""
@@ -69,12 +75,11 @@ def daemon(
 
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
 def test_a_web_page_commands_nothing(
-    daemon: tuple[str, str], wrap: Callable[[bytes, int], bytes]
+    daemon: tuple[str, str], wrap: Callable[[bytes, str], bytes]
 ) -> None:
-    port = int(daemon[1].rsplit(":", 1)[1])
-    request = wrap(old_command("arm") + old_command("arm")[2:], port)
+    request = wrap(old_command("arm") + old_command("arm")[2:], daemon[1])
     with Hand(*daemon) as hand:
-        answer = said_to(request, port, lambda: [hand.status() for _ in range(20)])
+        answer = said_to(request, daemon[1], lambda: [hand.status() for _ in range(20)])
         assert b"ok" not in answer
         assert hand.state().mode == "disarmed"
         hand.arm()  # a client is still heard
@@ -84,12 +89,11 @@ def test_a_web_page_commands_nothing(
 
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
 def test_a_web_page_reads_nothing(
-    daemon: tuple[str, str], wrap: Callable[[bytes, int], bytes]
+    daemon: tuple[str, str], wrap: Callable[[bytes, str], bytes]
 ) -> None:
-    port = int(daemon[0].rsplit(":", 1)[1])
-    request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), port)
+    request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon[0])
     with Hand(*daemon) as hand:
-        answer = said_to(request, port, lambda: hand.collect(0.5))
+        answer = said_to(request, daemon[0], lambda: hand.collect(0.5))
         assert b"hand/" not in answer
 
 
