@@ -1,6 +1,6 @@
 """From settings to a running daemon: builds, connects and warms up everything, in the safe order.
 
-Sockets are bound first, so that a second daemon ends before it has touched any hardware. Kernels
+Sockets are bound before any hardware is touched, so that a second daemon ends without. Kernels
 are compiled and warm before the loop exists, and so before torque can be on.
 """
 
@@ -12,14 +12,13 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
-
-import zmq
+from typing import TYPE_CHECKING
 
 from daemon.clock import LoopClock, make_clock
 from daemon.commands import CommandServer
-from daemon.doorkeeper import Doorkeeper
-from daemon.keys import load_server
+from daemon.gateway.config import Config
+from daemon.gateway.supervisor import Gateway
+from daemon.local_stop import LocalStop
 from daemon.loop import EventSink, Loop
 from daemon.messages import Facts
 from daemon.model import (
@@ -33,8 +32,7 @@ from daemon.records import FINGERS
 from daemon.servos import make_servos
 from daemon.servos.base import Servos
 from daemon.settings import Settings
-from daemon.sockets import Guard
-from daemon.stream import Publisher
+from daemon.stream import TOPICS, Publisher
 from daemon.tactile import make_sensor
 from daemon.warm_up import Scene, warm_up
 from kinematics.table import ContactTable
@@ -46,7 +44,7 @@ if TYPE_CHECKING:
 class Daemon:
     """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
-    Raises SettingsError, AddressError, KeyFileError, ServoError or TactileError when it can't be
+    Raises SettingsError, AddressError (keys included), ServoError or TactileError when it can't be
     made ready; whatever was opened until then is closed again.
     """
 
@@ -61,6 +59,7 @@ class Daemon:
         self.settings = settings
         self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
+        self.gateway: Gateway | None = None  # the process that serves clients
         try:
             self._assemble(on_event, wire, table_cache)
         except BaseException:
@@ -80,6 +79,8 @@ class Daemon:
         self.prediction: Prediction | None = None
         if perceptions and self.servos is not None:
             self.prediction = Prediction(settings, self.tables)
+        if self.gateway is not None:
+            self.gateway.wait()  # a second daemon touches no hardware
         if self.servos is not None:
             self._connect(self.servos)
         for perception in perceptions:
@@ -100,26 +101,24 @@ class Daemon:
             publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
-        context: zmq.Context[Any] = zmq.Context()
-        self._closers.append(context.destroy)  # sockets that a signal left half made, too
         stream, commands = self.settings.stream, self.settings.commands
         access = self.settings.access
-        keys = load_server(Path(access.keys)) if access.keys else None
-        if keys is not None:
-            self._closers.append(Doorkeeper(context, keys.clients).close)
-        guard = Guard(int(access.ipc_mode, 8), keys)
-        publisher = Publisher(context, stream.address, stream.queue, guard)
-        self._closers.append(publisher.close)
-        server = CommandServer(
-            context,
-            commands.address,
-            commands.max_bytes,
-            commands.per_second,
-            guard,
-            self.clock.host,
+        gateway = self.gateway = Gateway(
+            Config(
+                stream.address,
+                commands.address,
+                TOPICS,
+                stream.queue,
+                commands.max_bytes,
+                commands.per_second,
+                int(access.ipc_mode, 8),
+                access.keys,
+            )
         )
-        self._closers.append(server.close)
-        return publisher, server
+        self._closers.append(gateway.close)
+        local = LocalStop(commands.address)
+        self._closers.append(local.close)
+        return Publisher(gateway.link), CommandServer(gateway.link, local)
 
     def _make_hand(self, cache: Path | None, on_event: EventSink | None) -> SimulatedHand | None:
         """The simulated hand, where a backend wants one.

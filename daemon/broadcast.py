@@ -8,13 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from daemon import messages
 from daemon.messages import Parts, Rates, Truth
 from daemon.perception import FingerPerception
 from daemon.records import Frame, State
 from daemon.schedule import Schedule
 from daemon.settings import Settings
 from daemon.statistics import Statistics
-from daemon.stream import Publisher
+from daemon.stream import Publisher, bit
+
+_STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
+    bit, (messages.STATE, messages.TACTILE, messages.STATS, messages.INPUT, messages.TRUTH)
+)
 
 
 @dataclass(slots=True)
@@ -55,27 +60,25 @@ class Broadcast:
     def __call__(self, state: State) -> None:
         """All that is due at this tick."""
         publisher, schedule, seq = self._publisher, self._schedule, state.seq
-        if schedule.look.due(seq):
-            publisher.refresh()
-        publisher.repeat()
-        if publisher.wants_tactile:
+        wanted = publisher.wanted
+        if wanted & _TACTILE:
             for perception in self._perceptions:
                 if perception.frame is not self._seen[perception.finger]:
                     self._frame(state, perception)
-        if publisher.wants_input:  # behind the frames, which it refers to
+        if wanted & _INPUT:  # behind the frames, which it refers to
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
             publisher.input(state, (frames[0], frames[1]))
         if schedule.state.due(seq):
-            if publisher.wants_state:
+            if wanted & _STATE:
                 self._states += 1
                 publisher.state(state, self._scene, schedule.state.every)
-            if publisher.wants_truth and self.truth is not None:
+            if wanted & _TRUTH and self.truth is not None:
                 publisher.truth(state, self.truth, schedule.state.every)
         if schedule.stats.due(seq):
             rates = self._rates(state)
-            if publisher.wants_stats:
+            if wanted & _STATS:
                 publisher.stats(state, self._period, rates, self._statistics, schedule.stats.every)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:

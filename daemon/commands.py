@@ -1,182 +1,122 @@
-"""The command server and client: one msgpack map each way, and nothing that decides.
+"""The loop's side of commands: takes requests from the gateway, and has them carried out.
 
-The server lives in the loop's own thread: it is asked once a tick, costs one look when
-nobody speaks, and needs no lock. A plain REQ socket is enough for a client.
-
-One command is carried out a tick. What has come beside it is looked through as far as a tick
-allows: a ``stop`` goes first whoever else speaks, and whatever waits then is refused, since it may
-have been sent before; a client that sends more than it may a second is refused, or in a flood not
-even answered, so that a flood costs the tick a bounded time and no one else's command its turn.
+It lives in the loop's own thread: it is asked once a tick, costs one look when nobody speaks, and
+needs no lock. A ``stop`` goes first; what came before one is refused, wherever it waits (see
+`daemon.gateway.requests`).
 """
 
 from __future__ import annotations
 
-import logging
-import math
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import msgpack
-import zmq
 
-from daemon.keys import ClientKeys
-from daemon.messages import pack
-from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
-from daemon.sockets import OWNER_ONLY, Bound, Guard
+from daemon.gateway.link import Ask, Link
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
-_QUEUE = 64  # commands that wait, of one client in its socket and of all of them here
-_LOOK = 8  # messages that are taken in at a tick
-_REFUSALS = 2  # answers at a tick to who sends too much
-_CLIENTS = 256  # whose pace is remembered
-_FULL = "too many commands wait already"
-_STOPPED = "a stop came before its turn; send it again"
-_STOP = b"stop"
-_VALUES = (str, int, float)  # and bool, which is an int
+PASSED = "came while the daemon stood still or was starting, or before a stop; send it again"
 
-_log = logging.getLogger(__name__)
+_BEGUN_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
+_A_TICK = 2  # commands carried out at one, a stop not counted
+_VALUES = (str, int, float)  # and bool, which is an int
 
 
 class Refused(Exception):
     """A command that is not carried out. The message is what the client is told."""
 
 
+class Local(Protocol):
+    """Where a stop comes from past the gateway: `daemon.local_stop.LocalStop`."""
+
+    def fileno(self) -> int:
+        """The descriptor at which it comes."""
+
+    def take(self) -> bool:
+        """Whether a stop has come."""
+
+    def answer(self, reply: bytes) -> None:
+        """Answer all who asked."""
+
+
 class CommandServer:
-    """Answers commands, at most one a tick. Anything malformed is refused, never an exception."""
+    """Answers requests that come over a link, and a stop that comes past it."""
 
-    def __init__(
-        self,
-        context: zmq.Context[Any],
-        address: str,
-        max_bytes: int,
-        per_second: float = 1e9,
-        guard: Guard = OWNER_ONLY,
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """``per_second`` bounds each client's commands; one second's worth may come at once.
+    def __init__(self, link: Link, local: Local | None = None) -> None:
+        self._link = link
+        self._local = local
+        self._stopped: bytes | None = None  # the local answer, until what comes next is heard
+        self._answer_by = 0.0
+        if local is not None:
+            link.watch(local.fileno())
 
-        ``now`` [s] is the clock that their pace is measured by.
+    @property
+    def refused_by_pace(self) -> int:
+        """Requests refused because too many came."""
+        return self._link.refused
+
+    @property
+    def notices(self) -> deque[str]:
+        """What is to be told of the gateway."""
+        return self._link.notices
+
+    def serve(self, handler: Handler) -> None:
+        """Have ``handler`` carry out what is due at this tick.
+
+        It raises Refused with the reason.
         """
-        self._bound = Bound(
-            context, zmq.ROUTER, address, "commands.address", _QUEUE, 4 * max_bytes, guard
-        )
-        self._socket = self._bound.socket
-        self._max_bytes = max_bytes
-        self._per_second = per_second
-        self._now = now
-        self._paces: dict[bytes, tuple[float, float]] = {}  # of a client: may send, at time
-        self._waiting: deque[tuple[list[bytes], bytes]] = deque()
-        self._refusals = _REFUSALS  # that may still be answered at this tick
-        self._settled = False  # nothing waits anywhere until the socket's descriptor tells
-        self.refused_by_pace = 0
-
-    def serve(self, handler: Handler) -> bool:
-        """Answer one waiting command through ``handler``; False when there was nothing at all."""
-        if self._settled and not self._bound.signalled():
-            return False
-        came = stopped = self._settled = False
-        self._refusals = _REFUSALS
-        for _ in range(_LOOK):
-            if not self._bound.readable():
-                self._settled = not came and not self._waiting  # else an answer is sent below
-                break
-            came = True
-            frames = self._socket.recv_multipart(zmq.NOBLOCK)
-            stopped = self._take_in(frames, handler) or stopped
-        if stopped:
-            self._refuse_waiting()
-        if not self._waiting:
-            return came
-        envelope, payload = self._waiting.popleft()
-        self._send(envelope, self._answer(payload, handler))
-        return True
-
-    def _take_in(self, frames: list[bytes], handler: Handler) -> bool:
-        """Sort one message in; True when it was a stop, which has been carried out."""
-        # A REQ socket sends [identity, empty, payload]. Without the empty frame, as from a DEALER,
-        # the reply goes back in the same form.
-        envelope, payload = frames[:-1], frames[-1]
-        if not 0 < len(envelope) <= 2:
-            return False  # no client's form; an answer would only send its frames back
-        if _is_stop(payload, self._max_bytes):
-            self._send(envelope, self._answer(payload, handler))
-            return True
-        if not self._in_pace(envelope[0], self._now()):
-            self._refuse(envelope, f"too many commands: at most {self._per_second:g} a second")
-        elif len(self._waiting) >= _QUEUE and not self._make_room(envelope[0]):
-            self._refuse(envelope, _FULL)
-        else:
-            self._waiting.append((envelope, payload))
-        return False
-
-    def _refuse_waiting(self) -> None:
-        while self._waiting:
-            envelope, _ = self._waiting.popleft()
-            self._send(envelope, {"ok": False, "error": _STOPPED})
-
-    def _make_room(self, client: bytes) -> bool:
-        """Refuse the last command of whoever has most waiting, unless that is this client."""
-        counts = Counter([envelope[0] for envelope, _ in self._waiting])
-        greedy, most = counts.most_common(1)[0]
-        if counts[client] + 1 >= most:
-            return False
-        at = max(i for i, (envelope, _) in enumerate(self._waiting) if envelope[0] == greedy)
-        envelope, _ = self._waiting[at]
-        del self._waiting[at]
-        self._refuse(envelope, _FULL)
-        return True
-
-    def _in_pace(self, client: bytes, now: float) -> bool:
-        most = self._per_second
-        left, then = self._paces.get(client, (most, now))
-        left = min(left + (now - then) * most, most)
-        if client not in self._paces and len(self._paces) >= _CLIENTS:
-            self._paces.clear()
-        self._paces[client] = (max(left - 1.0, 0.0), now)
-        return left >= 1.0
-
-    def _refuse(self, envelope: list[bytes], error: str) -> None:
-        self.refused_by_pace += 1
-        if self._refusals <= 0:
+        link = self._link
+        link.look()
+        if self._local is not None and (link.called or self._stopped is not None):
+            self._serve_local(self._local, handler)
+        if not link.asked:
             return
-        self._refusals -= 1
-        self._send(envelope, {"ok": False, "error": error})
-
-    def _send(self, envelope: list[bytes], reply: dict[str, Any]) -> None:
-        try:
-            self._socket.send_multipart([*envelope, pack(reply)], zmq.NOBLOCK)
-        except zmq.ZMQError:
-            pass  # the client has gone
-
-    def drain(self, handler: Handler) -> None:
-        """Answer all that wait, up to the queue's length."""
-        for _ in range(_QUEUE):
-            if not self.serve(handler):
+        for ask in [ask for ask in link.asked if ask.stop]:
+            link.asked.remove(ask)
+            link.begin_epoch()
+            self._answer(ask, handler)
+        for _ in range(_A_TICK):
+            while link.asked and link.asked[0].epoch != link.epoch:
+                link.reply(link.asked.popleft().number, _refusal(PASSED))
+            if not link.asked:
                 return
+            self._answer(link.asked.popleft(), handler)
 
-    def _answer(self, payload: bytes, handler: Handler) -> dict[str, Any]:
-        try:
-            if len(payload) > self._max_bytes:
-                raise Refused(f"message of {len(payload)} bytes; at most {self._max_bytes}")
-            return {"ok": True, **handler(decode(payload))}
-        except Refused as refusal:
-            return {"ok": False, "error": str(refusal)}
+    def begin_epoch(self) -> None:
+        """What has arrived until now is refused: a stop, or the loop could not act."""
+        self._link.begin_epoch()
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._bound.close()
+    def _serve_local(self, local: Local, handler: Handler) -> None:
+        self._link.called = False
+        if local.take():
+            self._link.begin_epoch()
+            self._stopped = _carry_out({"command": "stop"}, handler)
+            self._answer_by = time.monotonic() + _BEGUN_WITHIN
+        if self._stopped is not None and (
+            self._link.begun == self._link.epoch or time.monotonic() > self._answer_by
+        ):
+            local.answer(self._stopped)
+            self._stopped = None
+
+    def _answer(self, ask: Ask, handler: Handler) -> None:
+        self._link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
 
 
-def _is_stop(payload: bytes, max_bytes: int) -> bool:
-    if _STOP not in payload or len(payload) > max_bytes:
-        return False
+def _carry_out(request: dict[str, Any], handler: Handler) -> bytes:
+    """The packed reply."""
     try:
-        return bool(decode(payload)["command"] == "stop")
-    except Refused:
-        return False
+        reply: bytes = msgpack.packb({"ok": True, **handler(request)})
+    except Refused as refusal:
+        return _refusal(str(refusal))
+    return reply
+
+
+def _refusal(error: str) -> bytes:
+    packed: bytes = msgpack.packb({"ok": False, "error": error})
+    return packed
 
 
 def decode(payload: bytes) -> dict[str, Any]:
@@ -198,45 +138,3 @@ def decode(payload: bytes) -> dict[str, Any]:
     if not all(value is None or isinstance(value, _VALUES) for value in request.values()):
         raise Refused("expected numbers and texts as values")
     return request
-
-
-class NoAnswer(Exception):
-    """The daemon did not answer in time."""
-
-
-def send(
-    address: str, request: dict[str, Any], timeout: float = PATIENCE, keys: ClientKeys | None = None
-) -> dict[str, Any]:
-    """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
-
-    A warning is logged when that takes long, which without handlers goes to standard error.
-    """
-    context: zmq.Context[Any] = zmq.Context()
-    socket = context.socket(zmq.REQ)
-    socket.setsockopt(zmq.LINGER, 0)
-    try:
-        if keys is not None:
-            keys.guard(socket)
-        try:
-            socket.connect(address)
-        except zmq.ZMQError as error:
-            raise NoAnswer(f"{address}: {error}") from None
-        socket.send(pack(request))
-        silence = min(SILENCE, timeout)
-        answered = socket.poll(math.ceil(silence * 1e3))
-        if not answered and silence < timeout:
-            _log.warning(still_waiting(answer_to(request, address), timeout))
-            answered = socket.poll(math.ceil((timeout - silence) * 1e3))
-        if not answered:
-            hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
-            raise NoAnswer(
-                f"no {answer_to(request, address)} within {timeout:g} s; is softfinger running, "
-                f"or still starting?{hint}"
-            )
-        reply = msgpack.unpackb(socket.recv(), raw=False)
-    finally:
-        socket.close()
-        context.term()
-    if not isinstance(reply, dict):
-        raise NoAnswer(f"{address} answered something that is not a reply")
-    return reply

@@ -6,11 +6,13 @@ public keys of its clients. Whoever has no key among them gets nothing. A folder
 ``server/server.key_secret``
     the daemon's own pair
 ``server/clients/NAME.key``
-    whom it lets in; a file taken away is a client shut out at the next start
+    whom it lets in; a file taken away is a client shut out at once
 ``NAME/server.key``, ``NAME/client.key_secret``
     what that client needs: the folder to bring to its machine. ``local`` is this machine's.
 
-The files are ZeroMQ certificates, which other ZeroMQ programs can read, too.
+The files are ZeroMQ certificates, which other ZeroMQ programs can read, too. Files and folders that
+somebody else owns or may write are refused, with all folders above them: whoever may write there
+may add a key of his own.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ import zmq.utils.z85
 
 LOCAL = "local"  # the client that every folder of keys has
 DOMAIN = b"softfinger"
+HANDSHAKE = 2000  # ms in which a client has to have shown who it is
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _KEY = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"]*)"\s*$', re.MULTILINE)
@@ -47,14 +50,14 @@ class ServerKeys:
     clients: dict[bytes, str]  # public key → name
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Before bind: only clients whom a `Doorkeeper` of these keys lets in."""
+        """Before bind: only clients whom the context's authenticator lets in."""
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
-        # Without a doorkeeper nobody is let in, rather than everybody.
+        # Without an authenticator nobody is let in, rather than everybody.
         socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-        socket.setsockopt(zmq.HANDSHAKE_IVL, 2000)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +144,7 @@ def load_server(folder: Path) -> ServerKeys:
     check_curve()
     place = folder if (folder / "server.key_secret").exists() else folder / "server"
     public, secret = _pair(place / "server.key_secret")
+    _check_above(place / "clients" / "any")
     clients = {}
     for path in sorted((place / "clients").glob("*.key")):
         clients[_keys(path)["public"]] = path.stem
@@ -158,18 +162,17 @@ def load_client(folder: Path) -> ClientKeys:
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
-    found = _keys(path)
+    _check_above(path)
+    found = _keys(path, secret=True)
     if "secret" not in found:
         raise KeyFileError(f"{path}: holds no secret key")
-    mode = stat.S_IMODE(path.stat().st_mode)
-    if mode & 0o077:
-        raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")
     return found["public"], found["secret"]
 
 
-def _keys(path: Path) -> dict[str, bytes]:
+def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
     try:
         with path.open(encoding="ascii") as file:
+            _check(path, os.fstat(file.fileno()), secret)
             text = file.read(_LARGEST)
     except OSError as error:
         raise KeyFileError(
@@ -181,6 +184,30 @@ def _keys(path: Path) -> dict[str, bytes]:
     if "public" not in found or not all(_sound(key) for key in found.values()):
         raise KeyFileError(f"{path}: no key file")
     return found
+
+
+def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
+    """Raises KeyFileError when somebody else owns or may write it, or may read a secret."""
+    if status.st_uid not in (0, os.geteuid()):
+        raise KeyFileError(f"{path}: belongs to user {status.st_uid}: chown it, or make new keys")
+    mode = stat.S_IMODE(status.st_mode)
+    if secret and mode & 0o077:
+        raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")
+    # In a folder with the sticky bit, as /tmp, nobody can replace what isn't his.
+    if mode & 0o022 and not (mode & stat.S_ISVTX and stat.S_ISDIR(status.st_mode)):
+        raise KeyFileError(f"{path}: may be written by others ({mode:04o}): chmod go-w {path}")
+
+
+def _check_above(path: Path) -> None:
+    """All folders above a file. Raises KeyFileError."""
+    for folder in path.resolve().parents:
+        try:
+            status = folder.stat()
+        except OSError as error:
+            raise KeyFileError(
+                f"{folder}: can't be read: {error.strerror}; `softfinger keys` makes such files"
+            ) from None
+        _check(folder, status)
 
 
 def _sound(key: bytes) -> bool:

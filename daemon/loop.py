@@ -34,19 +34,24 @@ EventSink = Callable[[str, str, str], None]
 
 # Both in the machine's time, whose clients sent the commands.
 _STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
-_DEAF = 0.1  # s in which what waited meanwhile has come through the socket's own thread
 
 
 class Commands(Protocol):
     """Where commands come from: `daemon.commands.CommandServer`, or a recording."""
 
-    refused_by_pace: int
+    @property
+    def refused_by_pace(self) -> int:
+        """Commands refused because too many came."""
 
-    def serve(self, handler: Handler) -> bool:
-        """Carry out through ``handler`` what is due at this tick; False when nothing was."""
+    @property
+    def notices(self) -> deque[str]:
+        """What is to be told of the process that serves clients."""
 
-    def drain(self, handler: Handler) -> None:
-        """Answer all that has waited since before the first tick."""
+    def serve(self, handler: Handler) -> None:
+        """Carry out through ``handler`` what is due at this tick."""
+
+    def begin_epoch(self) -> None:
+        """Refuse all that has arrived until now, but for a stop."""
 
 
 class Loop:
@@ -105,7 +110,6 @@ class Loop:
         self._ending = False
         self._stopping = False
         self._began = -math.inf  # the present tick, in the machine's time
-        self._deaf_until = -math.inf  # until then, likewise, commands are from before a stall
         self._commanded = False  # a command was carried out at this tick, which may take long
 
     @property
@@ -143,7 +147,7 @@ class Loop:
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         if self._server is not None:
-            self._server.drain(self._refuse_old)
+            self._server.begin_epoch()
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -179,8 +183,8 @@ class Loop:
             if event is not None:
                 self.emit(*event)
             self._commanded = False
-            if timing.tick_s > _STALL:
-                self._deaf_until = began + _DEAF
+            if timing.tick_s > _STALL and self._server is not None:
+                self._server.begin_epoch()
             done = self.tick(clock.now())
             deadline += self.period
             if done > deadline + clock.behind:
@@ -193,16 +197,6 @@ class Loop:
             if self.heartbeat is not None:
                 self.heartbeat(done)
         clock.sleep_until(deadline)
-
-    def _refuse_old(self, request: dict[str, Any]) -> dict[str, Any]:
-        """No command from before a stop or a stall may move the hand, but stop stops."""
-        if request["command"] == "stop":
-            return self._by_person(request)
-        name = request["command"][:40]
-        raise Refused(
-            f"{name}: came while the daemon stood still or was starting, or before a stop; "
-            "send it again"
-        )
 
     # The tick
 
@@ -268,10 +262,11 @@ class Loop:
         if stopped:
             self._by_person({"command": "stop"})
         if self._server is not None:
-            if stopped or self._began < self._deaf_until:
-                self._server.drain(self._refuse_old)
-            else:
-                self._server.serve(self._by_person)
+            if stopped:
+                self._server.begin_epoch()
+            self._server.serve(self._by_person)
+            while self._server.notices:
+                self.emit("warning", "clients", self._server.notices.popleft())
         if self._task is not None:
             self._follow(self._task)
         state.mode = control.mode

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -179,17 +180,17 @@ class _Commands:
 
     def __init__(self) -> None:
         self.waiting: list[dict[str, Any]] = []
+        self.notices: deque[str] = deque()
 
-    def serve(self, handler: Handler) -> bool:
+    def serve(self, handler: Handler) -> None:
         for request in self.waiting:
             try:
                 handler(request)
             except Refused:
                 pass  # it was carried out when it was recorded: the states will differ and be told
         self.waiting = []
-        return True
 
-    def drain(self, handler: Handler) -> None:
+    def begin_epoch(self) -> None:
         pass
 
     def close(self) -> None:

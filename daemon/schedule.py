@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from daemon.settings import Settings
 
-_LOOK = 20.0  # Hz of looking who subscribes
 _STATS = 1.0  # Hz of the loop's own statistics
 
 
@@ -38,7 +37,6 @@ class Schedule:
         self.tactile_every = max(round(settings.tactile.rate / stream.tactile_rate), 1)  # frames
         #                         what          wanted rate [Hz]     phase
         self.state = self._turn("hand/state", stream.state_rate, 0)
-        self.look = self._turn("look for subscribers", _LOOK, 2)
         self.stats = self._turn("hand/stats", _STATS, 3)
 
     def _turn(self, what: str, wanted: float, phase: int) -> Turn:
@@ -47,7 +45,7 @@ class Schedule:
 
     def turns(self) -> tuple[Turn, ...]:
         """All of them, from frequent to rare."""
-        turns = (self.state, self.look, self.stats)
+        turns = (self.state, self.stats)
         return tuple(sorted(turns, key=lambda turn: turn.every))
 
     def __str__(self) -> str:

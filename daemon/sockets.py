@@ -1,124 +1,123 @@
-"""Binding the daemon's sockets so that a second daemon is told and nobody's socket is taken."""
+"""Addresses that the daemon listens on, so that a second daemon is told and nobody's is taken."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
+import errno
 import fcntl
 import os
-import select
-from dataclasses import dataclass
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import zmq
-
-from daemon.keys import ServerKeys
-
-_EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)  # plain numbers: enum flags cost a microsecond
-
-# The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
-_poll = ctypes.PyDLL(None).poll
-
-
-class _PollFd(ctypes.Structure):
-    """One descriptor, as the system's poll takes it."""
-
-    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
+_INFO = struct.Struct("=24xI")  # struct tcp_info, of a listener: connections that wait
+_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+_BACKLOG = 1024  # connections that wait to be accepted; the system may allow less
 
 
 class AddressError(Exception):
     """A socket can't be bound: the address is in use or can't be had."""
 
 
-@dataclass(frozen=True, slots=True)
-class Guard:
-    """Who may connect: rights of an ipc address's file, and keys where there are some."""
+class IpcFile:
+    """The file of an ipc address, and the lock beside it that keeps the address ours.
 
-    ipc_mode: int = 0o600
-    keys: ServerKeys | None = None
-
-
-OWNER_ONLY = Guard()
-
-
-class Bound:
-    """A bound ZeroMQ socket and, for ipc, the lock file that keeps the address ours.
-
-    libzmq replaces an ipc file that another process listens on without a word, hence the lock.
+    Whoever binds such an address replaces a file that another process listens on, hence the lock.
     """
 
-    def __init__(
-        self,
-        context: zmq.Context[Any],
-        kind: int,
-        address: str,
-        key: str,
-        queue: int,
-        max_bytes: int,
-        guard: Guard = OWNER_ONLY,
-    ) -> None:
-        self._lock = -1
-        self._file = ""
-        if address.startswith("ipc://"):
-            path = address.removeprefix("ipc://")
-            self._lock = _lock(path, address, key)
-            self._file = path
-        self.socket: zmq.Socket[Any] = context.socket(kind)
-        self.socket.setsockopt(zmq.LINGER, 200)
-        # These bounds hold only for connections made after they were set, so before bind.
-        self.socket.setsockopt(zmq.MAXMSGSIZE, max_bytes)
-        self.socket.setsockopt(zmq.SNDHWM, queue)
-        self.socket.setsockopt(zmq.RCVHWM, queue)
-        if guard.keys is not None:
-            guard.keys.guard(self.socket)
-        # The file comes into being with its rights, so that nobody slips in before.
-        before = os.umask(0o777 & ~guard.ipc_mode) if self._file else -1
+    def __init__(self, address: str, key: str, mode: int) -> None:
+        """``key`` is the setting that names the address. Raises AddressError."""
+        self.path = address.removeprefix("ipc://")
+        self._mode = mode
+        self._lock = _lock(self.path, address, key)
+
+    @contextmanager
+    def coming_into_being(self) -> Iterator[None]:
+        """Around bind: the file has its rights from the first, so that nobody slips in before."""
+        before = os.umask(0o777 & ~self._mode)
         try:
-            self.socket.bind(address)
-            if self._file:
-                Path(self._file).chmod(guard.ipc_mode)
-        except zmq.ZMQError as error:
-            self.close()
-            if error.errno == zmq.EADDRINUSE:
-                raise AddressError(
-                    f"{key}: {address} is in use; is another softfinger running?"
-                ) from None
-            raise AddressError(f"{key}: can't bind {address}: {error}") from None
-        except OSError as error:
-            self.close()
-            raise AddressError(f"{key}: {address}: {error.strerror}") from None
+            yield
+            Path(self.path).chmod(self._mode)
         finally:
-            if before >= 0:
-                os.umask(before)
-        descriptor = cast(int, self.socket.getsockopt(zmq.FD))
-        self._asked = ctypes.byref(_PollFd(descriptor, select.POLLIN, 0))
-
-    def signalled(self) -> bool:
-        """Something may have come since `readable` last said no, if nothing was sent since then.
-
-        libzmq's descriptor tells of a change once, not of what waits; a third of `readable`'s time.
-        """
-        return bool(_poll(self._asked, 1, 0))
-
-    def readable(self) -> bool:
-        """A message waits. About a microsecond."""
-        return bool(cast(int, self.socket.getsockopt(_EVENTS)) & _POLLIN)
+            os.umask(before)
 
     def close(self) -> None:
-        """Close the socket and give the address back."""
-        self.socket.close()
+        """Give the address back."""
         if self._lock >= 0:
-            for path in (self._file, self._file + ".lock"):
+            for path in (self.path, self.path + ".lock"):
                 with contextlib.suppress(OSError):
                     Path(path).unlink()
             os.close(self._lock)
             self._lock = -1
 
 
+class Listener:
+    """A socket that listens on a tcp or ipc address and never blocks."""
+
+    def __init__(self, address: str, key: str, ipc_mode: int) -> None:
+        """``key`` is the setting that names the address. Raises AddressError."""
+        self._file: IpcFile | None = None
+        kind, _, place = address.partition("://")
+        if kind == "ipc":
+            self._file = IpcFile(address, key, ipc_mode)
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        else:
+            host, _, port = place.rpartition(":")
+            host = host.strip("[]")
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.socket(family, socket.SOCK_STREAM)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._socket.setblocking(False)
+        try:
+            if self._file is not None:
+                with contextlib.suppress(FileNotFoundError):  # of one that was killed; we lock it
+                    Path(self._file.path).unlink()
+                with self._file.coming_into_being():
+                    self._socket.bind(self._file.path)
+            else:
+                self._socket.bind((host, int(port)))
+            self._socket.listen(_BACKLOG)
+        except OSError as error:
+            self.close()
+            raise bind_error(address, key, error.errno, error.strerror or str(error)) from None
+
+    def fileno(self) -> int:
+        """The descriptor."""
+        return self._socket.fileno()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """As `socket.socket.accept`."""
+        return self._socket.accept()
+
+    def waiting(self) -> int:
+        """How many connections wait to be accepted, at most."""
+        if self._socket.family == socket.AF_UNIX:
+            return _BACKLOG
+        known = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO.size)
+        return int(_INFO.unpack(known)[0])
+
+    def close(self) -> None:
+        """Give the address back."""
+        self._socket.close()
+        if self._file is not None:
+            self._file.close()
+
+
+def bind_error(address: str, key: str, number: int | None, reason: str) -> AddressError:
+    """What to raise when an address can't be bound."""
+    if number == errno.EADDRINUSE:
+        return AddressError(f"{key}: {address} is in use; is another softfinger running?")
+    return AddressError(f"{key}: can't bind {address}: {reason}")
+
+
 def _lock(path: str, address: str, key: str) -> int:
     try:
-        descriptor = os.open(path + ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = os.open(
+            path + ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
+        )
     except OSError as error:
         raise AddressError(f"{key}: can't bind {address}: {error.strerror}") from None
     try:

@@ -1,30 +1,24 @@
-"""The publisher: two-frame messages ``[topic, msgpack map]`` on an XPUB socket.
+"""The publisher: messages of the stream, packed and given to the gateway.
 
-A subscriber that comes late, stops reading or dies changes nothing here: sends never wait, and a
-slow subscriber's queue is bounded, beyond which its messages are dropped. Topics that nobody
-subscribes to are not packed. Who comes late is told the settings and the last events again, with
-``again`` true, one message a tick.
+A subscriber that comes late, stops reading or dies changes nothing here: the gateway sends to all
+of them. Topics that nobody subscribes to are not packed. Late subscribers are told the settings and
+the last events again, with ``again`` true, by the gateway.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any
 
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 
 from daemon import messages
 from daemon.fixed_maps import InputMap, StateMap
+from daemon.gateway.config import Topics
+from daemon.gateway.link import Link
 from daemon.records import Frame, State
-from daemon.sockets import OWNER_ONLY, Bound, Guard
 from daemon.statistics import Statistics
 
-# Plain numbers, since enum flags cost a microsecond.
-_NOW, _MORE_NOW = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
-_CHANGES = 16  # subscriptions taken in at a time; more wait for the next look
-_KEPT = 50  # events that a late subscriber is told
 _TOPICS = (
     messages.STATE,
     messages.TACTILE,
@@ -35,52 +29,36 @@ _TOPICS = (
     messages.COMMAND,
     messages.SETTINGS,
 )
+_INDEX = {topic: index for index, topic in enumerate(_TOPICS)}
+TOPICS = Topics(
+    tuple(topic.decode() for topic in _TOPICS), _INDEX[messages.SETTINGS], _INDEX[messages.EVENT]
+)
+
+
+def bit(topic: bytes) -> int:
+    """A topic's bit in `Publisher.wanted`."""
+    return 1 << _INDEX[topic]
+
+
+_COMMANDS = bit(messages.COMMAND)
 
 
 class Publisher:
     """Publishes state, tactile frames and events. One thread, the loop's, may call it."""
 
-    def __init__(
-        self, context: zmq.Context[Any], address: str, queue: int, guard: Guard = OWNER_ONLY
-    ) -> None:
-        self._bound = Bound(context, zmq.XPUB, address, "stream.address", queue, 1024, guard)
-        self._socket = self._bound.socket
-        # Past the conveniences of pyzmq's outer class, which cost more than a send does.
-        self._send_frame = super(zmq.Socket, self._socket).send
+    def __init__(self, link: Link) -> None:
+        self._link = link
         self._pack_state, self._pack_input = StateMap(), InputMap()
-        self._subscriptions: set[bytes] = set()
-        self.wants_state = False
-        self.wants_tactile = False
-        self.wants_stats = False
-        self.wants_input = False
-        self.wants_truth = False
-        self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
         self._told = {messages.EVENT: 0, messages.COMMAND: 0, messages.SETTINGS: 0}
-        self._kept: deque[tuple[bytes, dict[str, Any]]] = deque(maxlen=_KEPT)
-        self._settings: list[tuple[bytes, dict[str, Any]]] = []
-        self._owed: set[bytes] = set()  # topics to tell again
-        self._again: deque[tuple[bytes, dict[str, Any]]] = deque()
 
-    def refresh(self) -> None:
-        """Learn who came and went. XPUB tells a topic's first subscriber and its last one gone."""
-        for _ in range(_CHANGES):
-            if not self._bound.readable():
-                break
-            change = self._socket.recv(zmq.NOBLOCK)
-            # What is the beginning of no topic is not kept: there may be any number of it.
-            if change[:1] == b"\x01" and any(each.startswith(change[1:]) for each in _TOPICS):
-                self._subscriptions.add(change[1:])
-                self._owe(change[1:])
-            elif change[:1] == b"\x00":  # else no subscription at all: not every socket is a SUB
-                self._subscriptions.discard(change[1:])
-        self.wants_state = self._wanted(messages.STATE)
-        self.wants_tactile = self._wanted(messages.TACTILE)
-        self.wants_stats = self._wanted(messages.STATS)
-        self.wants_input = self._wanted(messages.INPUT)
-        self.wants_truth = self._wanted(messages.TRUTH)
+    @property
+    def wanted(self) -> int:
+        """The topics that somebody subscribes to, as bits: see `bit`."""
+        return self._link.wanted
 
-    def _wanted(self, topic: bytes) -> bool:
-        return any(topic.startswith(prefix) for prefix in self._subscriptions)
+    def look(self) -> None:
+        """Learn who came and went. The loop does by taking in commands."""
+        self._link.look()
 
     def state(self, state: State, scene: messages.Parts, step: int = 1) -> None:
         """Publish ``hand/state``, every ``step`` ticks."""
@@ -124,14 +102,13 @@ class Publisher:
         """Publish ``hand/event``."""
         seq = self._count(messages.EVENT)
         message = messages.event_message(seq, wall, t, level, kind, text)
-        self._kept.append((messages.EVENT, message))
         self._send(messages.EVENT, message)
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
     ) -> None:
         """Publish ``hand/command``: what came and what became of it."""
-        if self._wanted(messages.COMMAND):
+        if self._link.wanted & _COMMANDS:
             seq = self._count(messages.COMMAND)
             message = messages.command_message(seq, wall, t, tick, request, error)
             self._send(messages.COMMAND, message)
@@ -139,27 +116,7 @@ class Publisher:
     def settings(self, wall: float, t: float, facts: messages.Facts) -> None:
         """Publish ``hand/settings``, once."""
         message = messages.settings_message(self._count(messages.SETTINGS), wall, t, facts)
-        self._settings = [(messages.SETTINGS, message)]
         self._send(messages.SETTINGS, message)
-
-    def repeat(self) -> None:
-        """Send one of the messages that a late subscriber missed, if any is owed."""
-        if not self._again:
-            if not self._owed:
-                return
-            held = [*self._settings, *self._kept]
-            self._again.extend(each for each in held if each[0] in self._owed)
-            self._owed.clear()
-            if not self._again:
-                return
-        topic, message = self._again.popleft()
-        self._send(topic, {**message, "again": True})
-
-    def _owe(self, prefix: bytes) -> None:
-        # Who comes while a list is being sent is told by the next one: a flood makes no more.
-        for topic in (messages.SETTINGS, messages.EVENT):
-            if topic.startswith(prefix):
-                self._owed.add(topic)
 
     def _count(self, topic: bytes) -> int:
         self._told[topic] += 1
@@ -169,12 +126,7 @@ class Publisher:
         self._send_packed(topic, messages.pack(message))
 
     def _send_packed(self, topic: bytes, packed: bytes) -> None:
-        try:
-            self._send_frame(topic, _MORE_NOW)
-            self._send_frame(packed, _NOW)
-        except zmq.Again:
-            pass  # XPUB drops rather than waits; should libzmq ever refuse, the loop goes on
-
-    def close(self) -> None:
-        """Send what is queued (for 0.2 s at most) and close."""
-        self._bound.close()
+        if topic == messages.SETTINGS:
+            self._link.publish_lasting(_INDEX[topic], packed)
+        else:
+            self._link.publish(_INDEX[topic], packed, keep=topic == messages.EVENT)

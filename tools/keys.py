@@ -12,7 +12,8 @@ _EPILOG = """\
 The first call makes the daemon's keys and those of the client `local`, for the tools on the
 daemon's own machine; each CLIENT is one more. Set access.keys in the profile to FOLDER, bring
 FOLDER/CLIENT to that client's machine, and give it to the tools with --keys. Nothing is ever
-overwritten; a client is shut out by removing FOLDER/server/clients/CLIENT.key and restarting.
+overwritten. Removing FOLDER/server/clients/CLIENT.key shuts a client out within a second. With keys
+the commander's lease belongs to the key's name.
 Exit status: 0 made, 1 refused."""
 
 

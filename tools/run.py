@@ -151,11 +151,13 @@ def _tell_times(loop: Any, log: EventLog) -> None:
 
 def _record(path: Path, settings: Settings, daemon: Any) -> Any:
     """A recorder that has subscribed to everything. Raises NoRecorder."""
+    from daemon import messages
+    from daemon.stream import bit
     from tools.recorder_beside import RecorderBeside
 
     def subscribed() -> bool:
-        daemon.publisher.refresh()
-        return bool(daemon.publisher.wants_input)
+        daemon.publisher.look()
+        return bool(daemon.publisher.wanted & bit(messages.INPUT))
 
     def ended(why: str) -> None:
         daemon.loop.report("error", "record", why)

@@ -8,7 +8,7 @@ import math
 import sys
 from typing import Any
 
-from daemon.commands import NoAnswer, send
+from daemon.command_client import NoAnswer, send
 from daemon.keys import KeyFileError
 from daemon.patience import PATIENCE
 from daemon.settings import CommandSettings

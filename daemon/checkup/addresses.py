@@ -9,7 +9,7 @@ import socket
 from pathlib import Path
 
 from daemon.checkup.result import Result
-from daemon.commands import NoAnswer, send
+from daemon.command_client import NoAnswer, send
 from daemon.keys import KeyFileError, load_client
 from daemon.settings import Settings
 

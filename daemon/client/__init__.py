@@ -27,7 +27,8 @@ from daemon.client.records import (
     TactileFrame,
     to_columns,
 )
-from daemon.commands import NoAnswer, Refused
+from daemon.command_client import NoAnswer
+from daemon.commands import Refused
 
 __all__ = [
     "AsyncHand",

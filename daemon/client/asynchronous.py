@@ -18,8 +18,9 @@ from daemon.client.errors import HandFault, NoStream, NotInTime
 from daemon.client.hand import COMMANDS, STREAM, accepted
 from daemon.client.records import Event, HandState, TactileFrame
 from daemon.client.wire import Decoder, nothing_from, prepare, silent
-from daemon.commands import NoAnswer
+from daemon.command_client import LOCALLY, NoAnswer
 from daemon.keys import load_client
+from daemon.local_stop import stop_locally
 from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
 
 _log = logging.getLogger(__name__)
@@ -118,6 +119,12 @@ class AsyncHand:
         request: dict[str, Any] = {"command": name, **numbers}
         if self.client:
             request["client"] = self.client
+        if name == "stop":  # past all other clients, where the daemon is this user's
+            stopped = await asyncio.to_thread(
+                stop_locally, self.command_address, min(self.timeout, LOCALLY)
+            )
+            if stopped is not None:
+                return accepted(stopped)
         async with self._socket(zmq.REQ) as socket:
             socket.connect(self.command_address)
             await socket.send(messages.pack(request))

@@ -15,7 +15,8 @@ from daemon import messages
 from daemon.client.errors import HandFault, NoStream, NotInTime
 from daemon.client.records import Event, HandState, TactileFrame
 from daemon.client.wire import Decoder, nothing_from, prepare, silent
-from daemon.commands import Refused, send
+from daemon.command_client import send
+from daemon.commands import Refused
 from daemon.keys import load_client
 from daemon.patience import PATIENCE, SILENCE
 from daemon.settings import CommandSettings, Stream

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.client import Refused
-from daemon.commands import send
+from daemon.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "tools.cli"]
 # A hand that sits out a busy machine's stalls, for tests that are not about its time-outs.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,8 +26,9 @@ class Script:
         self._due = due
         self._tick = 0
         self.refused = 0
+        self.notices: deque[str] = deque()
 
-    def serve(self, handler: Handler) -> bool:
+    def serve(self, handler: Handler) -> None:
         self._tick += 1
         request = self._due.get(self._tick)
         if request is not None:
@@ -34,9 +36,8 @@ class Script:
                 handler(request)
             except Refused:
                 self.refused += 1
-        return request is not None
 
-    def drain(self, handler: Handler) -> None:
+    def begin_epoch(self) -> None:
         pass
 
 
@@ -62,8 +63,7 @@ def published(
         publisher = daemon.publisher
         assert publisher is not None
         publisher._send_packed = take  # type: ignore[method-assign]
-        publisher._subscriptions.add(b"hand/")
-        publisher.refresh()
+        publisher._link.wanted = -1
         publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
         daemon.loop._server = script
         daemon.loop.advance(seconds)

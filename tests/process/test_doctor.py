@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import resource
-import select
 import socket
 import subprocess
 import sys
@@ -14,19 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zmq
 
 from daemon import warm_up
 from daemon.checkup import addresses as sockets
 from daemon.checkup import hand, kernels, machine, mending, ports
 from daemon.checkup.result import Result
-from daemon.commands import CommandServer
 from daemon.profiles import load
 from daemon.servos import registers as reg
 from daemon.servos.scanning import scan
 from daemon.settings import Settings
 from daemon.simulation.emulator import Emulator
 from tests.harness.descendants import ending
+from tests.harness.gateway import Served
 from tools import doctor
 from tools.cli import main
 
@@ -354,21 +352,9 @@ def test_free_and_taken_sockets(addresses, monkeypatch):
     assert free.status == "pass"
 
 
-def test_a_running_daemon_is_recognised(addresses, context):
-    server = CommandServer(context, addresses[1], 4096)
-    asked = threading.Event()
-
-    def answer() -> None:
-        while not asked.is_set():
-            select.select([server._socket.getsockopt(zmq.FD)], [], [], 0.01)
-            server.serve(lambda request: {"mode": "holding"})
-
-    thread = threading.Thread(target=answer)
-    thread.start()
-    _, found = check(profile(addresses))
-    asked.set()
-    thread.join()
-    server.close()
+def test_a_running_daemon_is_recognised(addresses):
+    with Served(commands=addresses[1]) as served, served.serving(lambda _: {"mode": "holding"}):
+        _, found = check(profile(addresses))
     assert found.status == "warn"
     assert "runs here already (holding)" in found.text
 
@@ -377,12 +363,11 @@ def check(settings: Settings) -> list[Result]:
     return sockets.check_addresses(settings)
 
 
-def test_ipc_addresses(tmp_path, context):
+def test_ipc_addresses(tmp_path):
     place = f"ipc://{tmp_path / 'commands'}"
     assert sockets.why_not_free(place) == ""
-    server = CommandServer(context, place, 4096)
-    assert sockets.why_not_free(place) == "in use"
-    server.close()
+    with Served(commands=place):
+        assert sockets.why_not_free(place) == "in use"
     assert sockets.why_not_free(place) == ""
     assert "is not there" in sockets.why_not_free("ipc:///nowhere/at/all")
     assert "expected tcp or ipc" in sockets.why_not_free("udp://1")

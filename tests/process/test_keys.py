@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,14 +13,12 @@ import pytest
 import zmq
 import zmq.auth
 
-from daemon.client import Hand
-from daemon.commands import CommandServer, NoAnswer, send
-from daemon.doorkeeper import Doorkeeper
-from daemon.keys import KeyFileError, ServerKeys, load_client, load_server, make_keys
-from daemon.sockets import Guard
-from daemon.stream import Publisher
+from daemon.client import Hand, NoStream
+from daemon.command_client import NoAnswer, send
+from daemon.keys import KeyFileError, load_client, load_server, make_keys
 from tests.conftest import until
 from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
+from tests.harness.gateway import Served
 
 
 @pytest.fixture
@@ -88,41 +87,55 @@ def test_a_libzmq_without_curve_is_told(tmp_path: Path, monkeypatch: pytest.Monk
         make_keys(tmp_path, [])
 
 
+@pytest.mark.parametrize(
+    "which",
+    ["", "server", "server/clients", "server/clients/alice.key", "server/server.key_secret"],
+)
+def test_keys_that_somebody_else_may_write_or_owns_are_refused(
+    folder: Path, which: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = folder / which if which else folder
+    mode = stat.S_IMODE(path.stat().st_mode)
+    path.chmod(mode | 0o022)
+    with pytest.raises(KeyFileError, match=f"{path}: may be .* by others"):
+        load_server(folder)
+    path.chmod(mode)
+    load_server(folder)
+    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # whoever it is, it isn't ours
+    if os.getuid() == 0:
+        for each in [path, *path.parents]:
+            if each.is_relative_to(folder):
+                os.chown(each, 4_242, -1)
+        os.chown(path, 4_243, -1)
+    with pytest.raises(KeyFileError, match="belongs to user"):
+        load_server(folder)
+
+
 # --- sockets ----------------------------------------------------------------------------------
 
 
 class Guarded:
-    """Both of the daemon's sockets, guarded; commands are answered as they come."""
+    """Both of the daemon's sockets, for the holders of keys; commands are answered as they come."""
 
-    def __init__(self, context: zmq.Context[Any], addresses: tuple[str, str], folder: Path) -> None:
-        keys = load_server(folder)
-        self.doorkeeper = Doorkeeper(context, keys.clients)
-        self.publisher = Publisher(context, addresses[0], 10, Guard(keys=keys))
-        self.server = CommandServer(context, addresses[1], 200, guard=Guard(keys=keys))
-        self.heard: list[str] = []
+    def __init__(self, addresses: tuple[str, str], folder: Path) -> None:
+        self.served = Served(*addresses, keys=str(folder))
+        self.heard: list[dict[str, Any]] = []
+        until(lambda: [self.step(), self.served.service._doors[-1].epoch == 1][1])
 
     def step(self) -> None:
-        self.publisher.refresh()
-        self.publisher.event(0.0, 0.0, "info", "test", "told")
-        self.server.serve(self._hear)
+        self.served.publisher.event(0.0, 0.0, "info", "test", "told")
+        self.served.serve(self._hear)
 
     def _hear(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.heard.append(request["command"])
+        self.heard.append(request)
         return {}
-
-    def close(self) -> None:
-        self.server.close()
-        self.publisher.close()
-        self.doorkeeper.close()
 
 
 @pytest.fixture
-def guarded(
-    context: zmq.Context[Any], addresses: tuple[str, str], folder: Path
-) -> Iterator[Guarded]:
-    guarded = Guarded(context, addresses, folder)
-    yield guarded
-    guarded.close()
+def guarded(addresses: tuple[str, str], folder: Path) -> Iterator[Guarded]:
+    guarded = Guarded(addresses, folder)
+    with guarded.served:
+        yield guarded
 
 
 @pytest.fixture
@@ -159,7 +172,7 @@ def test_a_client_with_its_key_subscribes_and_commands(
         return bool(subscriber.poll(0) and commander.poll(0))
 
     until(both)
-    assert guarded.heard == ["arm"]
+    assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
 
 def stranger(folder: Path, kind: str) -> Any:
@@ -191,33 +204,43 @@ def test_whoever_has_no_key_gets_nothing(
     until(lambda: guarded.step() or ours[1].poll(0))
     assert not theirs[0].poll(0)
     assert not theirs[1].poll(0)
-    assert guarded.heard == ["arm"]
+    assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
 
-def test_without_a_doorkeeper_nobody_is_let_in(
-    context: zmq.Context[Any],
-    others: zmq.Context[Any],
-    addresses: tuple[str, str],
-    folder: Path,
+def test_a_client_is_who_its_key_says_whatever_it_says(
+    guarded: Guarded, others: zmq.Context[Any], addresses: tuple[str, str], folder: Path
 ) -> None:
-    keys: ServerKeys = load_server(folder)
-    server = CommandServer(context, addresses[1], 200, guard=Guard(keys=keys))
-    socket = others.socket(zmq.DEALER)
+    socket = others.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
-    load_client(folder).guard(socket)
-    monitor = socket.get_monitor_socket()
+    load_client(folder / "alice").guard(socket)
     socket.connect(addresses[1])
-    socket.send(msgpack.packb({"command": "arm"}))
-    from zmq.utils.monitor import parse_monitor_message
+    socket.send(msgpack.packb({"command": "arm", "client": "local"}))
+    until(lambda: [guarded.step(), socket.poll(0)][1])
+    assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
-    events = []
-    while zmq.EVENT_DISCONNECTED not in events and zmq.EVENT_HANDSHAKE_FAILED_AUTH not in events:
-        assert monitor.poll(10_000)
-        events.append(parse_monitor_message(monitor.recv_multipart())["event"])
-        assert events[-1] != zmq.EVENT_HANDSHAKE_SUCCEEDED
-    assert not server.serve(lambda _: {})
-    socket.disable_monitor()
-    server.close()
+
+def test_what_waits_with_keys_dies_with_a_stop_and_the_stops_own_client_goes_on(
+    guarded: Guarded, others: zmq.Context[Any], addresses: tuple[str, str], folder: Path
+) -> None:
+    flood, stopper = others.socket(zmq.DEALER), others.socket(zmq.REQ)
+    for socket in (flood, stopper):
+        socket.setsockopt(zmq.LINGER, 0)
+        load_client(folder / "alice").guard(socket)
+        socket.connect(addresses[1])
+    stopper.send(msgpack.packb({"command": "status"}))
+    until(lambda: [guarded.step(), stopper.poll(0)][1])
+    stopper.recv()
+    for _ in range(100):
+        flood.send(msgpack.packb({"command": "arm"}))
+    until(lambda: [guarded.step(), len(guarded.heard) > 3][1])
+    stopper.send(msgpack.packb({"command": "stop"}))
+    until(lambda: [guarded.step(), stopper.poll(0)][1])
+    stopper.recv()
+    stopper.send(msgpack.packb({"command": "status"}))
+    until(lambda: [guarded.step(), stopper.poll(0)][1])
+    assert msgpack.unpackb(stopper.recv())["ok"]
+    names = [request["command"] for request in guarded.heard]
+    assert names[names.index("stop") :] == ["stop", "status"]
 
 
 # --- the daemon -------------------------------------------------------------------------------
@@ -236,13 +259,54 @@ def test_a_running_daemon_with_keys(
     told = softfinger("send", *words)
     assert told.returncode == 0, told.stderr
     with pytest.raises(NoAnswer):
-        send(addresses[1], {"command": "stop"}, timeout=0.3)
+        send(addresses[1], {"command": "status"}, timeout=0.3)
+    # Who could end the daemon may stop it, too.
+    assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"]
     with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
         assert hand.state().mode == "disarmed"
         insist(hand.arm)
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
     where = ("--state", addresses[0], "--commands", addresses[1])
     until_it_says(("monitor", "--plain", "--keys", folder / "alice", *where), "armed")
+    assert running.end() == 0
+
+
+def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
+    profile: Callable[..., Path],
+    addresses: tuple[str, str],
+    folder: Path,
+    start: Callable[..., Running],
+) -> None:
+    running = start(
+        "--config", str(profile(f'access.keys = "{folder}"\nsafety.overruns_fault = 100000\n'))
+    )
+    with Hand(*addresses, keys=folder / "alice") as alice:
+        assert alice.state().mode == "disarmed"
+        (folder / "server" / "clients" / "alice.key").unlink()
+
+        def shut_out() -> bool:
+            try:
+                alice.state(timeout=0.5)
+            except NoStream:
+                return True
+            return False
+
+        until(shut_out)
+        with Hand(*addresses, keys=folder) as local, local.events(timeout=20.0) as told:
+            assert any("shut out: alice" in event.text for event in told)
+        with pytest.raises(NoAnswer):
+            send(addresses[1], {"command": "arm"}, 0.5, load_client(folder / "alice"))
+    make_keys(folder, ["bob"])
+
+    def bob_is_let_in() -> bool:
+        try:
+            return bool(send(addresses[1], {"command": "status"}, 1.0, load_client(folder / "bob")))
+        except NoAnswer:
+            return False
+
+    until(bob_is_let_in)
+    with Hand(*addresses, keys=folder) as local:
+        assert local.state().mode == "disarmed"
     assert running.end() == 0
 
 

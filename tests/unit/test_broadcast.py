@@ -10,32 +10,26 @@ import zmq
 
 from daemon.assembly import Daemon
 from daemon.broadcast import Broadcast
-from daemon.messages import SCHEMA, Rates, stats_message
+from daemon.messages import SCHEMA, STATE, STATS, TACTILE, Rates, stats_message
 from daemon.records import State
 from daemon.schedule import Schedule
 from daemon.settings import Settings
 from daemon.statistics import Statistics, record
-from daemon.stream import Publisher
+from daemon.stream import bit
 from tests.conftest import until
+from tests.harness.gateway import Served
 
 
 class Listener:
     """Wants everything and keeps the tick numbers of what it got."""
 
-    wants_state = wants_tactile = wants_stats = True
+    wanted = bit(STATE) | bit(TACTILE) | bit(STATS)
 
     def __init__(self) -> None:
-        self.ticks: dict[str, list[int]] = {"look": [], "state": [], "stats": []}
+        self.ticks: dict[str, list[int]] = {"state": [], "stats": []}
         self.frames: tuple[list[int], list[int]] = ([], [])  # of each finger, by number
         self.rates: list[Rates] = []
         self.seq = 0
-
-    def refresh(self) -> None:
-        self.ticks["look"].append(self.seq)
-
-    def __getattr__(self, name: str) -> Any:
-        """No other topic is wanted, and nothing else is done."""
-        return False if name.startswith("wants_") else lambda *_: None
 
     def state(self, state: State, *_: Any) -> None:
         self.ticks["state"].append(state.seq)
@@ -70,7 +64,6 @@ def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame() -> None:
     listener, _ = listened(4.0, stream={"tactile_rate": 25.0})
     ticks = listener.ticks
     assert ticks["state"] == list(range(5, 2001, 5))
-    assert ticks["look"] == list(range(2, 2001, 25))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
     for frames in listener.frames:  # 100 Hz, of which 25 are published: one of each four
@@ -121,17 +114,18 @@ def test_the_schedule_tells_every_rate() -> None:
 def test_the_statistics_message_has_every_field_as_documented(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=10)
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
     socket = context.socket(zmq.SUB)
     socket.subscribe("hand/stats")
     socket.connect(addresses[0])
-    until(lambda: (publisher.refresh(), publisher.wants_stats)[1])
-    assert not publisher.wants_state
+    until(lambda: [served.settle(), publisher.wanted & bit(STATS)][1])
+    assert not publisher.wanted & bit(STATE)
     statistics = Statistics()
     record(statistics.counts, statistics.largest, 1e-6, 2e-5, 1e-5, 2e-6)
     rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
     publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
-    assert socket.poll(60_000)
+    until(lambda: [served.settle(), socket.poll(0)][1])
     topic, payload = socket.recv_multipart()
     assert topic == b"hand/stats"
     message = msgpack.unpackb(payload)
@@ -148,7 +142,7 @@ def test_the_statistics_message_has_every_field_as_documented(
         "rates": {"tick": 500.0, "left": 100.0, "right": 99.0, "state": 100.0, "tactile": 50.0},
     }
     socket.close()
-    publisher.close()
+    served.close()
 
 
 def test_statistics_that_are_zero_are_still_floats() -> None:

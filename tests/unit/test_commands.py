@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import stat
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,14 @@ from hypothesis import strategies as st
 
 from daemon import assembly
 from daemon.clock import VirtualClock
-from daemon.commands import CommandServer, NoAnswer, Refused, decode, send
+from daemon.command_client import NoAnswer, send
+from daemon.commands import Refused, decode
+from daemon.gateway.config import Config
+from daemon.gateway.supervisor import Gateway
 from daemon.settings import Settings
-from daemon.sockets import AddressError, Guard
-from daemon.stream import Publisher
+from daemon.sockets import AddressError
 from tests.conftest import until
+from tests.harness.gateway import Served
 
 
 def echo(request: dict[str, Any]) -> dict[str, Any]:
@@ -30,20 +33,9 @@ def echo(request: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.fixture
-def server(context: zmq.Context[Any], addresses: tuple[str, str]) -> Iterator[CommandServer]:
-    server = CommandServer(context, addresses[1], max_bytes=200)
-    stop = threading.Event()
-
-    def serve() -> None:
-        while not stop.is_set():
-            server.serve(echo)
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    yield server
-    stop.set()
-    thread.join()
-    server.close()
+def server(addresses: tuple[str, str]) -> Iterator[Served]:
+    with Served(commands=addresses[1]) as served, served.serving(echo):
+        yield served
 
 
 def ask(address: str, payload: bytes) -> dict[str, Any]:
@@ -60,9 +52,7 @@ def ask(address: str, payload: bytes) -> dict[str, Any]:
     return reply
 
 
-def test_a_plain_req_socket_gets_its_answer(
-    server: CommandServer, addresses: tuple[str, str]
-) -> None:
+def test_a_plain_req_socket_gets_its_answer(server: Served, addresses: tuple[str, str]) -> None:
     assert send(addresses[1], {"command": "arm"}) == {"ok": True, "heard": "arm"}
     assert send(addresses[1], {"command": "no"}) == {"ok": False, "error": "not now"}
 
@@ -82,7 +72,7 @@ def test_a_plain_req_socket_gets_its_answer(
     ],
 )
 def test_malformed_commands_are_refused_and_the_server_lives_on(
-    server: CommandServer, addresses: tuple[str, str], payload: bytes, error: str
+    server: Served, addresses: tuple[str, str], payload: bytes, error: str
 ) -> None:
     reply = ask(addresses[1], payload)
     assert reply["ok"] is False
@@ -91,7 +81,7 @@ def test_malformed_commands_are_refused_and_the_server_lives_on(
 
 
 def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
-    server: CommandServer, context: zmq.Context[Any], addresses: tuple[str, str]
+    server: Served, context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
@@ -102,17 +92,20 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
     assert send(addresses[1], {"command": "arm"})["ok"] is True
 
 
-def test_drain_answers_all_that_wait(context: zmq.Context[Any], addresses: tuple[str, str]) -> None:
-    server = CommandServer(context, addresses[1], max_bytes=200)
-    early = context.socket(zmq.REQ)
-    early.connect(addresses[1])
-    early.send(msgpack.packb({"command": "arm"}))
-    until(lambda: server._bound.readable())
-    server.drain(lambda _: {"heard": "late"})
-    assert early.poll(60_000)
-    assert msgpack.unpackb(early.recv()) == {"ok": True, "heard": "late"}
-    assert not server.serve(echo)
-    server.close()
+def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    with Served(commands=addresses[1]) as served:
+        early = context.socket(zmq.REQ)
+        early.connect(addresses[1])
+        early.send(msgpack.packb({"command": "arm"}))
+        until(lambda: [served.settle(1), served.link.asked][1])
+        served.server.begin_epoch()
+        until(lambda: [served.serve(echo), early.poll(0)][1])
+        assert "before a stop; send it again" in msgpack.unpackb(early.recv())["error"]
+        early.send(msgpack.packb({"command": "arm"}))
+        until(lambda: [served.serve(echo), early.poll(0)][1])
+        assert msgpack.unpackb(early.recv()) == {"ok": True, "heard": "arm"}
 
 
 def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
@@ -142,27 +135,17 @@ def test_any_bytes_are_decoded_or_refused(payload: bytes) -> None:
 
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
 def test_a_second_server_on_the_same_address_is_told(
-    context: zmq.Context[Any],
-    addresses: tuple[str, str],
-    tmp_path_factory: pytest.TempPathFactory,
-    transport: str,
+    addresses: tuple[str, str], tmp_path_factory: pytest.TempPathFactory, transport: str
 ) -> None:
     address = addresses[1]
     if transport == "ipc":
         address = f"ipc://{tmp_path_factory.mktemp('s')}/c"
-    first = CommandServer(context, address, 200)
-    with pytest.raises(AddressError, match="is another softfinger running"):
-        CommandServer(context, address, 200)
-    first.close()
-
-    def free() -> bool:  # libzmq gives a port back in a thread of its own
-        try:
-            CommandServer(context, address, 200).close()
-        except AddressError:
-            return False
-        return True
-
-    until(free)
+    with (
+        Served(commands=address),
+        pytest.raises(AddressError, match="is another softfinger running"),
+    ):
+        Served(commands=address)
+    Served(commands=address).close()
 
 
 class Flood:
@@ -176,168 +159,152 @@ class Flood:
             for _ in range(each):
                 socket.send(msgpack.packb({"command": "move"}))
 
-    def replies(self) -> list[dict[str, Any]]:
-        found = []
+    def collect(self, replies: list[dict[str, Any]]) -> int:
+        """Add what has been answered; how many there are now."""
         for socket in self.sockets:
-            while socket.poll(20):
-                found.append(msgpack.unpackb(socket.recv()))
-        return found
-
-
-def arrived(server: CommandServer) -> bool:
-    return server._bound.readable()
+            while socket.poll(0):
+                replies.append(msgpack.unpackb(socket.recv()))
+        return len(replies)
 
 
 def test_a_stop_goes_before_all_that_waits(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    server = CommandServer(context, addresses[1], max_bytes=200)
-    flood = Flood(context, addresses[1], clients=4, each=40)
-    until(lambda: arrived(server))
-    order: list[str] = []
+    with Served(commands=addresses[1]) as served:
+        flood = Flood(context, addresses[1], clients=4, each=40)
+        order: list[str] = []
 
-    def note(request: dict[str, Any]) -> dict[str, Any]:
-        order.append(request["command"])
-        return {}
+        def note(request: dict[str, Any]) -> dict[str, Any]:
+            order.append(request["command"])
+            return {}
 
-    server.serve(note)  # the flood is being worked on
-    stopper = context.socket(zmq.DEALER)
-    stopper.setsockopt(zmq.LINGER, 0)
-    stopper.connect(addresses[1])
-    stopper.send_multipart([b"", msgpack.packb({"command": "stop"})])
-    ticks = 0
-
-    def stopped() -> bool:
-        nonlocal ticks
-        ticks += 1
-        server.serve(note)
-        return bool(stopper.poll(1))
-
-    until(stopped)
-    assert "stop" in order
-    assert order.index("stop") < 160, "not behind all of the flood"
-    assert not server._waiting, "nothing of before is carried out later"
-    del flood
-    server.close()
-
-
-def test_what_was_sent_before_a_stop_is_refused_and_what_comes_after_is_not(
-    context: zmq.Context[Any],
-) -> None:
-    server = CommandServer(context, "inproc://commands", max_bytes=200)  # all is there at once
-    client = context.socket(zmq.DEALER)
-    client.connect("inproc://commands")
-    heard: list[str] = []
-
-    def note(request: dict[str, Any]) -> dict[str, Any]:
-        heard.append(request["command"])
-        return {}
-
-    for name in ("arm", "move", "stop"):
-        client.send(msgpack.packb({"command": name}))
-    while server.serve(note):
-        pass
-    assert heard == ["stop"]
-    replies = [msgpack.unpackb(client.recv()) for _ in range(3)]
-    assert [reply["ok"] for reply in replies] == [True, False, False]
-    assert "a stop came before its turn" in replies[1]["error"]
-    client.send(msgpack.packb({"command": "arm"}))
-    assert server.serve(note)
-    assert heard == ["stop", "arm"]
-    client.close()
-    server.close()
+        until(lambda: [served.serve(note), order][1])  # the flood is being worked on
+        stopper = context.socket(zmq.DEALER)
+        stopper.setsockopt(zmq.LINGER, 0)
+        stopper.connect(addresses[1])
+        stopper.send_multipart([b"", msgpack.packb({"command": "stop"})])
+        until(lambda: [served.serve(note), stopper.poll(0)][1])
+        assert order.count("stop") == 1
+        assert order.index("stop") < 160, "not behind all of the flood"
+        carried_out = len(order)
+        # All that was sent before the stop is answered, and none of it carried out.
+        replies: list[dict[str, Any]] = []
+        until(lambda: [served.serve(note), flood.collect(replies) == 160][1])
+        assert len(order) == carried_out
+        assert sum(reply["ok"] for reply in replies) == carried_out - 1
 
 
 def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     clock = VirtualClock()
-    server = CommandServer(context, addresses[1], 200, per_second=20.0, now=clock.now)
-    flood = Flood(context, addresses[1], clients=1, each=60)
-    quiet = Flood(context, addresses[1], clients=1, each=3)
-    replies: list[dict[str, Any]] = []
-    kind: list[dict[str, Any]] = []
+    with Served(commands=addresses[1], per_second=20.0, now=clock.now) as served:
+        flood = Flood(context, addresses[1], clients=1, each=60)
+        quiet = Flood(context, addresses[1], clients=1, each=3)
+        replies: list[dict[str, Any]] = []
+        kind: list[dict[str, Any]] = []
 
-    def all_answered() -> bool:
-        while server.serve(echo):
-            pass
-        replies.extend(flood.replies())
-        kind.extend(quiet.replies())
-        return server.refused_by_pace == 40 and len(kind) == 3
+        def all_answered() -> bool:
+            clock.sleep_until(clock.now() + 1e-3)  # one that floods is not read for a while
+            served.serve(echo)
+            flood.collect(replies)
+            return served.server.refused_by_pace == 40 and quiet.collect(kind) == 3
 
-    until(all_answered)
-    assert sum(reply["ok"] for reply in replies) == 20
-    assert {reply.get("error") for reply in replies if not reply["ok"]} == {
-        "too many commands: at most 20 a second"
-    }
-    assert all(reply["ok"] for reply in kind)
-    # A second later it may send again.
-    flood.sockets[0].send(msgpack.packb({"command": "move"}))
-    clock.sleep_until(1.0)
-    until(lambda: server.serve(echo))
-    assert flood.replies() == [{"ok": True, "heard": "move"}]
-    server.close()
+        until(all_answered)
+        until(lambda: [served.serve(echo), flood.collect(replies) > 20][1])
+        assert sum(reply["ok"] for reply in replies) == 20
+        assert {reply.get("error") for reply in replies if not reply["ok"]} == {
+            "too many commands: at most 20 a second"
+        }
+        assert all(reply["ok"] for reply in kind)
+        # A second later it may send again.
+        clock.sleep_until(clock.now() + 1.0)
+        flood.sockets[0].send(msgpack.packb({"command": "move"}))
+        last: list[dict[str, Any]] = []
+        until(lambda: [served.serve(echo), flood.collect(last)][1])
+        assert last == [{"ok": True, "heard": "move"}]
+
+
+def test_a_client_that_asks_again_and_again_is_answered_each_time(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    """Whoever waits for its answer would wait for ever if it got none."""
+    clock = VirtualClock()
+    with Served(commands=addresses[1], per_second=5.0, now=clock.now) as served:
+        client = context.socket(zmq.REQ)
+        client.connect(addresses[1])
+        told = []
+        for k in range(12):
+            clock.sleep_until(0.06 * k)  # a refused one is not read for a while
+            client.send(msgpack.packb({"command": "status"}))
+            until(lambda: [served.serve(echo), client.poll(0)][1])
+            told.append(msgpack.unpackb(client.recv())["ok"])
+        assert told[:5] == [True] * 5
+        assert False in told
 
 
 def test_clients_that_flood_leave_others_a_place(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    server = CommandServer(context, addresses[1], max_bytes=200, per_second=200.0)
-    flood = Flood(context, addresses[1], clients=4, each=60)
     heard = []
 
     def note(request: dict[str, Any]) -> dict[str, Any]:
         heard.append(request["command"])
         return {}
 
-    until(lambda: server.serve(note) and server.refused_by_pace > 10)  # no place is left
-    other = context.socket(zmq.REQ)
-    other.connect(addresses[1])
-    other.send(msgpack.packb({"command": "grasp"}))
-    until(lambda: [server.serve(note), other.poll(0)][1])
-    assert msgpack.unpackb(other.recv())["ok"]
-    assert flood.sockets
-    assert len(heard) < 160, "it waited for more than those that were before it"
-    other.close()
-    server.close()
+    with Served(commands=addresses[1], per_second=600.0) as served:
+        flood = Flood(context, addresses[1], clients=4, each=500)
+        # No place is left.
+        until(lambda: [served.service.step(0.0), served.service.requests.refused > 10][1])
+        other = context.socket(zmq.REQ)
+        other.connect(addresses[1])
+        other.send(msgpack.packb({"command": "grasp"}))
+        until(lambda: [served.serve(note), other.poll(0)][1])
+        assert msgpack.unpackb(other.recv())["ok"]
+        assert flood.sockets
+        assert len(heard) < 1100, "it waited for more than those that were before it"
 
 
-def test_what_many_clients_are_remembered_by_is_bounded(
+def test_many_clients_that_ask_once_each_are_all_answered(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    server = CommandServer(context, addresses[1], max_bytes=200, per_second=2.0)
-    for client in range(5000):
-        assert server._in_pace(str(client).encode(), 0.0)
-    assert len(server._paces) <= 256
-    server.close()
+    context.set(zmq.MAX_SOCKETS, 2000)
+    with Served(commands=addresses[1], places=1000, now=VirtualClock().now) as served:
+        flood = Flood(context, addresses[1], clients=600, each=1)
+        replies: list[dict[str, Any]] = []
+        until(lambda: [served.serve(echo), flood.collect(replies) >= 600][1])
+        assert all(reply["ok"] for reply in replies)
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o660])
 def test_an_ipc_file_has_the_rights_that_were_set(
-    context: zmq.Context[Any], tmp_path_factory: pytest.TempPathFactory, mode: int
+    tmp_path_factory: pytest.TempPathFactory, mode: int
 ) -> None:
     folder = tmp_path_factory.mktemp("s")
-    server = CommandServer(context, f"ipc://{folder}/c", 200, guard=Guard(mode))
-    stream = Publisher(context, f"ipc://{folder}/s", 10, Guard(mode))
-    for name in ("c", "s"):
-        assert stat.S_IMODE(Path(f"{folder}/{name}").stat().st_mode) == mode
-    assert stat.S_IMODE(Path(f"{folder}/c.lock").stat().st_mode) == 0o600
-    server.close()
-    stream.close()
+    with Served(f"ipc://{folder}/s", f"ipc://{folder}/c", ipc_mode=mode):
+        for name in ("c", "s"):
+            assert stat.S_IMODE(Path(f"{folder}/{name}").stat().st_mode) == mode
+        assert stat.S_IMODE(Path(f"{folder}/c.lock").stat().st_mode) == 0o600
     assert list(folder.iterdir()) == []
 
 
 def test_a_signal_while_the_sockets_are_made_ends_the_start(
     monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, str]
 ) -> None:
-    made: list[zmq.Socket[Any]] = []
+    made: list[Gateway] = []
 
-    def interrupted(context: zmq.Context[Any], *_: Any) -> None:
-        made.append(context.socket(zmq.ROUTER))
+    class Noted(Gateway):
+        def __init__(self, config: Config) -> None:
+            super().__init__(config)
+            made.append(self)
+
+    def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(assembly, "CommandServer", interrupted)
+    monkeypatch.setattr(assembly, "Gateway", Noted)
+    monkeypatch.setattr(assembly, "LocalStop", interrupted)
     wire = {"stream": {"address": addresses[0]}, "commands": {"address": addresses[1]}}
     with pytest.raises(KeyboardInterrupt):
         assembly.Daemon(Settings.model_validate(wire))
-    assert made[0].closed
+    with pytest.raises(ProcessLookupError):
+        os.kill(made[0].process, 0)

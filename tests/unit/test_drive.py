@@ -10,10 +10,12 @@ import pytest
 import zmq
 
 from daemon.assembly import Daemon
-from daemon.commands import CommandServer, Refused
+from daemon.commands import Refused
 from daemon.records import Reading
 from daemon.servos.base import ServoError
 from daemon.settings import Settings
+from tests.conftest import until
+from tests.harness.gateway import Served
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
 
 
@@ -169,23 +171,33 @@ def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> 
 
 
 def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
-    make: Make, context: zmq.Context[Any]
+    make: Make, context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     daemon = make()
-    server = CommandServer(context, "inproc://commands", 200)
-    daemon.loop._server = server
-    client = context.socket(zmq.DEALER)
-    client.connect("inproc://commands")
-    client.send(msgpack.packb({"command": "arm"}))
-    daemon.loop.stop()
-    daemon.loop.advance(5 * daemon.loop.period)
-    assert daemon.loop.state.mode == "disarmed"
-    assert "before a stop" in msgpack.unpackb(client.recv(zmq.NOBLOCK))["error"]
-    client.send(msgpack.packb({"command": "arm"}))
-    daemon.loop.advance(daemon.loop.period)
-    assert daemon.loop.state.mode == "armed"
-    client.close()
-    server.close()
+    with Served(commands=addresses[1]) as served:
+        daemon.loop._server = served.server
+        client = context.socket(zmq.DEALER)
+        client.connect(addresses[1])
+        for _ in range(20):
+            client.send(msgpack.packb({"command": "arm"}))
+        until(lambda: [served.settle(1), served.link.asked][1])
+        daemon.loop.stop()
+        told = []
+
+        def tick() -> int:
+            daemon.loop.advance(daemon.loop.period)
+            assert daemon.loop.state.mode == "disarmed"
+            served.settle()
+            while client.poll(0):
+                told.append(msgpack.unpackb(client.recv()))
+            return len(told)
+
+        until(lambda: tick() == 20)
+        assert all("before a stop" in reply["error"] for reply in told)
+        client.send(msgpack.packb({"command": "arm"}))
+        until(lambda: [served.settle(1), served.link.asked][1])
+        daemon.loop.advance(daemon.loop.period)
+        assert daemon.loop.state.mode == "armed"
 
 
 def test_arm_waits_until_torque_off_is_confirmed(make: Make) -> None:

@@ -10,10 +10,21 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon.messages import SCHEMA, Facts, Parts, SensorFacts, state_message
+from daemon.messages import (
+    COMMAND,
+    EVENT,
+    SCHEMA,
+    STATE,
+    TACTILE,
+    Facts,
+    Parts,
+    SensorFacts,
+    state_message,
+)
 from daemon.records import Contact, Frame, State
-from daemon.stream import Publisher
+from daemon.stream import bit
 from tests.conftest import until
+from tests.harness.gateway import Served
 
 BOTH = Parts((True, True), servos=True, sensors=False)
 FINGER_FLOATS = (
@@ -42,15 +53,17 @@ def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zm
     return socket
 
 
-def receive(socket: zmq.Socket[Any]) -> tuple[bytes, dict[str, Any]]:
+def receive(socket: zmq.Socket[Any], served: Served | None = None) -> tuple[bytes, dict[str, Any]]:
+    if served is not None:
+        until(lambda: [served.settle(), socket.poll(0)][1])
     assert socket.poll(60_000)
     topic, payload = socket.recv_multipart()
     return topic, msgpack.unpackb(payload)
 
 
-def refreshed(publisher: Publisher) -> bool:
-    publisher.refresh()
-    return publisher.wants_state
+def wanted(served: Served, topic: bytes = STATE) -> bool:
+    served.settle()
+    return bool(served.publisher.wanted & bit(topic))
 
 
 def test_state_has_every_field_of_the_public_face_with_its_type() -> None:
@@ -91,14 +104,15 @@ def test_frame_age_counts_from_the_sample() -> None:
 def test_tactile_data_is_little_endian_uint16_row_major(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=10)
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
     socket = subscribe(context, addresses[0], b"hand/tactile")
-    until(lambda: (publisher.refresh(), publisher.wants_tactile)[1])
-    assert not publisher.wants_state
+    until(lambda: wanted(served, TACTILE))
+    assert not publisher.wanted & bit(STATE)
     data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
     facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
     publisher.tactile(Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
-    topic, message = receive(socket)
+    topic, message = receive(socket, served)
     assert topic == b"hand/tactile"
     assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
     assert message == {
@@ -125,55 +139,60 @@ def test_tactile_data_is_little_endian_uint16_row_major(
     }
     floats = {"timestamp", "delay_s", "scale", *SensorFacts._fields[:5]}
     assert all(isinstance(message[key], float) for key in floats)
-    publisher.close()
+    served.close()
 
 
 def test_topics_nobody_subscribes_to_are_not_wanted(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=10)
-    publisher.refresh()
-    assert not publisher.wants_state
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
+    served.settle()
+    assert not publisher.wanted & bit(STATE)
     socket = subscribe(context, addresses[0], b"hand")
-    until(lambda: refreshed(publisher))
-    assert publisher.wants_tactile
+    until(lambda: wanted(served))
+    assert publisher.wanted & bit(TACTILE)
     socket.close()
-    until(lambda: not refreshed(publisher))
-    publisher.close()
+    until(lambda: not wanted(served))
+    served.close()
 
 
-def test_what_is_no_subscription_takes_none_from_others(context: zmq.Context[Any]) -> None:
-    publisher = Publisher(context, "inproc://stream", queue=10)
-    listener = subscribe(context, "inproc://stream")
-    other = context.socket(zmq.XSUB)
-    other.connect("inproc://stream")
-    # And what subscribes to no topic of ours is not remembered.
-    for message in (b"", b"\x05", b"\x05hand/state", b"\x01hand/nothing", b"\x01hand/input"):
-        other.send(message)
-    publisher.refresh()
-    assert publisher.wants_input, "all has come"
-    assert publisher.wants_state
-    assert publisher._subscriptions == {b"", b"hand/input"}
-    listener.close()
-    other.close()
-    publisher.close()
+def test_what_is_no_subscription_takes_none_from_others(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    with Served(addresses[0]) as served:
+        listener = subscribe(context, addresses[0])
+        until(lambda: wanted(served))
+        other = context.socket(zmq.XSUB)
+        other.connect(addresses[0])
+        for message in (b"", b"\x05", b"\x05hand/state", b"\x01hand/nothing", b"\x01hand/event"):
+            other.send(message)
+        served.publisher.event(1.0, 1.0, "info", "test", "all has come")
+        until(lambda: [served.settle(), other.poll(0)][1])
+        listener.close()
+        until(lambda: not wanted(served))
+        assert wanted(served, EVENT), "the other's own"
+        other.close()
+        until(lambda: not wanted(served, EVENT))
 
 
 def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=50)
+    served = Served(addresses[0], queue=50)
+    publisher = served.publisher
     stuck = context.socket(zmq.SUB)
     stuck.setsockopt(zmq.RCVHWM, 10)
     stuck.setsockopt(zmq.RCVBUF, 4096)
     stuck.setsockopt(zmq.SUBSCRIBE, b"")
     stuck.connect(addresses[0])
     reading = subscribe(context, addresses[0], b"hand/state")
-    until(lambda: refreshed(publisher))
+    until(lambda: wanted(served))
     state = State()
     for seq in range(20_000):
         state.seq = seq
-        publisher.state(state, BOTH)  # would never return if it waited for the stuck one
+        publisher.state(state, BOTH)
+        served.service.step(0.0)  # would never return if it waited for the stuck one
         while reading.poll(0):
             reading.recv_multipart()
     kept = 0
@@ -181,39 +200,42 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
         stuck.recv_multipart()
         kept += 1
     assert kept < 20_000, "the stuck subscriber's queue has no bound"
-    publisher.close()
+    served.close()
 
 
 def test_a_late_subscriber_gets_what_is_published_from_then_on(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=10)
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
     for seq in range(100):
         publisher.state(State(seq=seq), BOTH)
     late = subscribe(context, addresses[0], b"hand/state")
-    until(lambda: refreshed(publisher))
+    until(lambda: wanted(served))
     publisher.state(State(seq=100), BOTH)
-    assert receive(late)[1]["seq"] == 100
-    publisher.close()
+    assert receive(late, served)[1]["seq"] == 100
+    served.close()
 
 
 def test_events_are_numbered(context: zmq.Context[Any], addresses: tuple[str, str]) -> None:
-    publisher = Publisher(context, addresses[0], queue=10)
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
     socket = subscribe(context, addresses[0])
-    until(lambda: refreshed(publisher))
+    until(lambda: wanted(served))
     publisher.event(5.0, 2.5, "info", "mode", "disarmed → armed")
-    topic, message = receive(socket)
+    topic, message = receive(socket, served)
     assert topic == b"hand/event"
     assert message["seq"] == 1
     assert message["mono_ns"] == 2_500_000_000
     assert (message["level"], message["kind"]) == ("info", "mode")
-    publisher.close()
+    served.close()
 
 
 def test_who_comes_late_is_told_settings_and_events_again(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=200)
+    served = Served(addresses[0], queue=200)
+    publisher = served.publisher
     publisher.settings(98.0, 0.5, Facts("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
@@ -221,8 +243,7 @@ def test_who_comes_late_is_told_settings_and_events_again(
     told: list[tuple[bytes, dict[str, Any]]] = []
 
     def tick(socket: zmq.Socket[Any]) -> int:
-        publisher.refresh()
-        publisher.repeat()
+        served.settle()
         while socket.poll(0):
             told.append(receive(socket))
         return len(told)
@@ -242,49 +263,59 @@ def test_who_comes_late_is_told_settings_and_events_again(
     late = subscribe(context, addresses[0], b"hand/event")
     until(lambda: tick(late) == 50)
     assert {topic for topic, _ in told} == {b"hand/event"}
-    publisher.close()
+    served.close()
 
 
-def test_all_of_a_flood_of_subscribers_are_told_by_few_lists(
+def test_all_of_many_late_subscribers_are_told_once_each(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=200)
-    publisher.settings(98.0, 0.5, Facts("0.1.0", "{}", "", "", "{}", "{}"))
-    for k in range(5):
-        publisher.event(99.0, 1.0, "info", "mode", f"event {k}")
-    sockets = [subscribe(context, addresses[0], b"hand/event") for _ in range(40)]
-    for socket in sockets:
-        socket.setsockopt(zmq.SUBSCRIBE, b"hand/settings")
-    heard: list[set[tuple[bytes, int]]] = [set() for _ in sockets]
-    sent = 0
+    with Served(addresses[0]) as served:
+        served.publisher.settings(98.0, 0.5, Facts("0.1.0", "{}", "", "", "{}", "{}"))
+        for k in range(5):
+            served.publisher.event(99.0, 1.0, "info", "mode", f"event {k}")
+        sockets = [subscribe(context, addresses[0], b"hand/event") for _ in range(40)]
+        for socket in sockets:
+            socket.setsockopt(zmq.SUBSCRIBE, b"hand/settings")
+        heard: list[list[tuple[bytes, int]]] = [[] for _ in sockets]
 
-    def all_told() -> bool:
-        nonlocal sent
-        publisher.refresh()
-        publisher.repeat()
-        sent += 1
-        for socket, seen in zip(sockets, heard, strict=True):
-            while socket.poll(0):
-                topic, message = receive(socket)
-                seen.add((topic, message["seq"]))
-        return all(len(seen) == 6 for seen in heard)
+        def all_told() -> bool:
+            served.settle()
+            for socket, seen in zip(sockets, heard, strict=True):
+                while socket.poll(0):
+                    topic, message = receive(socket)
+                    seen.append((topic, message["seq"]))
+            return all(len(seen) >= 6 for seen in heard)
 
-    until(all_told)
-    assert sent < 40 * 6
-    publisher.close()
+        until(all_told)
+        assert all(len(set(seen)) == len(seen) == 6 for seen in heard)
+
+
+def test_a_long_message_comes_in_pieces_and_whole(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    facts = Facts("0.1.0", "x" * 150_000, "", "", "{}", "{}")
+    grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
+    sensor = SensorFacts(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
+    with Served(addresses[0]) as served:
+        served.publisher.settings(98.0, 0.5, facts)
+        socket = subscribe(context, addresses[0])
+        assert receive(socket, served)[1]["settings"] == facts.settings
+        served.publisher.tactile(Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
+        assert receive(socket, served)[1]["data"] == grid.tobytes()
 
 
 def test_commands_are_told_to_those_who_ask(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    publisher = Publisher(context, addresses[0], queue=10)
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
     publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
     socket = subscribe(context, addresses[0], b"hand/command")
-    until(lambda: (publisher.refresh(), publisher._wanted(b"hand/command"))[1])
+    until(lambda: wanted(served, COMMAND))
     publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")
-    topic, message = receive(socket)
+    topic, message = receive(socket, served)
     assert topic == b"hand/command"
     assert (message["seq"], message["tick"], message["client"]) == (1, 501, "me")
     assert (message["ok"], message["error"]) == (False, "no")
     assert json.loads(message["request"]) == {"command": "grasp", "force": 5.0, "client": "me"}
-    publisher.close()
+    served.close()

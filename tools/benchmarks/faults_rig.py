@@ -19,7 +19,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from daemon.commands import NoAnswer
+from daemon.command_client import NoAnswer
 from daemon.messages import STATE
 from daemon.profiles import load
 from daemon.simulation.control_port import NoEmulator, send_words

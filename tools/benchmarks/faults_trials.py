@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from daemon.commands import NoAnswer
+from daemon.command_client import NoAnswer
 from tools.benchmarks.faults_cases import Case
 from tools.benchmarks.faults_rig import Rig, RigError, stopped
 

@@ -21,14 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zmq
 
 from daemon.assembly import Daemon
+from daemon.gateway.config import Config
+from daemon.gateway.supervisor import Gateway
 from daemon.messages import Parts
 from daemon.realtime import RealTime
 from daemon.records import State
 from daemon.settings import Settings
-from daemon.stream import Publisher
+from daemon.stream import TOPICS, Publisher
 from tools.benchmarks.canned import can, hold, make_noisy
 from tools.benchmarks.wakeup import may_hurry
 
@@ -257,36 +258,35 @@ def _serve(link: Connection, address: str, priority: int, noise: bool) -> None:
 
 
 def stuck_subscriber(fill: int = _FILL, more: int = _MORE) -> Kept:
-    """The publisher's memory while one subscriber never reads: bounded by its queue."""
+    """The gateway's memory while one subscriber never reads: bounded by its queue."""
     with tempfile.TemporaryDirectory() as folder:
         address = f"ipc://{folder}/stream"
-        queue = Settings().stream.queue
-        context: zmq.Context[Any] = zmq.Context()
-        publisher = Publisher(context, address, queue)
+        gateway = Gateway(Config(address, "", TOPICS, Settings().stream.queue)).wait()
+        publisher = Publisher(gateway.link)
         try:
             with _running([[sys.executable, "-c", _STUCK, address]]):
                 patience = time.monotonic() + 10.0
-                while not publisher.wants_state and time.monotonic() < patience:
-                    publisher.refresh()
-                before = _resident()
-                _publish(publisher, fill)
-                full = _resident() - before
-                _publish(publisher, more)
-                later = _resident() - before
+                while not publisher.wanted and time.monotonic() < patience:
+                    gateway.link.wait(0.1)
+                before = _resident(gateway.process)
+                _publish(gateway, publisher, fill)
+                full = _resident(gateway.process) - before
+                _publish(gateway, publisher, more)
+                later = _resident(gateway.process) - before
         finally:
-            publisher.close()
-            context.term()
+            gateway.close()
     return Kept("memory for a subscriber that never reads", full, later, full + _KEPT)
 
 
-def _publish(publisher: Publisher, count: int) -> None:
+def _publish(gateway: Gateway, publisher: Publisher, count: int) -> None:
     state, scene = State(), Parts.of(Settings())
     for _ in range(count):
+        gateway.link.wait_for_room(1.0)
         state.seq += 1
         publisher.state(state, scene)
 
 
-def _resident() -> float:
-    """Memory of this process [MiB]."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+def _resident(process: int) -> float:
+    """Memory of a process [MiB]."""
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -19,8 +19,10 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from daemon import messages
 from daemon.assembly import Daemon
 from daemon.settings import Settings
+from daemon.stream import bit
 from kinematics import ladder
 from kinematics.kernels import kernel
 from kinematics.table import ContactTable, lookup
@@ -138,9 +140,7 @@ def _always_predicted(daemon: Daemon) -> None:
 def _always_packed(daemon: Daemon) -> None:
     broadcast = daemon.loop._broadcast
     assert broadcast is not None
-    publisher = broadcast._publisher
-    publisher.refresh = lambda: None  # type: ignore[method-assign]
-    publisher.wants_state = publisher.wants_tactile = publisher.wants_stats = True
+    broadcast._publisher._link.wanted = bit(messages.STATE) | bit(messages.TACTILE)
 
 
 def _tabulated(daemon: Daemon) -> None:

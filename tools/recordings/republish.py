@@ -1,25 +1,21 @@
-"""A recording's messages on the daemon's wire again: the socket, and what late subscribers miss."""
+"""A recording's messages on the daemon's wire again, by a gateway as the daemon's own."""
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import zmq
-
 from daemon import messages
 from daemon.contradictions import address_fault
-from daemon.doorkeeper import Doorkeeper
-from daemon.keys import KeyFileError, load_server
-from daemon.sockets import OWNER_ONLY, AddressError, Bound, Guard
+from daemon.gateway.config import Config
+from daemon.gateway.supervisor import Gateway
+from daemon.sockets import AddressError
+from daemon.stream import TOPICS
 from tools.recordings.errors import RecordingError
 
 _QUEUE = 10_000  # messages that wait for a subscriber; what it does not take by then it misses
-_SUBSCRIPTION = 1024  # bytes
-_EVENTS = 50  # told again to whoever comes later
+_PATIENCE = 1.0  # s for the gateway to take a message
 
 
 class Wire:
@@ -32,57 +28,31 @@ class Wire:
         fault = address_fault(address, "" if keys is not None else "--keys")
         if fault:
             raise RecordingError(f"--address: {fault}")
-        self._context: zmq.Context[Any] = zmq.Context()
-        self._doorkeeper: Doorkeeper | None = None
-        self._settings: dict[str, Any] | None = None
-        self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+        folder = "" if keys is None else str(keys)
+        config = Config(address, "", TOPICS, _QUEUE, keys=folder, stream_key="--address")
+        self._gateway = Gateway(config)
         try:
-            guard = OWNER_ONLY
-            if keys is not None:
-                guard = Guard(keys=(server := load_server(keys)))
-                self._doorkeeper = Doorkeeper(self._context, server.clients)
-            self._bound = Bound(
-                self._context, zmq.XPUB, address, "--address", _QUEUE, _SUBSCRIPTION, guard
-            )
-        except (AddressError, KeyFileError) as error:
-            self._end()
+            self._gateway.wait()
+        except AddressError as error:
+            self._gateway.close()
             raise RecordingError(str(error)) from None
-        self._bound.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every subscriber, not the first
+        self._link = self._gateway.link
+        self._link.begin_epoch()
 
     def subscribed(self, seconds: float) -> bool:
-        """Wait that long and see to those who subscribe meanwhile; whether somebody did."""
-        deadline = time.monotonic() + seconds
-        came = False
-        while self._bound.socket.poll(max(0, round(1e3 * (deadline - time.monotonic())))):
-            change = self._bound.socket.recv()
-            if change[:1] == b"\x01":
-                came = True
-                self._tell_again(change[1:])
-        return came
+        """Wait that long, or until who subscribes changes; whether somebody does."""
+        self._link.wait(seconds)
+        return bool(self._link.wanted)
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Publish one message."""
+        """Publish one message, as soon as the gateway has room for it."""
+        index = TOPICS.names.index(topic.decode())
+        packed = messages.pack(message)
         if topic == messages.SETTINGS:
-            self._settings = message
-        elif topic == messages.EVENT:
-            self._events.append(message)
-        self._bound.socket.send_multipart([topic, messages.pack(message)])
-        if self._bound.readable():
-            self.subscribed(0.0)
-
-    def _tell_again(self, prefix: bytes) -> None:
-        """What a daemon tells again, too: settings and the last events."""
-        kept = [] if self._settings is None else [(messages.SETTINGS, self._settings)]
-        kept += [(messages.EVENT, event) for event in self._events]
-        for topic, message in kept:
-            if topic.startswith(prefix):
-                again = messages.pack({**message, "again": True})
-                self._bound.socket.send_multipart([topic, again])
-
-    def _end(self) -> None:
-        if self._doorkeeper is not None:
-            self._doorkeeper.close()
-        self._context.term()
+            self._link.publish_lasting(index, packed)
+            return
+        self._link.wait_for_room(_PATIENCE)
+        self._link.publish(index, packed, keep=topic == messages.EVENT)
 
     def __enter__(self) -> Wire:
         return self
@@ -93,5 +63,4 @@ class Wire:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._bound.close()
-        self._end()
+        self._gateway.close()

@@ -1,0 +1,277 @@
+"""Clients with keys: libzmq's sockets, and pyzmq's authenticator, which says whose key it is.
+
+Nobody gets past the handshake without a key, and libzmq bounds what comes before. Its own thread
+reads ahead of us, so what arrived before a stop is known by time alone: for a moment after it all
+requests are refused, and its own answer waits as long.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import OrderedDict
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, cast
+
+import zmq
+import zmq.utils.z85
+from zmq.auth.thread import ThreadAuthenticator
+
+from daemon.gateway.config import Config
+from daemon.gateway.requests import Pace
+from daemon.gateway.service import Service, StartAnew
+from daemon.keys import DOMAIN, KeyFileError, ServerKeys, load_server
+from daemon.sockets import IpcFile, bind_error
+
+_NOW = int(zmq.NOBLOCK)
+_READ = 64  # messages at a look
+_PARTS = 3  # of a request: its client, REQ's empty one, the request
+_QUEUE = 64  # requests of one client in its socket
+_CLIENTS = 256  # who are remembered
+_READ_PURGING = 4096  # and of those that are refused
+_PURGE = 0.02  # s after a stop in which all requests are refused, …
+_PURGE_LONGEST = 0.25  # … and while there are any
+_LOOK = 0.5  # s between looks at the folder of keys
+_LINGER = 200  # ms for last words
+_SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
+
+
+class Keys(ThreadAuthenticator):
+    """Knows the clients' keys, as the folder has them now."""
+
+    def __init__(self, context: zmq.Context[Any], folder: Path) -> None:
+        super().__init__(context)
+        self._folder = folder
+        self._at = 0.0
+        self.server: ServerKeys = load_server(folder)
+        self.start()
+        self.configure_curve_callback(DOMAIN.decode(), self)
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Whether a client with this key is let in; asked by the authenticator."""
+        return domain == DOMAIN.decode() and key in self.server.clients
+
+    def curve_user_id(self, client_public_key: bytes) -> str:
+        """The key's name."""
+        return self.server.clients.get(zmq.utils.z85.encode(client_public_key), "")
+
+    def look(self, now: float) -> None:
+        """Let in who was added to the folder. Raises StartAnew when somebody was taken away."""
+        if now < self._at:
+            return
+        self._at = now + _LOOK
+        try:
+            found = load_server(self._folder)
+        except KeyFileError as error:
+            raise StartAnew(str(error)) from None
+        gone = [name for key, name in self.server.clients.items() if key not in found.clients]
+        if gone or found.secret != self.server.secret:
+            raise StartAnew(f"access.keys: shut out: {', '.join(gone) or 'all clients'}")
+        self.server = found
+
+
+class _Client:
+    """One connection, as libzmq numbers them."""
+
+    alive = True
+
+    def __init__(self, door: KeyedCommands, route: bytes, name: str, pace: Pace) -> None:
+        self._door = door
+        self._route = route
+        self.name = name
+        self.pace = pace
+
+    @property
+    def epoch(self) -> int:
+        return self._door.epoch
+
+    def answer(self, envelope: list[bytes], reply: bytes) -> None:
+        self._door.answer([self._route, *envelope, reply])
+
+
+class _Door:
+    """A bound socket in the poll. libzmq tells of a change once, so all of it is read."""
+
+    def __init__(
+        self, service: Service, keys: Keys, config: Config, kind: int, queue: int, limit: int
+    ) -> None:
+        """``queue`` messages of ``limit`` bytes wait for one client. Raises AddressError."""
+        self._keys = keys
+        self._poll = service.poll
+        self._file: IpcFile | None = None
+        self.now = 0.0
+        self.epoch = 0
+        key, address = config.stream_key, config.stream
+        if kind == zmq.ROUTER:
+            key, address = "commands.address", config.commands
+        if address.startswith("ipc://"):
+            self._file = IpcFile(address, key, config.ipc_mode)
+        self._socket: zmq.Socket[Any] = keys.context.socket(kind)
+        self._socket.setsockopt(zmq.LINGER, _LINGER)
+        # These bounds hold only for connections made after they were set, so before bind.
+        self._socket.setsockopt(zmq.MAXMSGSIZE, limit)
+        self._socket.setsockopt(zmq.SNDHWM, queue)
+        self._socket.setsockopt(zmq.RCVHWM, queue)
+        keys.server.guard(self._socket)
+        try:
+            with self._file.coming_into_being() if self._file else nullcontext():
+                self._socket.bind(address)
+        except (zmq.ZMQError, OSError) as error:
+            self._socket.close()
+            raise bind_error(address, key, error.errno, str(error)) from None
+        self._fd = cast(int, self._socket.getsockopt(zmq.FD))
+        self._poll.watch(self._fd, select.EPOLLIN, lambda _: self.tend())
+
+    def _parts(self) -> list[zmq.Frame] | None:
+        """The next message's first few parts; None when there is none."""
+        found: list[zmq.Frame] = []
+        try:
+            while not found or found[-1].more:
+                part = self._socket.recv(_NOW, copy=False)
+                found[_PARTS:] = [part]
+        except zmq.Again:
+            return None
+        return found
+
+    @property
+    def begun(self) -> int:
+        """The epoch of who comes in from now on."""
+        return self.epoch
+
+    def tend(self) -> None:
+        """Take in what has come."""
+        raise NotImplementedError
+
+    def begin_epoch(self, epoch: int) -> None:
+        """Nothing waits here that matters."""
+        self.epoch = epoch
+
+    def close(self) -> None:
+        """Hang up on all."""
+        self._poll.forget(self._fd)
+        self._socket.close()
+        if self._file is not None:
+            self._file.close()
+
+
+class KeyedCommands(_Door):
+    """Where requests come in."""
+
+    def __init__(self, service: Service, keys: Keys, config: Config) -> None:
+        """Raises AddressError."""
+        self._requests = service.requests
+        self._clients: OrderedDict[bytes, _Client] = OrderedDict()
+        self._coming = 0  # the epoch that begins when all of before has been refused
+        self._passed_at = 0.0  # when the last one did
+        self._empty = True  # at the last look
+        self._replies: list[list[bytes]] = []
+        super().__init__(service, keys, config, zmq.ROUTER, _QUEUE, 4 * config.max_bytes)
+
+    def tend(self) -> None:
+        self._keys.look(self.now)
+        purging = self.epoch != self._coming
+        if purging and self._is_purged():
+            self._begin()
+            purging = False
+        self._empty = False
+        for _ in range(_READ_PURGING if purging else _READ):
+            parts = self._parts()
+            if parts is None:
+                self._empty = True
+                break
+            route, *envelope, payload = (part.bytes for part in parts)
+            if len(envelope) <= 1 and route:
+                client = self._client(route, str(parts[-1].get("User-Id")))
+                client.pace.begin_read()
+                client.pace.behind = False
+                self._requests.take(client, envelope, payload, self.now)
+
+    def _is_purged(self) -> bool:
+        past = time.monotonic() - self._passed_at
+        return past > _PURGE and (self._empty or past > _PURGE_LONGEST)
+
+    def _begin(self) -> None:
+        self.epoch = self._coming
+        replies, self._replies = self._replies, []
+        for reply in replies:
+            self.answer(reply)
+
+    def _client(self, route: bytes, name: str) -> _Client:
+        client = self._clients.get(route)
+        if client is None:
+            client = _Client(self, route, name, self._requests.new_pace(self.now))
+            self._clients[route] = client
+            if len(self._clients) > _CLIENTS:
+                self._clients.popitem(last=False)
+        return client
+
+    def answer(self, message: list[bytes]) -> None:
+        """Send a reply, once what came before a stop has been refused."""
+        if self.epoch != self._coming:
+            self._replies.append(message)
+            return
+        try:
+            self._socket.send_multipart(message, _NOW)
+        except zmq.ZMQError:
+            pass  # the client has gone
+
+    def begin_epoch(self, epoch: int) -> None:
+        """It begins in a moment."""
+        self._coming = epoch
+        self._passed_at = time.monotonic()
+
+
+class KeyedStream(_Door):
+    """Where subscribers come in."""
+
+    def __init__(self, service: Service, keys: Keys, config: Config) -> None:
+        """Raises AddressError."""
+        self._topics = tuple(name.encode() for name in config.topics.names)
+        self._late = service.kept.late
+        self._prefixes: set[bytes] = set()
+        self.wanted = 0
+        self.backlog = 0
+        super().__init__(service, keys, config, zmq.XPUB, config.queue, _SUBSCRIPTION)
+        self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
+
+    def tend(self) -> None:
+        self._keys.look(self.now)
+        late = 0
+        for _ in range(_READ):
+            parts = self._parts()
+            if parts is None:
+                break
+            change = parts[0].bytes
+            matching = self._matching(change[1:])
+            if change[:1] == b"\1" and matching:
+                self._prefixes.add(change[1:])
+                late |= matching
+            elif change[:1] == b"\0":
+                self._prefixes.discard(change[1:])
+        self.wanted = 0
+        for prefix in self._prefixes:
+            self.wanted |= self._matching(prefix)
+        for topic, message in self._late(late) if late else ():
+            self.publish(topic, message)
+
+    def _matching(self, prefix: bytes) -> int:
+        return sum(1 << k for k, topic in enumerate(self._topics) if topic.startswith(prefix))
+
+    def publish(self, topic: int, message: bytes) -> None:
+        """One message to all who want its topic; a slow one's is dropped."""
+        self._socket.send(self._topics[topic], _NOW | zmq.SNDMORE)
+        self._socket.send(message, _NOW)
+
+
+def open_doors(service: Service, config: Config) -> None:
+    """Bind what ``config`` names, for the clients whose keys are in its folder.
+
+    Raises AddressError and KeyFileError.
+    """
+    keys = Keys(zmq.Context(), Path(config.keys))
+    if config.stream:
+        stream = KeyedStream(service, keys, config)
+        service.add(stream, stream)
+    if config.commands:
+        service.add(KeyedCommands(service, keys, config))

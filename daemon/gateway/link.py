@@ -1,0 +1,240 @@
+"""The socket pair between the loop and the gateway: packets both ways, and the loop's end of it.
+
+Each packet is one message of a Unix socket that never blocks the loop. What goes out when there is
+no room is dropped and counted, but for replies and epochs, which wait for the next tick; the kernel
+bounds what is on the way, and the gateway bounds what it sends to what the loop has answered.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import select
+import socket
+import struct
+from collections import deque
+from typing import Any, NamedTuple
+
+# From the loop. A message too long for one packet comes in pieces.
+PUBLISH = b"P"  # topic's index, flags, piece of the message
+REPLY = b"R"  # number, reply
+EPOCH = b"E"  # epoch
+FIRST, LAST, KEEP = 1, 2, 4  # piece's place; and: don't publish it, but tell late subscribers
+
+# From the gateway.
+READY = b"U"  # nothing: the sockets are bound
+FAILED = b"!"  # why they are not
+BEGUN = b"B"  # epoch that all connections are in, or will be once they have been read
+WANTED = b"W"  # topics that somebody subscribes to as bits, refused requests
+ASK = b"C"  # epoch, number, request
+NOTICE = b"N"  # what is to be told of the gateway
+STOP = b"S"  # likewise; a stop, which goes before all else
+
+NUMBER = struct.Struct("<I")
+EPOCHS = struct.Struct("<Q")
+WANTS = struct.Struct("<IQ")
+ASKED = struct.Struct("<QI")
+
+ANEW = 3  # status of a gateway that is to be started again, and has said why
+
+LARGEST = 65_536  # bytes of a packet
+_PIECE = 60_000
+_ROOM = 1 << 20  # bytes that may be on the way; the kernel may allow less
+_LOOK = 16  # packets taken in at a tick
+_OWED = 64  # replies and epochs that wait for room
+_OURS, _OTHER = 0, 1  # of the descriptors that are looked at
+_NOTICES = 20
+_KEPT = 50  # events that a gateway is given anew
+
+# The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
+poll = ctypes.PyDLL(None).poll
+
+
+class PollFd(ctypes.Structure):
+    """One descriptor, as the system's poll takes it."""
+
+    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
+
+
+class Ask(NamedTuple):
+    """A request that the gateway has checked."""
+
+    stop: bool
+    epoch: int
+    number: int
+    packed: bytes
+
+
+def pair() -> tuple[socket.socket, socket.socket]:
+    """Both ends: the loop's and the gateway's."""
+    ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    for end in ends:
+        end.setblocking(False)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _ROOM)
+    return ends
+
+
+def send_all(end: socket.socket, packets: list[bytes], seconds: float = 2.0) -> None:
+    """Send packets, waiting for room: not for the loop. Raises OSError when there is none."""
+    for packet in packets:
+        if not select.select([], [end], [], seconds)[1]:
+            raise TimeoutError("the gateway reads nothing")
+        end.send(packet)
+
+
+def pieces(topic: int, message: bytes, flags: int = 0) -> list[bytes]:
+    """The packets that carry one message of the stream."""
+    head = PUBLISH + bytes((topic,))
+    count = max((len(message) + _PIECE - 1) // _PIECE, 1)
+    return [
+        head
+        + bytes((flags | (k == 0) * FIRST | (k == count - 1) * LAST,))
+        + message[k * _PIECE : (k + 1) * _PIECE]
+        for k in range(count)
+    ]
+
+
+class Link:
+    """The loop's end. One thread, the loop's, may call it, but for `offer`."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self.begun = 0  # the epoch that the gateway has come to
+        self.wanted = 0  # topics as bits
+        self.refused = 0  # requests that the gateway refused because too many came
+        self.lost = 0  # messages of the stream that found no room
+        self.asked: deque[Ask] = deque()
+        self.notices: deque[str] = deque(maxlen=_NOTICES)  # of the gateway's life
+        self.lasting: list[bytes] = []  # packets that every gateway is sent before it is offered
+        self._socket: socket.socket | None = None
+        self._offered: socket.socket | None = None
+        self._owed: deque[bytes] = deque(maxlen=_OWED)
+        self._kept: deque[bytes] = deque(maxlen=_KEPT)
+        self.called = False  # until whoever takes it says otherwise
+        self._polled = (PollFd * 2)(PollFd(-1, select.POLLIN, 0), PollFd(-1, select.POLLIN, 0))
+        self._asked_of: Any = ctypes.byref(self._polled)
+
+    def offer(self, end: socket.socket) -> None:
+        """Speak over this from the next look on. From any thread."""
+        self._offered = end
+
+    def watch(self, descriptor: int) -> None:
+        """Look at another descriptor, too: `called` tells that something waits there."""
+        self._polled[_OTHER].fd = descriptor
+
+    def look(self) -> None:
+        """Take in what the gateway says. Less than a microsecond when that is nothing."""
+        if self._offered is not None:
+            self._adopt()
+        if self._owed:
+            self._pay()
+        if not poll(self._asked_of, 2, 0):
+            return
+        self.called = self._polled[_OTHER].revents != 0
+        if self._socket is None or not self._polled[_OURS].revents:
+            return
+        for _ in range(_LOOK):
+            try:
+                packet = self._socket.recv(LARGEST)
+            except OSError:  # nothing more, or the gateway has died
+                return
+            if not packet:
+                self._hang_up()
+                return
+            self._take(packet)
+
+    def wait(self, seconds: float) -> None:
+        """`look` when the gateway says something, or after so long. Not for a tick."""
+        self.look()
+        heard = [] if self._socket is None else [self._socket]
+        select.select(heard, [], [], seconds)
+        self.look()
+
+    def wait_for_room(self, seconds: float) -> None:
+        """Wait until there is room for a message, for so long at most. Not for a tick."""
+        self.look()
+        if self._socket is not None:
+            select.select([], [self._socket], [], seconds)
+
+    def _take(self, packet: bytes) -> None:
+        kind = packet[:1]
+        if kind in (ASK, STOP):
+            epoch, number = ASKED.unpack_from(packet, 1)
+            self.asked.append(Ask(kind == STOP, epoch, number, packet[1 + ASKED.size :]))
+        elif kind == BEGUN:
+            (self.begun,) = EPOCHS.unpack_from(packet, 1)
+        elif kind == NOTICE:
+            self.notices.append(packet[1:].decode())
+        elif kind == WANTED:
+            self.wanted, self.refused = WANTS.unpack_from(packet, 1)
+
+    def _adopt(self) -> None:
+        """A gateway has been started: it is told the epoch and the last events."""
+        self._hang_up()
+        self._socket, self._offered = self._offered, None
+        assert self._socket is not None
+        self._polled[_OURS].fd = self._socket.fileno()
+        for packet in self._kept:
+            self._send(packet)
+        self.begin_epoch()
+
+    def _hang_up(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+            self._polled[_OURS].fd = -1
+        self.wanted = 0
+        self.asked.clear()
+        self._owed.clear()
+
+    def begin_epoch(self) -> None:
+        """From now on requests that came before are not to be carried out."""
+        self.epoch += 1
+        self._owed.append(EPOCH + EPOCHS.pack(self.epoch))
+        self._pay()
+
+    def reply(self, number: int, reply: bytes) -> None:
+        """Answer request ``number``."""
+        self._owed.append(REPLY + NUMBER.pack(number) + reply)
+        self._pay()
+
+    def _pay(self) -> None:
+        while self._owed and self._send(self._owed[0]):
+            self._owed.popleft()
+
+    def publish(self, topic: int, message: bytes, keep: bool = False) -> None:
+        """One message of the stream; with ``keep`` a gateway started later is given it, too."""
+        if len(message) > _PIECE:
+            if not all(self._send(packet) for packet in pieces(topic, message)):
+                self.lost += 1
+            return
+        packet = PUBLISH + bytes((topic, FIRST | LAST)) + message
+        if keep:
+            self._kept.append(PUBLISH + bytes((topic, FIRST | LAST | KEEP)) + message)
+        if not self._send(packet):
+            self.lost += 1
+
+    def publish_lasting(self, topic: int, message: bytes) -> None:
+        """What every subscriber is told, however late and long it is. Waits: not for a tick."""
+        self.look()
+        self.lasting = pieces(topic, message)
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # a gateway that has died: the next is sent it
+                send_all(self._socket, self.lasting)
+
+    def _send(self, packet: bytes) -> bool:
+        if self._socket is None:
+            return False
+        try:
+            self._socket.send(packet)
+        except OSError:  # no room, or the gateway has died
+            return False
+        return True
+
+    def close(self) -> None:
+        """Hang up; the gateway sends what it has and ends."""
+        self._hang_up()
+        offered, self._offered = self._offered, None
+        if offered is not None:
+            with contextlib.suppress(OSError):
+                offered.close()

@@ -1,0 +1,130 @@
+"""Starts the gateway's process, and starts it again when it has died."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+from daemon.gateway import link
+from daemon.gateway.config import Config
+from daemon.sockets import AddressError
+
+_ROOT = Path(__file__).parents[2]  # where the package is found
+_PATIENCE = 20.0  # s for a gateway to bind its sockets
+_LASTED = 10.0  # s after which a death counts as the first
+_AGAIN = 0.1, 2.0  # s between a death and the next start, at first and after many
+
+
+class Gateway:
+    """A gateway that runs until it is closed. `link` is the loop's way to it."""
+
+    def __init__(self, config: Config) -> None:
+        """It starts beside whatever is done until `wait`."""
+        self.link = link.Link()
+        self._config = config
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._process, self._end = self._start()
+
+    def wait(self) -> Gateway:
+        """Be ready. Raises AddressError when the sockets can't be bound."""
+        self._meet()
+        self._thread = threading.Thread(target=self._watch, name="gateway", daemon=True)
+        self._thread.start()
+        return self
+
+    @property
+    def process(self) -> int:
+        """The process's number."""
+        return self._process.pid
+
+    def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
+        ours, theirs = link.pair()
+        paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        with theirs:
+            process = subprocess.Popen(
+                # -P: a folder named daemon where this was started is not ours.
+                [
+                    *(sys.executable, "-P", "-m", __package__),
+                    *(str(theirs.fileno()), self._config.to_json()),
+                ],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                # A session of its own: Ctrl-C is the daemon's, whose last words are to be sent.
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+            )
+        return process, ours
+
+    def _meet(self) -> None:
+        """Wait until its sockets are bound, and give it what lasts. Raises AddressError."""
+        ours = self._end
+        said = b""
+        if select.select([ours], [], [], _PATIENCE)[0]:
+            with contextlib.suppress(OSError):
+                said = ours.recv(link.LARGEST)
+        if said[:1] == link.FAILED:
+            raise AddressError(said[1:].decode())
+        if said[:1] != link.READY:
+            raise AddressError("the process that serves clients could not be started")
+        try:
+            link.send_all(ours, self.link.lasting)
+        except OSError as error:
+            raise AddressError(f"the process that serves clients: {error}") from None
+        self.link.offer(ours)
+
+    def _watch(self) -> None:
+        wait, longest = _AGAIN
+        while True:
+            began = time.monotonic()
+            status = self._process.wait()
+            if self._closing.is_set():
+                return
+            if status != link.ANEW:
+                self.link.notices.append(
+                    f"the process that serves clients ended ({_cause(status)})"
+                )
+            if time.monotonic() - began > _LASTED:
+                wait = _AGAIN[0]
+            told = ""
+            while not self._closing.wait(wait):
+                wait = min(2.0 * wait, longest)
+                try:
+                    self._process, self._end = self._start()
+                    self._meet()
+                except (AddressError, OSError) as error:
+                    self._end.close()
+                    self._process.kill()
+                    self._process.wait()
+                    if str(error) != told:
+                        told = str(error)
+                        self.link.notices.append(f"clients can't be served: {told}")
+                else:
+                    break
+            if self._closing.is_set():  # while it was started
+                self._end.close()
+
+    def close(self) -> None:
+        """Hang up, and wait until all has been sent."""
+        self._closing.set()
+        self.link.close()
+        self._end.close()
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._thread is not None:
+            self._thread.join(2.0)
+
+
+def _cause(status: int) -> str:
+    return f"signal {-status}" if status < 0 else f"status {status}"

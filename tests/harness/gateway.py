@@ -1,0 +1,86 @@
+"""A gateway in the test's own process, which does something only when it is asked to."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from daemon.commands import CommandServer, Handler
+from daemon.gateway import link
+from daemon.gateway.config import Config
+from daemon.gateway.service import open_service
+from daemon.stream import TOPICS, Publisher
+
+
+class Served:
+    """Both ends of a link: clients come in at the gateway's, the loop's are used by the test."""
+
+    def __init__(
+        self,
+        stream: str = "",
+        commands: str = "",
+        *,
+        queue: int = 2000,
+        max_bytes: int = 200,
+        per_second: float = 1e6,
+        ipc_mode: int = 0o600,
+        keys: str = "",
+        places: int = 256,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.link = link.Link()
+        ours, theirs = link.pair()
+        config = Config(stream, commands, TOPICS, queue, max_bytes, per_second, ipc_mode, keys)
+        try:
+            self.service = open_service(theirs, config, places, now)
+        except BaseException:
+            ours.close()
+            theirs.close()
+            raise
+        self.link.offer(ours)
+        self.publisher = Publisher(self.link)
+        self.server = CommandServer(self.link)
+        self.settle()
+
+    def settle(self, times: int = 3) -> None:
+        """Let the link carry what is on the way."""
+        for _ in range(times):
+            self.service.step(0.0)
+            self.link.look()
+
+    def serve(self, handler: Handler) -> None:
+        """One look of the gateway, one tick of the loop's, one look for its answers."""
+        self.service.step(0.0)
+        self.server.serve(handler)
+        self.service.step(0.0)
+
+    @contextmanager
+    def serving(self, handler: Handler) -> Iterator[None]:
+        """Answer commands in a thread."""
+        over = threading.Event()
+
+        def serve() -> None:
+            while not over.is_set():
+                self.service.step(0.001)
+                self.server.serve(handler)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+    def close(self) -> None:
+        self.link.close()
+        self.service.close()
+
+    def __enter__(self) -> Served:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()

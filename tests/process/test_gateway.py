@@ -1,0 +1,239 @@
+"""The gateway's process may hang, die or be killed: the loop goes on; and a stop's own way."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import stat
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.assembly import Daemon
+from daemon.client import AsyncHand, Hand
+from daemon.command_client import NoAnswer, send
+from daemon.gateway.config import Config
+from daemon.gateway.supervisor import Gateway
+from daemon.local_stop import LocalStop, stop_locally
+from daemon.settings import Settings
+from daemon.sockets import AddressError
+from daemon.stream import TOPICS, Publisher
+from tests.conftest import until
+from tests.harness.daemon_process import Running, softfinger
+from tests.harness.zmtp_client import RawClient
+
+
+@pytest.fixture
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A runtime folder of the test's own."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    return tmp_path / "softfinger"
+
+
+@pytest.fixture
+def ticking(addresses: tuple[str, str], own_folder: Path) -> Iterator[Daemon]:
+    """A daemon that ticks in a thread; its gateway is a process."""
+    settings = Settings.model_validate(
+        {
+            "stream": {"address": addresses[0]},
+            "commands": {"address": addresses[1]},
+            "safety": {"overruns_fault": 10**6},
+        }
+    )
+    with Daemon(settings) as daemon:
+        thread = threading.Thread(target=daemon.loop.run)
+        thread.start()
+        yield daemon
+        daemon.loop.end()
+        thread.join()
+
+
+def gateway_of(daemon: Daemon) -> Gateway:
+    """The process that serves a daemon's clients."""
+    assert daemon.gateway is not None
+    return daemon.gateway
+
+
+def events(hand: Hand, text: str) -> bool:
+    """Wait until an event says ``text``."""
+    with hand.events(timeout=60.0) as told:
+        return any(text in event.text for event in told)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
+    ticking: Daemon, addresses: tuple[str, str], number: int
+) -> None:
+    gateway, loop = gateway_of(ticking), ticking.loop
+    with Hand(*addresses, timeout=60.0) as hand:
+        hand.arm()
+        stream = hand.stream(timeout=60.0)
+        next(stream)
+        first, ticks = gateway.process, loop.state.seq
+        os.kill(first, number)
+        until(lambda: gateway.process != first)
+        # Its clients come back by themselves, and hear what they missed.
+        assert events(hand, f"ended (signal {number})")
+        stream.skip()
+        state = next(stream)
+        assert state.mode == "armed"
+        assert state.seq > ticks
+        assert hand.status()["torque"] is True
+
+
+def test_the_gateway_leaves_with_its_daemon(
+    profile: Callable[..., Path], addresses: tuple[str, str], start: Callable[..., Running]
+) -> None:
+    running = start("--config", str(profile()))
+    reader = RawClient(addresses[0], b"SUB")
+    until(lambda: reader.read())
+    (gateway,) = children(running.process.pid)
+    running.process.kill()
+    running.process.wait()
+    until(lambda: not Path(f"/proc/{gateway}").exists() or is_zombie(gateway))
+    assert reader.hung_up()
+
+
+def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
+    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
+    try:
+        first = gateway.process
+        os.kill(first, signal.SIGALRM)  # as its own alarm does, which it puts off while it works
+        until(lambda: gateway.process != first)
+        assert "signal 14" in gateway.link.notices[0]
+    finally:
+        gateway.close()
+
+
+def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, str]) -> None:
+    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
+    try:
+        limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
+        (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
+        assert int(data.split()[3]) <= 128 << 20
+        assert os.sched_getscheduler(gateway.process) == os.SCHED_OTHER
+    finally:
+        gateway.close()
+
+
+def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(
+    addresses: tuple[str, str],
+) -> None:
+    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
+    try:
+        publisher = Publisher(gateway.link)
+        gateway.link.look()
+        os.kill(gateway.process, signal.SIGSTOP)
+        for k in range(50_000):  # would never end if it waited
+            publisher.event(0.0, 0.0, "info", "test", f"event {k}")
+        assert gateway.link.lost > 0
+        os.kill(gateway.process, signal.SIGCONT)
+    finally:
+        gateway.close()
+
+
+def test_it_imports_neither_numpy_nor_libzmq() -> None:
+    code = (
+        "import sys, daemon.gateway.__main__\n"
+        "assert not {'numpy', 'numba', 'zmq', 'pydantic'} & set(sys.modules), 'too much'"
+    )
+    done = os.spawnv(os.P_WAIT, sys.executable, [sys.executable, "-c", code])
+    assert done == 0
+
+
+# --- a stop past all clients --------------------------------------------------------------------
+
+
+def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
+    ticking: Daemon, addresses: tuple[str, str]
+) -> None:
+    with Hand(*addresses, timeout=60.0) as hand:
+        hand.arm()
+        os.kill(gateway_of(ticking).process, signal.SIGSTOP)  # nobody is served
+        try:
+            assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
+            assert ticking.loop.state.mode == "disarmed"
+
+            async def stop() -> bool:
+                async with AsyncHand(*addresses) as other:
+                    return bool(await other.command("stop"))
+
+            assert asyncio.run(stop())
+            with pytest.raises(NoAnswer):
+                send(addresses[1], {"command": "status"}, timeout=0.2)
+        finally:
+            os.kill(gateway_of(ticking).process, signal.SIGCONT)
+        assert hand.wait_for(lambda state: not state.torque).mode == "disarmed"
+        hand.stop()
+        hand.arm()  # what comes after its answer is heard
+        hand.stop()
+
+
+def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
+    send(addresses[1], {"command": "arm"}, timeout=60.0)
+    os.kill(gateway_of(ticking).process, signal.SIGSTOP)
+    try:
+        done = softfinger("send", "stop", "--address", addresses[1])
+    finally:
+        os.kill(gateway_of(ticking).process, signal.SIGCONT)
+    assert done.returncode == 0, done.stderr
+    assert '"ok": true' in done.stdout
+    assert ticking.loop.state.mode == "disarmed"
+
+
+def test_its_folder_and_file_are_the_users_alone(own_folder: Path) -> None:
+    local = LocalStop("tcp://127.0.0.1:9")
+    assert stat.S_IMODE(own_folder.stat().st_mode) == 0o700
+    assert stat.S_IMODE((own_folder / "stop-127.0.0.1-9").stat().st_mode) == 0o600
+    with pytest.raises(AddressError, match="is another softfinger running"):
+        LocalStop("tcp://127.0.0.1:9")
+    local.close()
+    assert list(own_folder.iterdir()) == []
+
+
+def test_a_folder_that_others_may_enter_is_not_taken(
+    own_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    own_folder.mkdir(mode=0o755)
+    monkeypatch.setattr("daemon.local_stop._folders", lambda: iter([own_folder]))
+    with pytest.raises(AddressError, match="is not this user's alone"):
+        LocalStop("tcp://127.0.0.1:9")
+    own_folder.rmdir()
+    own_folder.symlink_to(tmp_path)
+    with pytest.raises(AddressError, match="is not this user's alone"):
+        LocalStop("tcp://127.0.0.1:9")
+    assert stop_locally("tcp://127.0.0.1:9", 0.1) is None
+
+
+def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(own_folder: Path) -> None:
+    killed = LocalStop("tcp://127.0.0.1:9")
+    killed._socket.close()
+    assert stop_locally("tcp://127.0.0.1:9", 0.1) is None
+    LocalStop("tcp://127.0.0.1:9").close()
+
+
+def test_a_stop_for_another_machine_stops_nothing_here(own_folder: Path) -> None:
+    local = LocalStop("tcp://127.0.0.1:9")
+    for address in ("tcp://hand.example:9", "tcp://192.0.2.1:9", "tcp://127.0.0.2:9"):
+        assert stop_locally(address, 0.1) is None
+    assert not local.take()
+    local.close()
+
+
+def children(process: int) -> list[int]:
+    found = []
+    for task in Path(f"/proc/{process}/task").iterdir():
+        found += [int(each) for each in (task / "children").read_text(encoding="ascii").split()]
+    return found
+
+
+def is_zombie(process: int) -> bool:
+    try:
+        return " Z " in Path(f"/proc/{process}/stat").read_text(encoding="ascii")
+    except OSError:
+        return True

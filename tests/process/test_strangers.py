@@ -1,0 +1,106 @@
+"""What is no ZeroMQ client of today gets nothing from the daemon: no command in, no message out.
+
+A web page can have a browser POST bytes of its choice to any port of this machine. They can be made
+to read as frames of ZMTP/1.0, which has no handshake that could tell a browser from a client.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import pytest
+import zmq
+
+from daemon.client import Hand
+from tests.harness.daemon_process import Running
+
+
+def old_frame(body: bytes, more: bool = False) -> bytes:
+    """A frame of ZMTP/1.0: a length that counts the flags, flags, body."""
+    return bytes([len(body) + 1, more]) + body
+
+
+def old_command(name: str) -> bytes:
+    """What a REQ socket of ZMTP/1.0 sends, its identity first."""
+    payload = msgpack.packb({"command": name})
+    return old_frame(b"") + old_frame(b"", more=True) + old_frame(payload)
+
+
+def posted(frames: bytes, address: str) -> bytes:
+    """An HTTP request whose head is one part of a message, and whose body is ``frames``."""
+    for padding in range(256):
+        head = (
+            f"POST /{'x' * padding} HTTP/1.1\r\nHost: {address.removeprefix('tcp://')}\r\n"
+            f"Content-Type: text/plain\r\nContent-Length: {len(frames)}\r\n\r\n"
+        ).encode()
+        at = 0
+        while at < len(head):
+            at += 1 + head[at]
+        if at == len(head):
+            return head + frames
+    raise AssertionError("no padding ends the head with a frame")
+
+
+def place(address: str) -> tuple[str, int]:
+    """Host and port."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    return host, int(port)
+
+
+def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
+    """Send ``request``, do something else, and return what was answered meanwhile."""
+    with socket.create_connection(place(address), timeout=60.0) as raw:
+        raw.sendall(request)
+        wait()
+        answer = b""
+        with contextlib.suppress(OSError):  # the daemon may have hung up
+            raw.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(ConnectionError):
+            while part := raw.recv(4096):
+                answer += part
+    return answer
+
+
+@pytest.fixture
+def daemon(
+    profile: Callable[..., Path], start: Callable[..., Running], addresses: tuple[str, str]
+) -> tuple[str, str]:
+    start("--config", str(profile()))
+    return addresses
+
+
+@pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
+def test_a_web_page_commands_nothing(
+    daemon: tuple[str, str], wrap: Callable[[bytes, str], bytes]
+) -> None:
+    request = wrap(old_command("arm") + old_command("arm")[2:], daemon[1])
+    with Hand(*daemon) as hand:
+        answer = said_to(request, daemon[1], lambda: [hand.status() for _ in range(20)])
+        assert b"ok" not in answer
+        assert hand.state().mode == "disarmed"
+        hand.arm()  # a client is still heard
+        assert hand.wait_for(lambda state: state.torque).mode == "armed"
+        hand.stop()
+
+
+@pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
+def test_a_web_page_reads_nothing(
+    daemon: tuple[str, str], wrap: Callable[[bytes, str], bytes]
+) -> None:
+    request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon[0])
+    with Hand(*daemon) as hand:
+        answer = said_to(request, daemon[0], lambda: hand.collect(0.5))
+        assert b"hand/" not in answer
+
+
+def test_a_plain_socket_of_today_is_let_in(daemon: tuple[str, str]) -> None:
+    with zmq.Context() as context, context.socket(zmq.REQ) as client:
+        client.setsockopt(zmq.LINGER, 0)
+        client.connect(daemon[1])
+        client.send(msgpack.packb({"command": "status"}))
+        assert client.poll(10_000)
+        assert msgpack.unpackb(client.recv())["ok"] is True
