@@ -26,6 +26,7 @@ _REST = 0.05  # s in which one that floods is not read
 _REST_EACH = 5e-4  # s, and longer by this for each other one
 _REPLIES = 256 * 1024  # bytes of replies that a client leaves unread
 _PARTS = 2  # of a request: REQ's empty one and the request
+_PINGS = 4  # of a commander at a read
 _SUBSCRIPTIONS = 64.0  # changes of a subscriber at once, …
 _SUBSCRIPTION_RATE = 10.0  # … and a second
 _SUBSCRIPTION = 64  # bytes
@@ -66,7 +67,7 @@ class Peer:
         try:
             for command, more, body in self._parser.feed(data):
                 if command:
-                    self._command(body)
+                    self._command(body, now)
                 elif not self.ready:
                     raise Broken("a message before the handshake")
                 else:
@@ -79,7 +80,7 @@ class Peer:
         if len(data) < _READ:
             self._emptied()
 
-    def _command(self, body: bytes) -> None:
+    def _command(self, body: bytes, now: float) -> None:
         if not self.ready:
             if socket_type(body) not in self.TAKES:
                 raise Broken("a socket of another type")
@@ -173,11 +174,19 @@ class Commander(Peer):
     ) -> None:
         self.pace = pace
         self._parts: list[bytes] = []
+        self._pings = 0  # at this read
         super().__init__(door, connection, limit, epoch)
 
     def read(self, now: float) -> None:
         self.pace.begin_read()
+        self._pings = 0
         super().read(now)
+
+    def _command(self, body: bytes, now: float) -> None:
+        self._pings += 1
+        if self._pings > _PINGS:
+            raise Broken("too many pings")
+        super()._command(body, now)
 
     def _part(self, body: bytes, more: bool, now: float) -> None:
         self._parts.append(body)
@@ -217,21 +226,28 @@ class Subscriber(Peer):
         self._stream = door
         super().__init__(door, connection, limit, epoch)
 
-    def _command(self, body: bytes) -> None:
+    def _command(self, body: bytes, now: float) -> None:
+        self._count(now)
         if self.ready and body[:10] == b"\x09SUBSCRIBE":
             self._change(body[10:], True)
         elif self.ready and body[:7] == b"\x06CANCEL":
             self._change(body[7:], False)
         else:
-            super()._command(body)
+            super()._command(body, now)
 
     def _part(self, body: bytes, more: bool, now: float) -> None:
-        self._may = min(self._may + (now - self._then) * _SUBSCRIPTION_RATE, _SUBSCRIPTIONS) - 1.0
-        self._then = now
-        if self._may < 0.0 or more:
-            raise Broken("too many subscriptions")
+        self._count(now)
+        if more:
+            raise Broken("a subscription of parts")
         if body[:1] in (b"\0", b"\1"):  # anything else is an XSUB's own message
             self._change(body[1:], body[:1] == b"\1")
+
+    def _count(self, now: float) -> None:
+        """One more of whatever it sends."""
+        self._may = min(self._may + (now - self._then) * _SUBSCRIPTION_RATE, _SUBSCRIPTIONS) - 1.0
+        self._then = now
+        if self._may < 0.0:
+            raise Broken("too many subscriptions")
 
     def _change(self, prefix: bytes, subscribe: bool) -> None:
         topics = self._stream.matching(prefix)

@@ -59,6 +59,7 @@ def is_served(served: Served, address: str) -> bool:
         GREETING + ready(b"DEALER") + b"\x02" + (1 << 40).to_bytes(8, "big"),  # a frame likewise
         GREETING + ready(b"DEALER") + b"\x02" + (801).to_bytes(8, "big"),
         GREETING + ready(b"DEALER") + b"\x08\x00",
+        GREETING + ready(b"DEALER") + (bytes((4, 7)) + b"\x04PING\x00\x0a") * 20,
     ],
 )
 def test_what_breaks_the_protocol_is_hung_up_on(
@@ -76,6 +77,8 @@ def test_what_breaks_the_protocol_is_hung_up_on(
         frame(b"\x01hand/state") * 100,  # more than a few dozen
         b"".join(frame(b"\x01%d" % k) for k in range(100)),
         frame(b"\x01hand/state", more=True),
+        (bytes((4, 20)) + b"\x09SUBSCRIBEhand/state") * 100,
+        (bytes((4, 7)) + b"\x04PING\x00\x0a") * 100,
     ],
 )
 def test_more_subscriptions_than_anybody_needs_are_hung_up_on(
