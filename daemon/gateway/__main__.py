@@ -29,10 +29,15 @@ def main(words: list[str]) -> int:
 
     `link.ANEW` when all clients are to come in again.
     """
-    end = socket.socket(fileno=int(words[0]))
-    config = Config.from_json(words[1])
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the loop, whose last words it sends
+    try:
+        return _serve(socket.socket(fileno=int(words[0])), Config.from_json(words[1]))
+    except (BrokenPipeError, ConnectionResetError):
+        return 0  # the loop ended before all was told
+
+
+def _serve(end: socket.socket, config: Config) -> int:
     try:
         service = open_service(end, config, _be_bounded())
     except (AddressError, ValueError) as error:

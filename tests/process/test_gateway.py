@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import stat
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ import pytest
 from daemon.assembly import Daemon
 from daemon.client import AsyncHand, Hand
 from daemon.command_client import NoAnswer, send
+from daemon.gateway import link
 from daemon.gateway.config import Config
 from daemon.gateway.supervisor import Gateway
 from daemon.local_stop import LocalStop, stop_locally
@@ -237,3 +239,16 @@ def is_zombie(process: int) -> bool:
         return " Z " in Path(f"/proc/{process}/stat").read_text(encoding="ascii")
     except OSError:
         return True
+
+
+def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses: tuple[str, str]) -> None:
+    ours, theirs = link.pair()
+    config = Config(*addresses, TOPICS, 10, 200, 10.0, 0o600, "")
+    with ours, theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "daemon.gateway", str(theirs.fileno()), config.to_json()],
+            pass_fds=(theirs.fileno(),),
+            stderr=subprocess.PIPE,
+        )
+    assert process.communicate()[1] == b""
+    assert process.returncode == 0
