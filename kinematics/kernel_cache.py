@@ -27,6 +27,7 @@ import numba
 
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("kinematics", "daemon")
+_FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
 _KEPT = 4  # folders of other sources or compilers that stay: other checkouts, the last release
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
@@ -130,8 +131,12 @@ def own_folder(folder: Path) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove all but the last used of the other folders."""
-    others = [each for each in base.glob("kernels-*") if each != current]
+    """Remove all but the last used of the other folders that were made here."""
+    others = [
+        each
+        for each in base.iterdir()
+        if _FOLDER.fullmatch(each.name) and each != current and not each.is_symlink()
+    ]
     others.sort(key=lambda each: each.lstat().st_mtime, reverse=True)
     for old in others[_KEPT:]:
         shutil.rmtree(old, ignore_errors=True)

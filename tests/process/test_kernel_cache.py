@@ -121,11 +121,13 @@ def test_own_folder_refuses_links_files_and_other_users(
 def test_folders_that_were_not_used_for_longest_go(package: Package) -> None:
     base = package.cache / "softfinger"
     for age in range(7):
-        old = base / f"kernels-{age}"
+        old = base / f"kernels-{age:016x}"
         old.mkdir(parents=True)
         os.utime(old, (1e9 - age, 1e9 - age))
-    (base / "contact-1.table").touch()
+    others = {"contact-1.table", "kernels-of-somebody-else"}
+    for name in others:
+        (base / name).mkdir()
     package.run()
     kept = {each.name for each in base.iterdir()}
-    assert {"kernels-0", "kernels-1", "kernels-2", "kernels-3", "contact-1.table"} < kept
-    assert len(kept) == 6
+    assert {f"kernels-{age:016x}" for age in range(4)} | others < kept
+    assert len(kept) == 7
