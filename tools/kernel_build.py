@@ -57,7 +57,10 @@ def build_kernels(
     whoever needs it then meets the reason. Nothing is left running when it is interrupted.
     """
     missing = [part for part in wanted or parts(settings) if not is_built(part)]
-    if not missing or kernel_folder() is None:
+    if not missing:
+        return Built(0, False)
+    if kernel_folder() is None:
+        tell("warning", "compile", "kernels are compiled in this process, for half a minute")
         return Built(0, False)
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels, on the first start only: {names}")
