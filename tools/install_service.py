@@ -63,7 +63,7 @@ DeviceAllow=/dev/cpu_dma_latency rw
 CacheDirectory=softfinger
 RuntimeDirectory=softfinger
 RuntimeDirectoryMode=0700
-Environment=XDG_CACHE_HOME=/var/cache NUMBA_CACHE_DIR=/var/cache/softfinger/kernels
+Environment=XDG_CACHE_HOME=/var/cache
 NoNewPrivileges=yes
 ProtectSystem=strict
 ProtectHome=read-only
