@@ -1,6 +1,6 @@
 """Compiles the kernels that a scene needs and that are not kept yet, in processes on all cores.
 
-The daemon then loads them, stays small, and starts in under a second. Each process takes one part
+The daemon then only loads them and stays small. Each process takes one part
 of the pipeline after another (`daemon.warm_up`); parts that need the contact table wait for it.
 """
 
