@@ -19,8 +19,8 @@ import hypothesis
 import pytest
 import zmq
 
-from daemon.assembly import Daemon
-from daemon.settings import Settings
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
 from tests.harness import descendants
 from tests.harness.daemon_process import Running
 from tests.harness.loop import Make

@@ -8,12 +8,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.settings import SettingsError
-from tools.arguments import add_profile, profile
-from tools.recordings.errors import RecordingError
+from softfinger.daemon.profile.settings import SettingsError
+from softfinger.tools.arguments import add_profile, profile
+from softfinger.tools.recordings.errors import RecordingError
 
 if TYPE_CHECKING:
-    from tools.analysis.contacts import Contacts
+    from softfinger.tools.analysis.contacts import Contacts
 
 _EPILOG = """\
 FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, a folder of .npy frames, or a
@@ -42,13 +42,13 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
-    from daemon.tactile.base import TactileError
-    from daemon.tactile.recording import RecordingError as FramesError
-    from daemon.warm_up import FRAMES
-    from tools.analysis.contacts import analyse, write_csv
-    from tools.analysis.sources import open_source
-    from tools.kernel_build import build_kernels, print_event, table_cache
-    from tools.progress import Progress
+    from softfinger.daemon.loop.warm_up import FRAMES
+    from softfinger.daemon.tactile.base import TactileError
+    from softfinger.daemon.tactile.recording import RecordingError as FramesError
+    from softfinger.tools.analysis.contacts import analyse, write_csv
+    from softfinger.tools.analysis.sources import open_source
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.tools.terminal.progress import Progress
 
     build_kernels(settings, print_event, FRAMES)
     path: Path = arguments.file
@@ -82,8 +82,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _draw(contacts: list[Contacts], arguments: argparse.Namespace, base: Path) -> int:
-    from tools.analysis.pictures import draw
-    from tools.figure_pages.style import NoMatplotlib
+    from softfinger.tools.analysis.pictures import draw
+    from softfinger.tools.paper.style import NoMatplotlib
 
     picture = arguments.plot or base.with_name(base.name + ".contacts.png")
     try:

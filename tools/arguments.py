@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.own_files import require_own, runtime_folder
-from daemon.profiles import load
-from daemon.settings import Settings, SettingsError
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.wire.own_files import require_own, runtime_folder
 
 if TYPE_CHECKING:
-    from daemon.keys import ClientKeys
+    from softfinger.daemon.wire.keys import ClientKeys
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +74,7 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
     """
     if folder is None:
         return None
-    from daemon.keys import load_client
+    from softfinger.daemon.wire.keys import load_client
 
     return load_client(folder)
 
@@ -133,12 +133,12 @@ def topic(text: str) -> bytes:
 
     Raises ArgumentTypeError with what was found.
     """
-    from daemon import contract
+    from softfinger.daemon.wire import schema
 
     if text.encode() == ALL:
         return ALL
     name = (text if text.startswith("hand/") else f"hand/{text}").encode()
-    if name not in contract.TOPICS:
-        known = ", ".join(each.decode().removeprefix("hand/") for each in contract.TOPICS)
+    if name not in schema.TOPICS:
+        known = ", ".join(each.decode().removeprefix("hand/") for each in schema.TOPICS)
         raise argparse.ArgumentTypeError(f"found topic {text!r}, expected one of {known}, all")
     return name

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-from daemon.own_files import write_text
+from softfinger.daemon.wire.own_files import write_text
 
 MEASUREMENTS = {
     "contact": "the contact model, run time against error",
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the JSON file."""
-    from tools.benchmarks.report import Row, table
+    from softfinger.tools.benchmarks.report import Row, table
 
     names = arguments.names or list(MEASUREMENTS)
     texts = MEASUREMENTS | ON_DEMAND
@@ -67,7 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
         known = ", ".join(texts)
         print(f"bench: found {unknown[0]!r}, expected one of {known}", file=sys.stderr)
         return 2
-    modules = {name: importlib.import_module(f"tools.benchmarks.{name}") for name in names}
+    modules = {
+        name: importlib.import_module(f"softfinger.tools.benchmarks.{name}") for name in names
+    }
     if "faults" in modules and not modules["faults"].known(arguments.only):
         print(f"bench: --only {arguments.only}: it is found in no fault's name", file=sys.stderr)
         return 2
@@ -110,7 +112,7 @@ def _count(text: str) -> int:
 
 def _no_plot(modules: dict[str, ModuleType]) -> str:
     """Why ``--plot`` can't be served, known before anything is measured; empty when it can."""
-    from tools.figure_pages.style import NoMatplotlib, settings
+    from softfinger.tools.paper.style import NoMatplotlib, settings
 
     if not any(hasattr(module, "plot") for module in modules.values()):
         return "--plot: none of the named measurements has a picture"

@@ -1,7 +1,7 @@
 """``softfinger calibrate``: one step of calibrating the sensor under one tip, and its file.
 
 Arguments, and the way from frames to a step's result. The mathematics is in
-`kinematics.calibration`, the file in `daemon.calibration`.
+`sensing.calibration`, the file in `perception.calibration_file`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daemon.settings import Settings, SettingsError
-from tools.arguments import add_profile, profile
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.tools.arguments import add_profile, profile
 
 if TYPE_CHECKING:
-    from daemon.calibration import Calibration, Converter
-    from tools.calibration_frames import Loads
+    from softfinger.daemon.perception.calibration_file import Calibration, Converter
+    from softfinger.tools.calibration.calibration_frames import Loads
 
 STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
 _EPILOG = """\
@@ -79,11 +79,11 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
-    from daemon.calibration import save_calibration
-    from daemon.tactile.base import TactileError
-    from daemon.tactile.recording import RecordingError
-    from kinematics.calibration import CalibrationError
-    from tools.calibration_frames import gather
+    from softfinger.daemon.perception.calibration_file import save_calibration
+    from softfinger.daemon.tactile.base import TactileError
+    from softfinger.daemon.tactile.recording import RecordingError
+    from softfinger.kinematics.sensing.calibration import CalibrationError
+    from softfinger.tools.calibration.calibration_frames import gather
 
     try:
         if arguments.speed is not None and (arguments.step != "modulus" or arguments.d):
@@ -127,7 +127,7 @@ def _check(loads: Loads, radius: float) -> None:
 
     import numpy as np
 
-    from kinematics.calibration import CalibrationError
+    from softfinger.kinematics.sensing.calibration import CalibrationError
 
     truths = loads.truths
     if not loads.frames:
@@ -150,8 +150,8 @@ def _drawer(arguments: argparse.Namespace) -> Any:
     """
     if arguments.no_plot:
         return None
-    from tools.calibration_plot import draw
-    from tools.figure_pages.style import NoMatplotlib, settings
+    from softfinger.tools.calibration.calibration_plot import draw
+    from softfinger.tools.paper.style import NoMatplotlib, settings
 
     try:
         settings()
@@ -174,7 +174,7 @@ def _draw(draw: Any, arguments: argparse.Namespace, picture: dict[str, Any]) -> 
 
 def _begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
     """The file's calibration, or a new one; refuses the file of another sensor."""
-    from daemon.calibration import (
+    from softfinger.daemon.perception.calibration_file import (
         Calibration,
         CalibrationFileError,
         difference,
@@ -196,13 +196,13 @@ def _begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
 
 
 def _put(calibration: Calibration, **steps: Any) -> Calibration:
-    from daemon.calibration import now
+    from softfinger.daemon.perception.calibration_file import now
 
     return calibration.model_copy(update={"date": now(), **steps})
 
 
 def _converter(settings: Settings, calibration: Calibration) -> Converter:
-    from daemon.calibration import Converter
+    from softfinger.daemon.perception.calibration_file import Converter
 
     return Converter(calibration, settings.tactile.pascal_per_count)
 
@@ -213,8 +213,8 @@ _Done = tuple["Calibration", str, dict[str, Any]]
 def _tare(_: Any, settings: Settings, calibration: Calibration, loads: Loads) -> _Done:
     import numpy as np
 
-    from daemon.calibration import TareStep, now
-    from kinematics.calibration import tare
+    from softfinger.daemon.perception.calibration_file import TareStep, now
+    from softfinger.kinematics.sensing.calibration import tare
 
     found = tare(np.concatenate(loads.frames))
     noise = float(np.median(found.noise))
@@ -227,8 +227,8 @@ def _tare(_: Any, settings: Settings, calibration: Calibration, loads: Loads) ->
 def _equilibrate(_: Any, settings: Settings, calibration: Calibration, loads: Loads) -> _Done:
     import numpy as np
 
-    from daemon.calibration import EquilibrateStep, now
-    from kinematics.calibration import equilibrate
+    from softfinger.daemon.perception.calibration_file import EquilibrateStep, now
+    from softfinger.kinematics.sensing.calibration import equilibrate
 
     zero = _converter(settings, calibration).zero
     found = equilibrate(loads.frames, zero)
@@ -252,7 +252,7 @@ def _readings(settings: Settings, calibration: Calibration, loads: Loads) -> lis
     """Each load's mean reading, cleared of noise far from the contact."""
     import numpy as np
 
-    from kinematics.calibration import cleared
+    from softfinger.kinematics.sensing.calibration import cleared
 
     converter = _converter(settings, calibration)
     noise = calibration.tare.noise if calibration.tare else 0.0
@@ -268,10 +268,10 @@ def _curve(
 ) -> _Done:
     import numpy as np
 
-    from daemon.calibration import CurveStep, now
-    from daemon.model import make_material, make_tip
-    from kinematics.calibration import CalibrationError, fit_curve
-    from kinematics.pressure import SensorGrid
+    from softfinger.daemon.perception.calibration_file import CurveStep, now
+    from softfinger.daemon.profile.factory import make_material, make_tip
+    from softfinger.kinematics.sensing.calibration import CalibrationError, fit_curve
+    from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
     sensor = calibration.sensor
     area = sensor.pitch[0] * sensor.pitch[1]
@@ -319,10 +319,10 @@ def _centre(_: Any, settings: Settings, calibration: Calibration, loads: Loads) 
 
     import numpy as np
 
-    from daemon.calibration import CentreStep, now
-    from daemon.model import make_material, make_tip
-    from kinematics.calibration import fit_centre
-    from kinematics.pressure import SensorGrid
+    from softfinger.daemon.perception.calibration_file import CentreStep, now
+    from softfinger.daemon.profile.factory import make_material, make_tip
+    from softfinger.kinematics.sensing.calibration import fit_centre
+    from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
     sensor, tactile = calibration.sensor, settings.tactile
     theta = loads.truths.get("theta", np.zeros(len(loads.frames)))
@@ -357,9 +357,9 @@ def _modulus(
 ) -> _Done:
     import numpy as np
 
-    from daemon.calibration import ModulusStep, now
-    from daemon.model import make_grid, make_tip
-    from kinematics.calibration import CalibrationError, fit_law, fit_modulus
+    from softfinger.daemon.perception.calibration_file import ModulusStep, now
+    from softfinger.daemon.profile.factory import make_grid, make_tip
+    from softfinger.kinematics.sensing.calibration import CalibrationError, fit_law, fit_modulus
 
     d = loads.truths.get("d")
     if d is None:

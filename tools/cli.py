@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, text in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(name, help=text, description=text)
         if name == called:
-            module = importlib.import_module(f"tools.{name.replace('-', '_')}")
+            module = importlib.import_module(f"softfinger.tools.{name.replace('-', '_')}")
             module.add_arguments(subparser)
     arguments = parser.parse_args(words)
     assert module is not None  # argparse has refused everything else
@@ -78,7 +78,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     return status
-
-
-if __name__ == "__main__":
-    sys.exit(main())

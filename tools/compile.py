@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 
-from daemon.settings import SettingsError
-from tools.arguments import add_profile, profile
-from tools.kernel_build import build_kernels, print_event
+from softfinger.daemon.profile.settings import SettingsError
+from softfinger.tools.arguments import add_profile, profile
+from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
-    from daemon.warm_up import ALL
+    from softfinger.daemon.loop.warm_up import ALL
 
     built = build_kernels(settings, print_event, ALL if arguments.all else None)
     if built.failed:

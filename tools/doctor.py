@@ -1,6 +1,6 @@
 """``softfinger doctor``: is all well for the daemon? One line a check, and what mends it.
 
-Arguments, order, printing and exit status; the checks are :mod:`daemon.checkup`'s.
+Arguments, order, printing and exit status; the checks are :mod:`softfinger.daemon.diagnosis`'s.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import argparse
 import sys
 from collections.abc import Iterator
 
-from daemon.checkup.addresses import check_addresses, daemon_mode
-from daemon.checkup.hand import check_board, check_servos
-from daemon.checkup.kernels import check_kernels
-from daemon.checkup.machine import check_machine
-from daemon.checkup.mending import mend_latency_timer, mend_servos
-from daemon.checkup.ports import check_latency_timer, check_port, note_ports
-from daemon.checkup.result import Result
-from daemon.records import FINGERS
-from daemon.settings import Settings, SettingsError
-from tools.arguments import add_profile, profile
-from tools.kernel_build import build_kernels, print_event
+from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
+from softfinger.daemon.diagnosis.hand import check_board, check_servos
+from softfinger.daemon.diagnosis.kernels import check_kernels
+from softfinger.daemon.diagnosis.machine import check_machine
+from softfinger.daemon.diagnosis.mending import mend_latency_timer, mend_servos
+from softfinger.daemon.diagnosis.ports import check_latency_timer, check_port, note_ports
+from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.types import FINGERS
+from softfinger.tools.arguments import add_profile, profile
+from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
 _PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board
 _EPILOG = """\

@@ -12,8 +12,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from daemon.settings import ServoSettings, Settings, SettingsError
-from tools.arguments import add_settings, own_runtime_folder, profile
+from softfinger.daemon.profile.settings import ServoSettings, Settings, SettingsError
+from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
@@ -143,12 +143,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals) -> int:
     # What follows imports numpy and numba: wrong settings are told without waiting for them.
-    from daemon.realtime import RealTime, hold_collector
+    from softfinger.daemon.loop.realtime import RealTime, hold_collector
 
     hold_collector()
-    from daemon.simulation.emulator import Emulator, EmulatorError, with_board
-    from daemon.warm_up import EMULATED
-    from tools.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.daemon.loop.warm_up import EMULATED
+    from softfinger.daemon.simulation.emulator.emulator import Emulator, EmulatorError, with_board
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
 
     build_kernels(with_board(settings), print_event, EMULATED)
     try:
@@ -225,7 +225,7 @@ class _Signals:
 
 
 def _send(folder: Path, words: str) -> int:
-    from daemon.simulation.control_port import NoEmulator, send_words
+    from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
 
     try:
         reply = send_words(folder, words)

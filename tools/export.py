@@ -7,8 +7,8 @@ import math
 import sys
 from pathlib import Path
 
-from tools.arguments import moment, seconds, teller
-from tools.recordings.errors import RecordingError
+from softfinger.tools.arguments import moment, seconds, teller
+from softfinger.tools.recordings.errors import RecordingError
 
 _EPILOG = """\
 Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Export; 1 with one line when the recording, the folder or an extra is no good."""
-    from tools.progress import Progress
-    from tools.recordings.reader import Recording
-    from tools.recordings.tables import CsvTable, ParquetTable, export
+    from softfinger.tools.recordings.reader import Recording
+    from softfinger.tools.recordings.tables import CsvTable, ParquetTable, export
+    from softfinger.tools.terminal.progress import Progress
 
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".export")

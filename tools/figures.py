@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tools.figure_pages.sheets import Page
+    from softfinger.tools.paper.sheets import Page
 
 NAMES = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig7_run", "fig10", "fig10_run")
 
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, Page]:
     """All figures by name."""
-    from tools.figure_pages import experiment_pages, material_page, model_pages, run_pages
+    from softfinger.tools.paper import experiment_pages, material_page, model_pages, run_pages
 
     found = {
         "fig3": material_page.PAGE,
@@ -57,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def write(chosen: dict[str, Page], folder: Path) -> None:
     """Write these pages into ``folder`` and print each file's path. Raises OSError."""
-    from tools.figure_pages import style
-    from tools.figure_pages.sheets import errata_sheet
+    from softfinger.tools.paper import style
+    from softfinger.tools.paper.sheets import errata_sheet
 
     numbers = {name: page.sheets() for name, page in chosen.items()}
     for sheets in numbers.values():

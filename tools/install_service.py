@@ -11,7 +11,7 @@ import re
 import sys
 from pathlib import Path
 
-from daemon.own_files import write_text
+from softfinger.daemon.wire.own_files import write_text
 
 UNIT = "softfinger.service"
 RULES = "70-softfinger.rules"
@@ -134,7 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def unit(config: Path | None, user: str) -> str:
     """The unit's text. Raises ValueError for a user or profile that is not there."""
-    words = [sys.executable, "-P", "-m", "tools.cli", "run", "--no-task"]
+    words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task"]
     if config is not None:
         if not config.is_file():
             raise ValueError(f"{config}: no such profile")

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from daemon.keys import KeyFileError, make_keys
+from softfinger.daemon.wire.keys import KeyFileError, make_keys
 
 _EPILOG = """\
 The first call makes the daemon's keys and those of the client `local`, for the tools on the

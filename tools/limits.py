@@ -6,8 +6,8 @@ import argparse
 import sys
 from typing import Any
 
-from daemon.settings import Settings, SettingsError
-from tools.arguments import add_profile, profile
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.tools.arguments import add_profile, profile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
-    from daemon.limits import ROWS
+    from softfinger.daemon.safety.limits import ROWS
 
     lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in ROWS]
     widths = [max(len(line[column]) for line in lines) for column in range(3)]

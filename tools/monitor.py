@@ -21,14 +21,14 @@ from typing import Any
 
 import zmq
 
-from daemon.keys import KeyFileError
-from daemon.patience import PATIENCE
-from tools.arguments import add_keys, client_keys, nothing
-from tools.feed import FINGERS, Feed, number, text
-from tools.feed_sockets import Commander, Subscriber
-from tools.monitor_keys import HandKeys
-from tools.monitor_page import Page
-from tools.terminal import Keys, Terminal, TerminalGone
+from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.wire.keys import KeyFileError
+from softfinger.tools.arguments import add_keys, client_keys, nothing
+from softfinger.tools.terminal.feed import FINGERS, Feed, number, text
+from softfinger.tools.terminal.feed_sockets import Commander, Subscriber
+from softfinger.tools.terminal.monitor_keys import HandKeys
+from softfinger.tools.terminal.monitor_page import Page
+from softfinger.tools.terminal.terminal import Keys, Terminal, TerminalGone
 
 REDRAW = 1.0 / 15.0  # s between redraws at most
 PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Run until q, a signal, the duration or the daemon's end. 1 when no stream ever came."""
     state, commands = args.state, args.commands
     if state is None or commands is None:
-        from daemon.settings import CommandSettings, Stream
+        from softfinger.daemon.profile.settings import CommandSettings, Stream
 
         state = Stream().address if state is None else state
         commands = CommandSettings().address if commands is None else commands

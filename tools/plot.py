@@ -7,8 +7,8 @@ import math
 import sys
 from pathlib import Path
 
-from tools.arguments import moment, seconds, teller
-from tools.recordings.errors import RecordingError
+from softfinger.tools.arguments import moment, seconds, teller
+from softfinger.tools.recordings.errors import RecordingError
 
 # Beside each other in help, so that a page can be chosen without drawing all.
 PAGES = {
@@ -48,14 +48,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw; 1 with one line when the recording, the folder or an extra is no good."""
-    from daemon.settings import Settings
-    from daemon.warm_up import FRAMES
-    from tools.analysis.plots import draw
-    from tools.analysis.plots_data import load_run
-    from tools.figure_pages import style
-    from tools.kernel_build import build_kernels, print_event, table_cache
-    from tools.progress import Progress
-    from tools.recordings.reader import Recording
+    from softfinger.daemon.loop.warm_up import FRAMES
+    from softfinger.daemon.profile.settings import Settings
+    from softfinger.tools.analysis.plots import draw
+    from softfinger.tools.analysis.plots_data import load_run
+    from softfinger.tools.paper import style
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.tools.recordings.reader import Recording
+    from softfinger.tools.terminal.progress import Progress
 
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.patience import PATIENCE
-from daemon.settings import Stream
-from tools.arguments import (
+from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.profile.settings import Stream
+from softfinger.tools.arguments import (
     ALL,
     add_keys,
     client_keys,
@@ -23,7 +23,7 @@ from tools.arguments import (
     topic,
     waiting,
 )
-from tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.errors import RecordingError
 
 _EPILOG = """\
 Ends with Ctrl-C, after --duration, or at --to; prints what it wrote and what was lost on the way.
@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Record until told to end; 1 with one line when something went wrong."""
-    from daemon.keys import KeyFileError
+    from softfinger.daemon.wire.keys import KeyFileError
 
     try:
         if arguments.recover:
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _recover(path: Path) -> int:
-    from tools.recordings.recover import recover
+    from softfinger.tools.recordings.recover import recover
 
     messages, damage = recover(path)
     print(
@@ -110,8 +110,8 @@ class _Recorder:
     """One call of ``record``: the socket, the files one after the other, and the account."""
 
     def __init__(self, arguments: argparse.Namespace, ending: _Ending) -> None:
-        from daemon.client.wire import Gaps
-        from tools.recordings.writer import RecordingWriter
+        from softfinger.daemon.client.wire import Gaps
+        from softfinger.tools.recordings.writer import RecordingWriter
 
         self._arguments = arguments
         self._keys = client_keys(arguments.keys)  # before there is a file
@@ -134,7 +134,7 @@ class _Recorder:
         """Take messages until the end."""
         import zmq
 
-        from daemon.client.wire import prepare
+        from softfinger.daemon.client.wire import prepare
 
         arguments = self._arguments
         context: zmq.Context[Any] = zmq.Context()
@@ -317,11 +317,11 @@ class _Recorder:
 
 
 def _topics(named: list[bytes] | None) -> list[bytes]:
-    from daemon import contract, messages
+    from softfinger.daemon.wire import messages, schema
 
     if named is None:
-        return [each for each in contract.TOPICS if each != messages.INPUT]
-    return list(contract.TOPICS) if ALL in named else named
+        return [each for each in schema.TOPICS if each != messages.INPUT]
+    return list(schema.TOPICS) if ALL in named else named
 
 
 def _hung_up(lifeline: int) -> bool:

@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.own_files import write_text
-from daemon.settings import SettingsError, Stream
-from tools.arguments import moment, seconds, teller
-from tools.recordings.errors import RecordingError
+from softfinger.daemon.profile.settings import SettingsError, Stream
+from softfinger.daemon.wire.own_files import write_text
+from softfinger.tools.arguments import moment, seconds, teller
+from softfinger.tools.recordings.errors import RecordingError
 
 _EPILOG = """\
 Without --recompute the messages go out on the stream's socket as they were, at their own pace or
@@ -59,8 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Publish, or recompute; 1 with one line when the recording is no good."""
-    from daemon.tactile.base import TactileError
-    from tools.recordings.reader import Recording
+    from softfinger.daemon.tactile.base import TactileError
+    from softfinger.tools.recordings.reader import Recording
 
     try:
         recording = Recording(arguments.file, teller("replay"))
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _publish(arguments: argparse.Namespace, recording: Any) -> int:
-    from tools.recordings.republish import Wire
+    from softfinger.tools.recordings.republish import Wire
 
     ended = False
 
@@ -115,11 +115,11 @@ def _publish(arguments: argparse.Namespace, recording: Any) -> int:
 
 
 def _recompute(arguments: argparse.Namespace, recording: Any) -> int:
-    from daemon.profiles import load
-    from daemon.settings import Settings
-    from tools.kernel_build import build_kernels, print_event, table_cache
-    from tools.progress import Progress
-    from tools.recordings.recomputed import recompute
+    from softfinger.daemon.profile.load import load
+    from softfinger.daemon.profile.settings import Settings
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.tools.recordings.recomputed import recompute
+    from softfinger.tools.terminal.progress import Progress
 
     settings = None if arguments.config is None else load(arguments.config)
     build_kernels(settings or Settings(), print_event)

@@ -11,11 +11,11 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from daemon.service import Service
-from daemon.settings import Settings, SettingsError, Task
-from tools.arguments import add_profile, profile, seconds
-from tools.event_log import EventLog
-from tools.recorder_beside import NoRecorder
+from softfinger.daemon.loop.sd_notify import Service
+from softfinger.daemon.profile.settings import Settings, SettingsError, Task
+from softfinger.tools.arguments import add_profile, profile, seconds
+from softfinger.tools.processes.event_log import EventLog
+from softfinger.tools.processes.recorder_beside import NoRecorder
 
 _STARTED = time.monotonic()
 
@@ -76,15 +76,15 @@ def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: _Signals, log: EventLog
 ) -> int:
     # What follows imports numpy, numba and zmq: wrong settings are told without waiting for them.
-    from daemon.realtime import RealTime, hold_collector
+    from softfinger.daemon.loop.realtime import RealTime, hold_collector
 
     hold_collector()
-    from daemon.assembly import Daemon
-    from daemon.schedule import Schedule
-    from daemon.servos.base import ServoError
-    from daemon.sockets import AddressError
-    from daemon.tactile.base import TactileError
-    from tools.kernel_build import build_kernels, table_cache
+    from softfinger.daemon.loop.build import Daemon
+    from softfinger.daemon.loop.rates import Schedule
+    from softfinger.daemon.servos.base import ServoError
+    from softfinger.daemon.tactile.base import TactileError
+    from softfinger.daemon.wire.sockets import AddressError
+    from softfinger.tools.processes.kernel_build import build_kernels, table_cache
 
     log.line("info", "start", f"softfinger: {_scene(settings)}")
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
@@ -151,9 +151,9 @@ def _tell_times(loop: Any, log: EventLog) -> None:
 
 def _record(path: Path, settings: Settings, daemon: Any) -> Any:
     """A recorder that has subscribed to everything. Raises NoRecorder."""
-    from daemon import messages
-    from daemon.stream import bit
-    from tools.recorder_beside import RecorderBeside
+    from softfinger.daemon.wire import messages
+    from softfinger.daemon.wire.publisher import bit
+    from softfinger.tools.processes.recorder_beside import RecorderBeside
 
     def subscribed() -> bool:
         daemon.publisher.look()
@@ -166,7 +166,7 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
-    from tools.beside import start_beside
+    from softfinger.tools.processes.monitor_beside import start_beside
 
     return start_beside(
         settings.stream.address,

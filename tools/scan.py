@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 
-from daemon.checkup.ports import serial_ports
-from daemon.servos.base import ServoError
-from daemon.servos.registers import BAUD_RATES
-from daemon.servos.scanning import ALONE, FoundServo, search
+from softfinger.daemon.diagnosis.ports import serial_ports
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.registers import BAUD_RATES
+from softfinger.daemon.servos.scanning import ALONE, FoundServo, search
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,11 +8,11 @@ import math
 import sys
 from typing import Any
 
-from daemon.command_client import NoAnswer, send
-from daemon.keys import KeyFileError
-from daemon.patience import PATIENCE
-from daemon.settings import CommandSettings
-from tools.arguments import add_keys, client_keys, seconds
+from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.profile.settings import CommandSettings
+from softfinger.daemon.wire.keys import KeyFileError
+from softfinger.tools.arguments import add_keys, client_keys, seconds
 
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,

@@ -18,14 +18,22 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from daemon.patience import PATIENCE
-from daemon.settings import Stream
-from tools.arguments import add_keys, client_keys, megabytes, moment, nothing, seconds, waiting
-from tools.viewing.errors import NoRerun, ViewError
+from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.profile.settings import Stream
+from softfinger.tools.arguments import (
+    add_keys,
+    client_keys,
+    megabytes,
+    moment,
+    nothing,
+    seconds,
+    waiting,
+)
+from softfinger.tools.viewing.errors import NoRerun, ViewError
 
 if TYPE_CHECKING:
-    from tools.recordings.reader import Recording
-    from tools.viewing.viewer import Viewer
+    from softfinger.tools.recordings.reader import Recording
+    from softfinger.tools.viewing.viewer import Viewer
 
 _EPILOG = """\
 Opens Rerun's window, or with --web a page on this machine; with --save alone, neither.
@@ -93,8 +101,8 @@ def _rate(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show until told to end; 1 with one line when something went wrong."""
-    from daemon.keys import KeyFileError
-    from tools.recordings.errors import RecordingError
+    from softfinger.daemon.wire.keys import KeyFileError
+    from softfinger.tools.recordings.errors import RecordingError
 
     try:
         with _Ending(arguments.duration) as ending:
@@ -114,7 +122,7 @@ class _View:
             import rerun
         except ImportError:
             raise NoRerun from None
-        from tools.viewing.bridge import Bridge
+        from softfinger.tools.viewing.bridge import Bridge
 
         self._arguments = arguments
         self._keys = client_keys(arguments.keys)
@@ -131,15 +139,15 @@ class _View:
 
     def show(self) -> int:
         """From the first message to the end."""
-        from daemon.settings import Settings
-        from daemon.warm_up import LANDSCAPE
-        from tools.kernel_build import build_kernels
-        from tools.viewing.known import warm_up
+        from softfinger.daemon.loop.warm_up import LANDSCAPE
+        from softfinger.daemon.profile.settings import Settings
+        from softfinger.tools.processes.kernel_build import build_kernels
+        from softfinger.tools.viewing.known import warm_up
 
         arguments, ending = self._arguments, self._ending
         recording = None
         if arguments.file is not None:
-            from tools.recordings.reader import Recording
+            from softfinger.tools.recordings.reader import Recording
 
             recording = Recording(arguments.file, self._say)
         os.nice(_NICE)
@@ -169,7 +177,7 @@ class _View:
         return 0
 
     def _open(self) -> Viewer:
-        from tools.viewing.viewer import Viewer, is_free
+        from softfinger.tools.viewing.viewer import Viewer, is_free
 
         arguments = self._arguments
         port = arguments.port or (_PORT if is_free(_PORT) else 0)
@@ -201,7 +209,7 @@ class _View:
         self._recording.set_sinks(*sinks)
 
     def _show_stream(self, viewer: Viewer | None) -> None:
-        from tools.viewing.live import LiveStream
+        from softfinger.tools.viewing.live import LiveStream
 
         bridge, ending = self._bridge, self._ending
         heard = time.monotonic()
@@ -234,8 +242,8 @@ class _View:
             bridge.draw(last=True)
 
     def _show_recording(self, recording: Recording, viewer: Viewer | None) -> None:
-        from tools.progress import Progress
-        from tools.viewing.bridge import TOPICS
+        from softfinger.tools.terminal.progress import Progress
+        from softfinger.tools.viewing.bridge import TOPICS
 
         arguments, bridge = self._arguments, self._bridge
         drawn, period, pictures = math.nan, 1.0 / arguments.rate, 0
@@ -278,7 +286,7 @@ class _View:
 
     def _watch_memory(self) -> None:
         """Raise ViewError when what a viewer doesn't take has piled up to the bound."""
-        from tools.viewing.viewer import resident
+        from softfinger.tools.viewing.viewer import resident
 
         now = time.monotonic()
         if self._bridge.shown == 0 or now - self._looked < _SLOW_LOOK:

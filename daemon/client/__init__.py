@@ -2,7 +2,7 @@
 
 ::
 
-    from daemon.client import Hand
+    from softfinger.daemon.client import Hand
 
     with Hand() as hand:
         hand.arm()
@@ -16,10 +16,11 @@
 needs no more than its two addresses; nothing in it touches the daemon's own state.
 """
 
-from daemon.client.asynchronous import AsyncHand
-from daemon.client.errors import HandFault, NoStream, NotInTime
-from daemon.client.hand import Hand
-from daemon.client.records import (
+from softfinger.daemon.client.asynchronous import AsyncHand
+from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.daemon.client.errors import HandFault, NoStream, NotInTime
+from softfinger.daemon.client.hand import Hand
+from softfinger.daemon.client.records import (
     Event,
     FingerState,
     HandState,
@@ -27,8 +28,7 @@ from daemon.client.records import (
     TactileFrame,
     to_columns,
 )
-from daemon.command_client import NoAnswer
-from daemon.commands import Refused
+from softfinger.daemon.wire.command_server import Refused
 
 __all__ = [
     "AsyncHand",

@@ -1,4 +1,4 @@
-"""`AsyncHand`: what `daemon.client.hand.Hand` is, for asyncio."""
+"""`AsyncHand`: what `client.hand.Hand` is, for asyncio."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import msgpack
 import zmq
 import zmq.asyncio
 
-from daemon import messages
-from daemon.client.errors import HandFault, NoStream, NotInTime
-from daemon.client.hand import COMMANDS, STREAM, accepted
-from daemon.client.records import Event, HandState, TactileFrame
-from daemon.client.wire import Decoder, nothing_from, prepare, silent
-from daemon.command_client import LOCALLY, NoAnswer
-from daemon.keys import load_client
-from daemon.local_stop import stop_locally
-from daemon.patience import PATIENCE, SILENCE, answer_to, still_waiting
+from softfinger.daemon.client.command_client import LOCALLY, NoAnswer
+from softfinger.daemon.client.errors import HandFault, NoStream, NotInTime
+from softfinger.daemon.client.hand import COMMANDS, STREAM, accepted
+from softfinger.daemon.client.patience import PATIENCE, SILENCE, answer_to, still_waiting
+from softfinger.daemon.client.records import Event, HandState, TactileFrame
+from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
+from softfinger.daemon.wire import messages
+from softfinger.daemon.wire.keys import load_client
+from softfinger.daemon.wire.local_stop import stop_locally
 
 _log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class AsyncHand:
     ) -> HandState:
         """The first state from now on for which ``condition`` holds.
 
-        Raises as `daemon.client.hand.Hand.wait_for` does.
+        Raises as `client.hand.Hand.wait_for` does.
         """
         last: HandState | None = None
         states = self.stream()

@@ -11,15 +11,15 @@ from typing import Any, Generic, TypeVar
 
 import zmq
 
-from daemon import messages
-from daemon.client.errors import HandFault, NoStream, NotInTime
-from daemon.client.records import Event, HandState, TactileFrame
-from daemon.client.wire import Decoder, nothing_from, prepare, silent
-from daemon.command_client import send
-from daemon.commands import Refused
-from daemon.keys import load_client
-from daemon.patience import PATIENCE, SILENCE
-from daemon.settings import CommandSettings, Stream
+from softfinger.daemon.client.command_client import send
+from softfinger.daemon.client.errors import HandFault, NoStream, NotInTime
+from softfinger.daemon.client.patience import PATIENCE, SILENCE
+from softfinger.daemon.client.records import Event, HandState, TactileFrame
+from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
+from softfinger.daemon.profile.settings import CommandSettings, Stream
+from softfinger.daemon.wire import messages
+from softfinger.daemon.wire.command_server import Refused
+from softfinger.daemon.wire.keys import load_client
 
 _Record = TypeVar("_Record")
 
@@ -99,9 +99,9 @@ class Subscription(Generic[_Record]):
 class Hand:
     """A hand by its two addresses. Not for use from several threads at once; make one in each.
 
-    ``client`` is the name that owns the commander's lease (`daemon.modes.Lease`); ``timeout`` [s]
+    ``client`` is the name that owns the commander's lease (`control.modes.Lease`); ``timeout`` [s]
     is how long a reply, or a first state, is waited for. ``keys`` is the folder of this client's
-    keys, where the daemon wants some; `daemon.keys.KeyFileError` when they can't be read.
+    keys, where the daemon wants some; `wire.keys.KeyFileError` when they can't be read.
     """
 
     def __init__(

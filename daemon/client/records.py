@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.records import FINGERS
+from softfinger.daemon.types import FINGERS
 
 _Record = TypeVar("_Record")
 

@@ -11,9 +11,9 @@ from typing import Any
 import msgpack
 import zmq
 
-from daemon import messages
-from daemon.client.records import read_event, read_frame, read_state
-from daemon.patience import still_waiting
+from softfinger.daemon.client.patience import still_waiting
+from softfinger.daemon.client.records import read_event, read_frame, read_state
+from softfinger.daemon.wire import messages
 
 _QUEUE = 100_000  # messages kept for a program that is slow for a while
 _AGAIN = 1000  # messages that are known again

@@ -1,6 +1,6 @@
 """The gateway's process: bound first, then serving until the loop hangs up.
 
-``python -m daemon.gateway FD CONFIG``: the link's descriptor, and a `Config` as JSON.
+``python -m softfinger.daemon.gateway FD CONFIG``: the link's descriptor, and a `Config` as JSON.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import socket
 import sys
 from pathlib import Path
 
-from daemon.gateway import link
-from daemon.gateway.config import Config
-from daemon.gateway.service import StartAnew, open_service
-from daemon.sockets import AddressError
+from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.service import StartAnew, open_service
+from softfinger.daemon.wire.sockets import AddressError
 
 _MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
 _DESCRIPTORS = 64  # that are not clients'

@@ -18,11 +18,11 @@ import zmq
 import zmq.utils.z85
 from zmq.auth.thread import ThreadAuthenticator
 
-from daemon.gateway.config import Config
-from daemon.gateway.requests import Pace
-from daemon.gateway.service import Service, StartAnew
-from daemon.keys import DOMAIN, KeyFileError, ServerKeys, load_server
-from daemon.sockets import IpcFile, bind_error
+from softfinger.daemon.gateway.admission import Pace
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.service import Service, StartAnew
+from softfinger.daemon.wire.keys import DOMAIN, KeyFileError, ServerKeys, load_server
+from softfinger.daemon.wire.sockets import IpcFile, bind_error
 
 _NOW = int(zmq.NOBLOCK)
 _READ = 64  # messages at a look

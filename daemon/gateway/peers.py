@@ -13,11 +13,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
-from daemon.gateway.config import Topics
-from daemon.gateway.poll import Poll
-from daemon.gateway.requests import Pace, Requests
-from daemon.gateway.zmtp import GREETING, Broken, Parser, frame, pong, ready, socket_type
-from daemon.sockets import Listener
+from softfinger.daemon.gateway.admission import Pace, Requests
+from softfinger.daemon.gateway.config import Topics
+from softfinger.daemon.gateway.poll import Poll
+from softfinger.daemon.gateway.zmtp import GREETING, Broken, Parser, frame, pong, ready, socket_type
+from softfinger.daemon.wire.sockets import Listener
 
 _HANDSHAKE = 2.0  # s in which a peer has to have shown what it is
 _ACCEPTED = 32  # connections at a look

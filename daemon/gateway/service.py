@@ -11,12 +11,12 @@ from typing import Protocol
 
 import msgpack
 
-from daemon.gateway import link
-from daemon.gateway.config import Config, Topics
-from daemon.gateway.peers import Commands, Stream
-from daemon.gateway.poll import Poll
-from daemon.gateway.requests import Requests
-from daemon.sockets import Listener
+from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway.admission import Requests
+from softfinger.daemon.gateway.config import Config, Topics
+from softfinger.daemon.gateway.peers import Commands, Stream
+from softfinger.daemon.gateway.poll import Poll
+from softfinger.daemon.wire.sockets import Listener
 
 _TEND = 0.01  # s between looks at what is due by the time
 _PACKETS = 64  # packets of the loop taken in at a look
@@ -241,7 +241,7 @@ def open_service(
     """
     service = Service(end, config.topics, config.max_bytes, config.per_second, clock)
     if config.keys:
-        from daemon.gateway.curve import open_doors  # which alone needs libzmq
+        from softfinger.daemon.gateway.curve import open_doors  # which alone needs libzmq
 
         open_doors(service, config)
         return service

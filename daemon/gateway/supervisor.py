@@ -12,11 +12,11 @@ import threading
 import time
 from pathlib import Path
 
-from daemon.gateway import link
-from daemon.gateway.config import Config
-from daemon.sockets import AddressError
+from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.wire.sockets import AddressError
 
-_ROOT = Path(__file__).parents[2]  # where the package is found
+_ROOT = Path(__file__).parents[3]  # where the package is found
 _PATIENCE = 20.0  # s for a gateway to bind its sockets
 _LASTED = 10.0  # s after which a death counts as the first
 _AGAIN = 0.1, 2.0  # s between a death and the next start, at first and after many

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from daemon.records import Goal, Reading
+from softfinger.daemon.types import Goal, Reading
 
 
 class ServoError(Exception):

@@ -1,7 +1,7 @@
 """What is looked at before the servos are used: every finding in one list, with what mends it.
 
 Pure functions over what was read; they send nothing. The reading itself belongs to
-:mod:`daemon.servos.examine`.
+:mod:`servos.examine`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from daemon.servos import registers as reg
-from daemon.servos.models import ServoModel, by_number
-from daemon.servos.modes import mode_number
-from daemon.servos.units import JointScale
-from daemon.settings import ServoSettings, Settings
+from softfinger.daemon.profile.settings import ServoSettings, Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.models import ServoModel, by_number
+from softfinger.daemon.servos.modes import mode_number
+from softfinger.daemon.servos.units import JointScale
 
 # Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
 RETURN_DELAY_MAX = 25

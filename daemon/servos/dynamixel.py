@@ -4,7 +4,7 @@ Current, velocity, position and the alert bit of all servos come in one fast syn
 where a firmware is older). Now and then that read reaches further, which costs no exchange: every
 10 ms to the goals the servo holds, its bus watchdog and its own clock, 28 bytes a servo more, and
 four times a second to supply voltage and temperature, 11 bytes. Goal current and goal position go
-in one sync write, side by side (:mod:`daemon.servos.torque`); in current and position mode there is
+in one sync write, side by side (:mod:`servos.torque`); in current and position mode there is
 one goal and no indirection. What a servo must be set to in EEPROM is checked and never changed.
 """
 
@@ -19,22 +19,22 @@ from collections import deque
 
 from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 
-from daemon.clock import Clock
-from daemon.records import FINGERS, Goal, Reading
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.checks import check_latency
-from daemon.servos.examine import examine
-from daemon.servos.groups import GroupRead
-from daemon.servos.joints import Joint
-from daemon.servos.line import ServoLine
-from daemon.servos.models import ServoModel, by_name
-from daemon.servos.modes import mode_number
-from daemon.servos.packets import PacketHandler
-from daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
-from daemon.servos.torque import Torque
-from daemon.servos.units import JointScale
-from daemon.settings import Settings
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.checks import check_latency
+from softfinger.daemon.servos.examine import examine
+from softfinger.daemon.servos.groups import GroupRead
+from softfinger.daemon.servos.joints import Joint
+from softfinger.daemon.servos.line import ServoLine
+from softfinger.daemon.servos.models import ServoModel, by_name
+from softfinger.daemon.servos.modes import mode_number
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
+from softfinger.daemon.servos.torque import Torque
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ _LAST_TRIES = 10  # of torque off, at the end
 
 
 class DynamixelServos:
-    """Servo backend over a serial port; see :class:`daemon.servos.base.Servos`.
+    """Servo backend over a serial port; see :class:`servos.base.Servos`.
 
     One thread, one owner. ``notices`` holds what connect found worth saying and not wrong.
     """

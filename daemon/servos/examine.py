@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from daemon.records import FINGERS
-from daemon.servos import registers as reg
-from daemon.servos.checks import MEND, Findings, check_servo
-from daemon.servos.line import ServoLine
-from daemon.servos.models import ServoModel
-from daemon.settings import Settings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.checks import MEND, Findings, check_servo
+from softfinger.daemon.servos.line import ServoLine
+from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.types import FINGERS
 
 CHECKED = reg.BACKUP_READY  # registers 0 … 146 are looked at
 

@@ -13,9 +13,9 @@ from dynamixel_sdk.group_sync_read import GroupSyncRead
 from dynamixel_sdk.group_sync_write import GroupSyncWrite
 from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_CORRUPT, COMM_SUCCESS, INST_SYNC_WRITE
 
-from daemon.servos.crc import crc16
-from daemon.servos.packets import SMALLEST, PacketHandler, group_request
-from daemon.servos.port import SerialPort
+from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.packets import SMALLEST, PacketHandler, group_request
+from softfinger.daemon.servos.port import SerialPort
 
 _HEADER = b"\xff\xff\xfd"
 _CRC = struct.Struct("<H")

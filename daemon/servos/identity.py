@@ -1,6 +1,6 @@
 """Which servo of a bus is meant by which ID of the settings, where IDs or rates are not theirs yet.
 
-Pure: it decides what may be set without a guess; setting it is :mod:`daemon.servos.mend`'s affair.
+Pure: it decides what may be set without a guess; setting it is :mod:`servos.mend`'s affair.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from daemon.records import FINGERS
-from daemon.servos.models import ServoModel
-from daemon.servos.scanning import Found, FoundServo
-from daemon.settings import Settings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos.scanning import Found, FoundServo
+from softfinger.daemon.types import FINGERS
 
 
 @dataclass(frozen=True, slots=True)

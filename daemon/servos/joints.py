@@ -11,11 +11,11 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from daemon.servos import registers as reg
-from daemon.servos.examine import servo_name
-from daemon.servos.modes import current_toward
-from daemon.servos.units import JointScale
-from daemon.settings import ServoSettings
+from softfinger.daemon.profile.settings import ServoSettings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.examine import servo_name
+from softfinger.daemon.servos.modes import current_toward
+from softfinger.daemon.servos.units import JointScale
 
 _CURRENT_AT, _POSITION_AT = reg.GOAL_CURRENT, reg.GOAL_POSITION
 _CURRENT_AND_POSITION = struct.Struct("<hi")

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dynamixel_sdk.group_sync_write import GroupSyncWrite
 from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_SUCCESS
 
-from daemon.servos.packets import PacketHandler
-from daemon.servos.port import SerialPort
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import SerialPort
 
 TRIES = 3
 

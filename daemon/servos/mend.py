@@ -2,26 +2,26 @@
 
 The one place that writes a servo's EEPROM, and only when it is asked to (`softfinger doctor
 --fix`); the hand lets go meanwhile. IDs and rates are written where there is no doubt which servo
-is meant (:mod:`daemon.servos.identity`).
+is meant (:mod:`servos.identity`).
 """
 
 from __future__ import annotations
 
 import time
 
-from daemon.records import FINGERS
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.checks import DRIVE_UNFIT, RETURN_DELAY_MAX
-from daemon.servos.examine import servo_name
-from daemon.servos.identity import Change, Plan, plan
-from daemon.servos.line import ServoLine
-from daemon.servos.models import ServoModel, by_name
-from daemon.servos.modes import mode_number
-from daemon.servos.packets import PacketHandler
-from daemon.servos.port import SerialPort
-from daemon.servos.scanning import ALONE, PING_TIMEOUT, Found, search, talks_garbled
-from daemon.settings import Settings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.checks import DRIVE_UNFIT, RETURN_DELAY_MAX
+from softfinger.daemon.servos.examine import servo_name
+from softfinger.daemon.servos.identity import Change, Plan, plan
+from softfinger.daemon.servos.line import ServoLine
+from softfinger.daemon.servos.models import ServoModel, by_name
+from softfinger.daemon.servos.modes import mode_number
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.scanning import ALONE, PING_TIMEOUT, Found, search, talks_garbled
+from softfinger.daemon.types import FINGERS
 
 _REBOOT_LIMIT = 2.0  # s that a servo may take to answer again
 _WRITTEN = 0.05  # s in which a packet has left an adapter and is in a servo's EEPROM

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from daemon.servos.registers import BAUD_RATES, VELOCITY_UNIT
+from softfinger.daemon.servos.registers import BAUD_RATES, VELOCITY_UNIT
 
 
 @dataclass(frozen=True, slots=True)

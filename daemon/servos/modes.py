@@ -1,14 +1,14 @@
 """The operating modes in which the backends run the joints, by the settings' names.
 
-What a goal means in each of them is told in :mod:`daemon.servos.base`. Pure functions and numbers.
+What a goal means in each of them is told in :mod:`servos.base`. Pure functions and numbers.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from daemon.servos import registers as reg
-from daemon.settings import ServoSettings
+from softfinger.daemon.profile.settings import ServoSettings
+from softfinger.daemon.servos import registers as reg
 
 NUMBERS: Final = {
     "current-based position": reg.CURRENT_BASED_POSITION_MODE,

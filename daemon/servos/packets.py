@@ -3,7 +3,7 @@
 The SDK stuffs a packet and throws the result away, so that FF FF FD within goals reaches the
 servo unstuffed and is misread; it drops a byte of FF FF FD 12 FF FD FD when it unstuffs.
 Everything else of the SDK is used as it is; the group reads and writes of a tick stand in
-:mod:`daemon.servos.groups`.
+:mod:`servos.groups`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from dynamixel_sdk.robotis_def import (
     MAX_ID,
 )
 
-from daemon.servos.crc import crc16
-from daemon.servos.port import SerialPort
+from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.port import SerialPort
 
 _PREFIX = b"\xff\xff\xfd\x00"
 _HEADER = b"\xff\xff\xfd"

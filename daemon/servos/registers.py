@@ -1,7 +1,7 @@
 """Addresses of the Dynamixel X series' control table, its operating modes and fixed units.
 
 Names and numbers only, as the servo maker's manuals give them. The real backend and the emulated
-servo both read them here; what a model adds or limits stands in :mod:`daemon.servos.models`.
+servo both read them here; what a model adds or limits stands in :mod:`servos.models`.
 """
 
 from __future__ import annotations

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.line import ServoLine
-from daemon.servos.models import by_number
-from daemon.servos.packets import PacketHandler
-from daemon.servos.port import SerialPort
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.line import ServoLine
+from softfinger.daemon.servos.models import by_number
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import SerialPort
 
 PING_TIMEOUT = 0.02  # s, for factory-new servos with their return delay, behind slow adapters
 FACTORY_ID = 1

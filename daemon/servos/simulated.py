@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 
-from daemon.clock import Clock
-from daemon.records import FINGERS, Goal, Reading
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.checks import check_model
-from daemon.servos.models import by_name
-from daemon.servos.modes import current_toward, mode_number
-from daemon.servos.units import JointScale
-from daemon.settings import Settings
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.servo_health import AMBIENT, THERMAL_RISE, THERMAL_TIME
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.checks import check_model
+from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos.modes import current_toward, mode_number
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.servo_model.servo_health import (
+    AMBIENT,
+    THERMAL_RISE,
+    THERMAL_TIME,
+)
+from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _HEALTH_EVERY = 0.25  # s between two looks at temperature and supply
 

@@ -12,14 +12,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.checks import check_angle
-from daemon.servos.groups import GroupWrite
-from daemon.servos.joints import GOAL_SIZE, Joint, goal_in, pack_goal
-from daemon.servos.line import ServoLine
-from daemon.servos.models import ServoModel
-from daemon.settings import Hand, ServoSettings
+from softfinger.daemon.profile.settings import Hand, ServoSettings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.checks import check_angle
+from softfinger.daemon.servos.groups import GroupWrite
+from softfinger.daemon.servos.joints import GOAL_SIZE, Joint, goal_in, pack_goal
+from softfinger.daemon.servos.line import ServoLine
+from softfinger.daemon.servos.models import ServoModel
 
 _GOAL_BYTES = (
     reg.GOAL_CURRENT,

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from daemon.servos.models import ServoModel, by_name
-from daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
-from daemon.settings import ServoSettings
+from softfinger.daemon.profile.settings import ServoSettings
+from softfinger.daemon.servos.models import ServoModel, by_name
+from softfinger.daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
 
 _GOAL_LIMIT = 1_048_575  # counts: the furthest goal the multi-turn modes take
 

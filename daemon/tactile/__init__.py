@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daemon.clock import Clock
-from daemon.settings import Settings
-from daemon.tactile.base import TactileSensor
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.tactile.base import TactileSensor
 
 if TYPE_CHECKING:
-    from daemon.simulation.hand import SimulatedHand
+    from softfinger.daemon.simulation.physics.hand import SimulatedHand
 
 
 def make_sensor(
@@ -18,24 +18,24 @@ def make_sensor(
     """The settings' backend for one finger, not yet open; None when the scene has no sensors."""
     backend = settings.tactile.backend
     if backend == "simulated":
-        from daemon.tactile.simulated import SimulatedTactile
+        from softfinger.daemon.tactile.simulated import SimulatedTactile
 
         assert hand is not None
         return SimulatedTactile(settings, hand, clock, finger)
     if backend == "flexitac":
-        from daemon.tactile.flexitac import FlexiTac
+        from softfinger.daemon.tactile.flexitac import FlexiTac
 
         return FlexiTac(settings.tactile, clock, finger)
     if backend == "glove":
-        from daemon.tactile.glove import Glove
+        from softfinger.daemon.tactile.glove import Glove
 
         return Glove(settings.tactile, clock, finger)
     if backend == "cobs":
-        from daemon.tactile.cobs import Cobs
+        from softfinger.daemon.tactile.cobs import Cobs
 
         return Cobs(settings.tactile, clock, finger)
     if backend == "replay":
-        from daemon.tactile.replay import ReplayTactile
+        from softfinger.daemon.tactile.replay import ReplayTactile
 
         return ReplayTactile(settings.tactile, clock, finger)
     return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from daemon.records import Frame
+from softfinger.daemon.types import Frame
 
 
 class TactileError(Exception):

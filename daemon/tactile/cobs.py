@@ -44,11 +44,11 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.clock import Clock
-from daemon.settings import TactileSettings
-from daemon.tactile.cobs_packet import BAD_CRC, CRC_START, crc_tables, unpack
-from daemon.tactile.delimited import DelimitedDecoder
-from daemon.tactile.serial_reader import Decoded, SerialReader
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.tactile.cobs_packet import BAD_CRC, CRC_START, crc_tables, unpack
+from softfinger.daemon.tactile.delimited import DelimitedDecoder
+from softfinger.daemon.tactile.serial_reader import Decoded, SerialReader
 
 _HEADER = struct.Struct("<BBHIHH")
 _CRC = 2

@@ -7,9 +7,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.tactile.byte_masks import WIDTH, clear, equal, lowest
-from kinematics.borrowed import borrowed
-from kinematics.kernels import inner_kernel, kernel
+from softfinger.daemon.tactile.byte_masks import WIDTH, clear, equal, lowest
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.unowned import borrowed
 
 Bytes = NDArray[np.uint8]
 Mask: TypeAlias = np.uint64

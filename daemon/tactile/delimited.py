@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.tactile.serial_reader import Decoded
+from softfinger.daemon.tactile.serial_reader import Decoded
 
 _LOST_AFTER = 10  # frames' worth of bytes without a frame
 

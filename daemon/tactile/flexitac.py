@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from daemon.clock import Clock
-from daemon.settings import TactileSettings
-from daemon.tactile.serial_reader import BITS_PER_BYTE, Decoded, SerialReader
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, Decoded, SerialReader
 
 MARKER = b"\xaa\x55"
 _LEVELS = 12  # frames that a search may look back on before it drops the oldest

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.records import Frame
+from softfinger.daemon.types import Frame
 
 
 class GivenFrames:

@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.clock import Clock
-from daemon.settings import TactileSettings
-from daemon.tactile.delimited import DelimitedDecoder
-from daemon.tactile.serial_reader import SerialReader
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.tactile.delimited import DelimitedDecoder
+from softfinger.daemon.tactile.serial_reader import SerialReader
 
 REQUEST = b"a"
 _NEWLINE = 10

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.own_files import write_bytes
-from daemon.tactile import tekscan
+from softfinger.daemon.tactile import tekscan
+from softfinger.daemon.wire.own_files import write_bytes
 
 FloatArray = NDArray[np.float64]
 TRUTHS = ("d", "theta", "force")

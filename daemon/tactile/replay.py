@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.clock import Clock
-from daemon.records import FINGERS, Frame
-from daemon.settings import TactileSettings
-from daemon.tactile.base import TactileError
-from daemon.tactile.recording import Recording, RecordingError, load_recording
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.tactile.recording import Recording, RecordingError, load_recording
+from softfinger.daemon.types import FINGERS, Frame
 
 
 class ReplayTactile:

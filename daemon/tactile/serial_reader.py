@@ -20,9 +20,9 @@ import numpy as np
 import serial
 from numpy.typing import NDArray
 
-from daemon.clock import Clock
-from daemon.records import Frame
-from daemon.tactile.base import TactileError
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.types import Frame
 
 _CHUNK = 65536  # bytes taken at once: all that a Linux tty can hold
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit

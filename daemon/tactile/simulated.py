@@ -7,14 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.clock import Clock
-from daemon.model import make_grid, make_material, make_tip
-from daemon.records import Frame
-from daemon.settings import Settings
-from daemon.simulation import layout
-from daemon.simulation.arrivals import Arrivals
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.sensor_model import Imperfections, SensorModel
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.sensor.arrivals import Arrivals
+from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.daemon.types import Frame
 
 
 def make_sensor_model(settings: Settings, finger: int) -> SensorModel:

@@ -22,12 +22,12 @@ from typing import Any
 import msgpack
 import zmq
 
-from daemon.assembly import Daemon
-from daemon.calibration import CalibrationFileError, load_calibration
-from daemon.commands import Refused, decode
-from daemon.modes import COMMANDS
-from daemon.profiles import load
-from daemon.settings import Settings, SettingsError
+from softfinger.daemon.control.modes import COMMANDS
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.perception.calibration_file import CalibrationFileError, load_calibration
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.wire.command_server import Refused, decode
 from tests.harness.gateway import Served
 
 ROOT = Path(__file__).parents[2]

@@ -13,9 +13,9 @@ import time
 
 import numpy as np
 
-from daemon.simulation import layout
-from daemon.simulation.plant import step
-from kinematics.kernels import kernel
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.plant import step
+from softfinger.kinematics.compiled.kernel import kernel
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
 LONGER = 10  # times the step that the plant chooses, in one hand of three

@@ -12,12 +12,12 @@ import sys
 import time
 from typing import NamedTuple
 
-from daemon.servos import registers as reg
-from daemon.servos.crc import crc16
-from daemon.simulation import protocol
-from daemon.simulation.protocol import BROADCAST, Parser, frame
-from daemon.simulation.servo import REBOOT_TIME, EmulatedServo
-from daemon.simulation.servo_bus import ServoBus
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, Parser, frame
+from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME, EmulatedServo
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import make_bus
 
 SEEDS = (

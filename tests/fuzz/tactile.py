@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daemon.simulation.encoders import ENCODERS
-from daemon.tactile.cobs import CobsDecoder
-from daemon.tactile.flexitac import FlexiTacDecoder
-from daemon.tactile.glove import GloveDecoder
-from daemon.tactile.serial_reader import Decoder
-from daemon.tactile.tekscan import TekscanError, parse
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.tactile.cobs import CobsDecoder
+from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
+from softfinger.daemon.tactile.glove import GloveDecoder
+from softfinger.daemon.tactile.serial_reader import Decoder
+from softfinger.daemon.tactile.tekscan import TekscanError, parse
 
 ROWS, COLS = 4, 5
 DECODERS = {"flexitac": FlexiTacDecoder, "glove": GloveDecoder, "cobs": CobsDecoder}

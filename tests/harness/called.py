@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-from kinematics.kernels import kernel
+from softfinger.kinematics.compiled.kernel import kernel
 
 Function = TypeVar("Function")
 

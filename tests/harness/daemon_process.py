@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.client import Refused
-from daemon.command_client import send
+from softfinger.daemon.client import Refused
+from softfinger.daemon.client.command_client import send
 
-SOFTFINGER = [sys.executable, "-m", "tools.cli"]
+SOFTFINGER = [sys.executable, "-m", "softfinger"]
 # A hand that sits out a busy machine's stalls, for tests that are not about its time-outs.
 PATIENCE = {
     "servos.reply_timeout": 0.1,

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from daemon.commands import CommandServer, Handler
-from daemon.gateway import link
-from daemon.gateway.config import Config
-from daemon.gateway.service import open_service
-from daemon.stream import TOPICS, Publisher
+from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.service import open_service
+from softfinger.daemon.wire.command_server import CommandServer, Handler
+from softfinger.daemon.wire.publisher import TOPICS, Publisher
 
 
 class Served:

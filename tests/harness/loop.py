@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.commands import Refused
-from daemon.simulation import layout
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.wire.command_server import Refused
 
 Make = Callable[..., Daemon]
 

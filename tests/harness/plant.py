@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from daemon.settings import Settings
-from daemon.simulation import layout
-from daemon.simulation.hand import SimulatedHand
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.table import ContactTable
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 
 MODULUS = 0.304e6
 WIDTH = 0.040

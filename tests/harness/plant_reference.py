@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kinematics.fingers import HandGeometry
+from softfinger.kinematics.hand.geometry import HandGeometry
 from tests.harness.plant import CONSTANT, MODULUS
 
 HAND = HandGeometry()

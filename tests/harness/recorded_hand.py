@@ -9,10 +9,10 @@ from typing import Any
 
 import msgpack
 
-from daemon.assembly import Daemon, facts
-from daemon.commands import Handler, Refused
-from daemon.profiles import load
-from tools.recordings.writer import RecordingWriter
+from softfinger.daemon.loop.build import Daemon, facts
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.wire.command_server import Handler, Refused
+from softfinger.tools.recordings.writer import RecordingWriter
 
 Messages = list[tuple[bytes, dict[str, Any]]]
 

@@ -13,14 +13,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from daemon.servos.models import by_name
-from daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
-from daemon.servos.units import JointScale
-from daemon.settings import Settings
-from daemon.simulation.free_joints import FreeJoints
-from daemon.simulation.pty_bus import PtyServoBus
-from daemon.simulation.servo import EmulatedServo
-from daemon.simulation.servo_bus import ServoBus
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
 RADIAN = 2.0 * 3.141592653589793 / COUNTS_PER_TURN
 

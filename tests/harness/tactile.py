@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.clock import Clock, RealClock, VirtualClock
-from daemon.records import Frame
-from daemon.settings import Settings
-from daemon.simulation.encoders import ENCODERS
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.tactile_board import BoardFault, TactileBoard
-from daemon.tactile import make_sensor
-from daemon.tactile.base import TactileSensor
+from softfinger.daemon.loop.clock import Clock, RealClock, VirtualClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.tactile.base import TactileSensor
+from softfinger.daemon.types import Frame
 from tests.conftest import until
 
 ROWS = COLS = 32

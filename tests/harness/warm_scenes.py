@@ -16,11 +16,17 @@ from typing import Any
 
 from numba.core import event
 
-from daemon.assembly import Daemon
-from daemon.calibration import Calibration, TareStep, now, save_calibration, sensor_of
-from daemon.commands import Refused
-from daemon.profiles import load
-from daemon.settings import Settings
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.perception.calibration_file import (
+    Calibration,
+    TareStep,
+    now,
+    save_calibration,
+    sensor_of,
+)
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.command_server import Refused
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SCENES: dict[str, dict[str, Any]] = {

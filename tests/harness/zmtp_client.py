@@ -9,7 +9,7 @@ from typing import Any
 
 import msgpack
 
-from daemon.gateway.zmtp import GREETING, Parser, frame
+from softfinger.daemon.gateway.zmtp import GREETING, Parser, frame
 
 
 def ready(kind: bytes) -> bytes:

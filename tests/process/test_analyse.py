@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import messages
-from daemon.records import Frame
-from daemon.settings import Settings
-from kinematics import Fingertip, Material, SensorGrid
+from softfinger import Fingertip, Material, SensorGrid
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Frame
+from softfinger.daemon.wire import messages
+from softfinger.tools.analysis.contacts import analyse, write_csv
+from softfinger.tools.analysis.sources import open_source
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.daemon_process import softfinger
-from tools.analysis.contacts import analyse, write_csv
-from tools.analysis.sources import open_source
-from tools.recordings.errors import RecordingError
-from tools.recordings.writer import RecordingWriter
 
 TIP, PITCH, SCALE = Fingertip(0.020), 0.058 / 44, 4.0
 DEPTHS = np.linspace(0.0, 0.005, 26)
@@ -145,7 +145,7 @@ def test_wrong_settings_and_a_missing_extra(tmp_path: Path, counts: np.ndarray) 
     assert done.returncode == 2
     code = (
         "import sys; sys.modules['matplotlib'] = None\n"
-        "from tools.cli import main\n"
+        "from softfinger.tools.cli import main\n"
         f"sys.exit(main(['analyse', {str(path)!r}]))"
     )
     told = subprocess.run(

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from daemon.profiles import load
-from tools.bench import ON_DEMAND
-from tools.benchmarks import faults, faults_trials
-from tools.benchmarks.faults import Outcome
-from tools.benchmarks.faults_cases import CASES, Case
-from tools.benchmarks.faults_rig import PROFILE, Rig, RigError
-from tools.benchmarks.faults_trials import Trial, judge_wire
-from tools.cli import main
+from softfinger.daemon.profile.load import load
+from softfinger.tools.bench import ON_DEMAND
+from softfinger.tools.benchmarks import faults, faults_trials
+from softfinger.tools.benchmarks.faults import Outcome
+from softfinger.tools.benchmarks.faults_cases import CASES, Case
+from softfinger.tools.benchmarks.faults_rig import PROFILE, Rig, RigError
+from softfinger.tools.benchmarks.faults_trials import Trial, judge_wire
+from softfinger.tools.cli import main
 
 BY_NAME = {case.name: case for case in CASES}
 SHORT = (
@@ -181,7 +181,7 @@ def test_the_command_line(monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path
 
 
 def test_every_fault_that_latches_has_a_time_and_names_that_exist() -> None:
-    from daemon.limits import ROWS
+    from softfinger.daemon.safety.limits import ROWS
 
     rows = {row.name for row in ROWS}
     assert len({case.name for case in CASES}) == len(CASES)

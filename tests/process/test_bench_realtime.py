@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tools.benchmarks import neighbours, scenes, wakeup
+from softfinger.tools.benchmarks import neighbours, scenes, wakeup
 
 REPORT = """\
 # /dev/cpu_dma_latency set to 0us

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from tools.benchmarks import recording
+from softfinger.tools.benchmarks import recording
 
 
 def test_a_short_measurement_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from tools.bench import MEASUREMENTS, ON_DEMAND
-from tools.benchmarks import blame, servo_rig, servos, sustained
-from tools.benchmarks.blame import Cycle
+from softfinger.tools.bench import MEASUREMENTS, ON_DEMAND
+from softfinger.tools.benchmarks import blame, servo_rig, servos, sustained
+from softfinger.tools.benchmarks.blame import Cycle
 
 
 def test_a_paced_cycle_takes_its_bytes_time(monkeypatch):

@@ -11,15 +11,15 @@ import threading
 import numpy as np
 import pytest
 
-from daemon.calibration import load_calibration
-from daemon.clock import RealClock
-from daemon.records import Frame
-from daemon.simulation.encoders import ENCODERS
-from daemon.simulation.tactile_board import TactileBoard
-from kinematics.material import Material
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
+from softfinger.daemon.types import Frame
+from softfinger.kinematics.contact.material import Material
+from softfinger.tools.cli import main
 from tests.harness.daemon_process import softfinger
 from tests.unit.test_calibrate import CENTRE, EXPONENT, NOISE, PROFILE, ROTATION, TIP, E, MadeUp, N
-from tools.cli import main
 
 MATERIAL = Material.constant(E)
 RATE = 400.0  # Hz

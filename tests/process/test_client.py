@@ -14,8 +14,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from daemon import messages
-from daemon.client import (
+from softfinger.daemon.client import (
     AsyncHand,
     FingerState,
     Hand,
@@ -28,10 +27,11 @@ from daemon.client import (
     Refused,
     to_columns,
 )
-from daemon.client.records import read_event, read_frame, read_state
-from daemon.client.wire import Gaps
-from daemon.patience import SILENCE
-from daemon.records import State
+from softfinger.daemon.client.patience import SILENCE
+from softfinger.daemon.client.records import read_event, read_frame, read_state
+from softfinger.daemon.client.wire import Gaps
+from softfinger.daemon.types import State
+from softfinger.daemon.wire import messages
 from tests.conftest import until
 from tests.harness import fake_daemon
 from tests.harness.daemon_process import Running, insist
@@ -271,5 +271,5 @@ def test_fingers_by_name() -> None:
 
 
 def test_importing_the_client_compiles_nothing() -> None:
-    code = "import daemon.client, sys; sys.exit('numba' in sys.modules)"
+    code = "import softfinger.daemon.client, sys; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

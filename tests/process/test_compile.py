@@ -10,8 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from daemon.settings import Settings
-from daemon.warm_up import named
+from softfinger.daemon.loop.warm_up import named
+from softfinger.daemon.profile.settings import Settings
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 
@@ -53,7 +53,7 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
     table = named("contact table")
     settings = Settings().model_dump_json()
     done = subprocess.run(
-        [sys.executable, "-m", "tools.kernel_worker"],
+        [sys.executable, "-m", "softfinger.tools.processes.kernel_worker"],
         input=f"{settings}\n\n{table.name}\n",
         env=environment(tmp_path),
         capture_output=True,

@@ -11,7 +11,7 @@ import pytest
 # Presses Ctrl-C at the import of a module.
 _AT = """
 import builtins, os, signal, sys
-from tools import cli
+from softfinger.tools import cli
 really = builtins.__import__
 def patched(name, *rest, **more):
     if name == sys.argv[1]:
@@ -24,7 +24,11 @@ sys.exit(cli.main(sys.argv[2:]))
 
 @pytest.mark.parametrize(
     ("module", "words"),
-    [("argparse", ["limits"]), ("pydantic", ["run"]), ("daemon.settings", ["monitor"])],
+    [
+        ("argparse", ["limits"]),
+        ("pydantic", ["run"]),
+        ("softfinger.daemon.profile.settings", ["monitor"]),
+    ],
 )
 def test_it_ends_the_process_as_any_other(module: str, words: list[str]) -> None:
     done = subprocess.run(
@@ -35,7 +39,7 @@ def test_it_ends_the_process_as_any_other(module: str, words: list[str]) -> None
 
 def test_later_it_is_a_keyboard_interrupt_again() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _AT, "daemon.limits", "limits"],
+        [sys.executable, "-c", _AT, "softfinger.daemon.safety.limits", "limits"],
         capture_output=True,
         text=True,
         timeout=60,

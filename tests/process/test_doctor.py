@@ -14,19 +14,19 @@ from typing import Any
 
 import pytest
 
-from daemon import warm_up
-from daemon.checkup import addresses as sockets
-from daemon.checkup import hand, kernels, machine, mending, ports
-from daemon.checkup.result import Result
-from daemon.profiles import load
-from daemon.servos import registers as reg
-from daemon.servos.scanning import scan
-from daemon.settings import Settings
-from daemon.simulation.emulator import Emulator
+from softfinger.daemon.diagnosis import addresses as sockets
+from softfinger.daemon.diagnosis import hand, kernels, machine, mending, ports
+from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.loop import warm_up
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.scanning import scan
+from softfinger.daemon.simulation.emulator.emulator import Emulator
+from softfinger.tools import doctor
+from softfinger.tools.cli import main
 from tests.harness.descendants import ending
 from tests.harness.gateway import Served
-from tools import doctor
-from tools.cli import main
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 
@@ -342,7 +342,7 @@ def profile(addresses: tuple[str, str]) -> Settings:
 def test_free_and_taken_sockets(addresses, monkeypatch):
     settings = profile(addresses)
     assert [each.status for each in check(settings)] == ["pass", "pass"]
-    monkeypatch.setattr("daemon.checkup.addresses._PATIENCE", 0.05)
+    monkeypatch.setattr("softfinger.daemon.diagnosis.addresses._PATIENCE", 0.05)
     host, port = addresses[0].removeprefix("tcp://").split(":")
     with socket.create_server((host, int(port))):
         taken, free = check(settings)

@@ -18,21 +18,21 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from daemon.clock import RealClock
-from daemon.records import Goal, Reading
-from daemon.servos import port as port_module
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.checks import check_latency, check_servo
-from daemon.servos.dynamixel import DynamixelServos
-from daemon.servos.groups import GroupRead
-from daemon.servos.models import by_name, by_number
-from daemon.servos.packets import PacketHandler
-from daemon.servos.port import PortGone, SerialPort
-from daemon.servos.units import JointScale
-from daemon.settings import ServoSettings, Settings
-from daemon.simulation.free_joints import FreeJoints
-from daemon.simulation.servo_bus import ServoBus
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.profile.settings import ServoSettings, Settings
+from softfinger.daemon.servos import port as port_module
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.checks import check_latency, check_servo
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.groups import GroupRead
+from softfinger.daemon.servos.models import by_name, by_number
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import PortGone, SerialPort
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
 from tests.harness.servos import RADIAN, RunningBus, make_bus
 

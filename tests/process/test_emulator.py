@@ -18,24 +18,24 @@ import numpy as np
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 
-from daemon.clock import RealClock
-from daemon.model import make_estimator, make_material
-from daemon.profiles import load
-from daemon.settings import Settings
-from daemon.simulation import emulator as module
-from daemon.simulation.emulator import (
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.profile.factory import make_estimator, make_material
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.emulator import emulator as module
+from softfinger.daemon.simulation.emulator.emulator import (
     DEFAULT_BOARD,
     Emulator,
     EmulatorClock,
     EmulatorError,
     with_board,
 )
-from daemon.simulation.link_folder import LINKS, FolderError, LinkFolder
-from daemon.tactile import make_sensor
-from daemon.tactile.base import TactileError
-from daemon.tactile.flexitac import FlexiTac
+from softfinger.daemon.simulation.emulator.link_folder import LINKS, FolderError, LinkFolder
+from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.tactile.flexitac import FlexiTac
+from softfinger.tools.cli import main
 from tests.conftest import until
-from tools.cli import main
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 READY_WITHIN = 200.0  # s; kernels may have to be compiled
@@ -49,7 +49,7 @@ class Process:
 
     def __init__(self, *arguments: str | Path) -> None:
         self.popen = subprocess.Popen(
-            [sys.executable, "-m", "tools.cli", "emulate", *map(str, arguments)],
+            [sys.executable, "-m", "softfinger", "emulate", *map(str, arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

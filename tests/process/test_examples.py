@@ -19,7 +19,7 @@ Profile = Callable[[str], Path]
 
 def example(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "tools.examples.grasp_and_turn", *words],
+        [sys.executable, "-m", "softfinger.tools.examples.grasp_and_turn", *words],
         capture_output=True,
         text=True,
         timeout=120,

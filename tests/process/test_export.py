@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import messages
+from softfinger.daemon.wire import messages
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.tables import BLOCK, CsvTable, ParquetTable, export
+from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.daemon_process import softfinger
 from tests.process.test_record import written
 from tests.unit.test_contract import flat, sample
-from tools.recordings.reader import Recording
-from tools.recordings.tables import BLOCK, CsvTable, ParquetTable, export
-from tools.recordings.writer import RecordingWriter
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_what_can_not_be_exported(tmp_path: Path) -> None:
 def test_a_missing_extra_is_named(path: Path, tmp_path: Path) -> None:
     code = (
         "import sys; sys.modules['pyarrow'] = None\n"
-        "from tools.cli import main\n"
+        "from softfinger.tools.cli import main\n"
         f"sys.exit(main(['export', {str(path)!r}, '--format', 'parquet', '--out', "
         f"{str(tmp_path / 'out')!r}]))"
     )

@@ -17,11 +17,11 @@ import serial
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from daemon.clock import RealClock
-from daemon.records import Frame
-from daemon.settings import TactileSettings
-from daemon.tactile.base import TactileError
-from daemon.tactile.flexitac import MARKER, FlexiTac, FlexiTacDecoder
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.tactile.flexitac import MARKER, FlexiTac, FlexiTacDecoder
+from softfinger.daemon.types import Frame
 from tests.conftest import until
 
 ROWS, COLS = 4, 5

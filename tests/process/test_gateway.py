@@ -14,16 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.client import AsyncHand, Hand
-from daemon.command_client import NoAnswer, send
-from daemon.gateway import link
-from daemon.gateway.config import Config
-from daemon.gateway.supervisor import Gateway
-from daemon.local_stop import LocalStop, stop_locally
-from daemon.settings import Settings
-from daemon.sockets import AddressError
-from daemon.stream import TOPICS, Publisher
+from softfinger.daemon.client import AsyncHand, Hand
+from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.supervisor import Gateway
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
+from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.daemon.wire.sockets import AddressError
 from tests.conftest import until
 from tests.harness.daemon_process import Running, softfinger
 from tests.harness.zmtp_client import RawClient
@@ -141,7 +141,7 @@ def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(
 
 def test_it_imports_neither_numpy_nor_libzmq() -> None:
     code = (
-        "import sys, daemon.gateway.__main__\n"
+        "import sys, softfinger.daemon.gateway.__main__\n"
         "assert not {'numpy', 'numba', 'zmq', 'pydantic'} & set(sys.modules), 'too much'"
     )
     done = os.spawnv(os.P_WAIT, sys.executable, [sys.executable, "-c", code])
@@ -202,7 +202,7 @@ def test_a_folder_that_others_may_enter_is_not_taken(
     own_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     own_folder.mkdir(mode=0o755)
-    monkeypatch.setattr("daemon.local_stop._folders", lambda: iter([own_folder]))
+    monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
     with pytest.raises(AddressError, match="is not this user's alone"):
         LocalStop("tcp://127.0.0.1:9")
     own_folder.rmdir()
@@ -246,7 +246,13 @@ def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses: tuple[
     config = Config(*addresses, TOPICS, 10, 200, 10.0, 0o600, "")
     with ours, theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "daemon.gateway", str(theirs.fileno()), config.to_json()],
+            [
+                sys.executable,
+                "-m",
+                "softfinger.daemon.gateway",
+                str(theirs.fileno()),
+                config.to_json(),
+            ],
             pass_fds=(theirs.fileno(),),
             stderr=subprocess.PIPE,
         )

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.simulation.encoders import encode_glove, encoder_for
-from daemon.tactile.glove import GloveDecoder, bits_of
+from softfinger.daemon.simulation.emulator.encoders import encode_glove, encoder_for
+from softfinger.daemon.tactile.glove import GloveDecoder, bits_of
 from tests.conftest import until
 from tests.harness.tactile import Rig
 

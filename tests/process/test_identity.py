@@ -10,23 +10,23 @@ from typing import Any
 
 import pytest
 
-from daemon.checkup import hand
-from daemon.profiles import load
-from daemon.servos import mend as mending
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError
-from daemon.servos.identity import plan
-from daemon.servos.mend import mend
-from daemon.servos.models import by_name
-from daemon.servos.scanning import Found, FoundServo, Garbled, search
-from daemon.settings import Settings
-from daemon.simulation import protocol
-from daemon.simulation.collision import collide, overlay
-from daemon.simulation.emulator import Emulator
-from daemon.simulation.protocol import BROADCAST, frame
+from softfinger.daemon.diagnosis import hand
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import mend as mending
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.identity import plan
+from softfinger.daemon.servos.mend import mend
+from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos.scanning import Found, FoundServo, Garbled, search
+from softfinger.daemon.simulation.emulator.emulator import Emulator
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.collision import collide, overlay
+from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, frame
+from softfinger.tools import doctor
+from softfinger.tools.cli import main
 from tests.harness.servos import make_bus
-from tools import doctor
-from tools.cli import main
 
 MODEL = by_name("XM430-W350")
 RATES = MODEL.baud_rates

@@ -13,23 +13,24 @@ from pathlib import Path
 
 import pytest
 
-import kinematics
-from kinematics import kernel_cache
+from softfinger.kinematics.compiled import kernel_cache
 
 FILES = {
-    "kinematics/__init__.py": "",
-    "kinematics/layout.py": "OFFSET = 1.0\n",
-    "kinematics/callee.py": """
-from kinematics.kernels import inner_kernel
+    "softfinger/__init__.py": "",
+    "softfinger/kinematics/__init__.py": "",
+    "softfinger/kinematics/compiled/__init__.py": "",
+    "softfinger/kinematics/layout.py": "OFFSET = 1.0\n",
+    "softfinger/kinematics/callee.py": """
+from softfinger.kinematics.compiled.kernel import inner_kernel
 
 @inner_kernel
 def twice(x):
     return 2.0 * x
 """,
-    "kinematics/caller.py": """
-from kinematics import layout
-from kinematics.callee import twice
-from kinematics.kernels import kernel
+    "softfinger/kinematics/caller.py": """
+from softfinger.kinematics import layout
+from softfinger.kinematics.callee import twice
+from softfinger.kinematics.compiled.kernel import kernel
 
 @kernel
 def caller(x):
@@ -37,7 +38,7 @@ def caller(x):
 """,
 }
 RUN = """
-import kinematics.caller as c
+import softfinger.kinematics.caller as c
 print(c.caller(1.0), sum(c.caller.stats.cache_hits.values()))
 """
 
@@ -50,14 +51,14 @@ class Package:
         self.cache = folder / "cache"
         for name, text in FILES.items():
             self.write(name, text)
-        real = Path(kinematics.__file__).parent
-        for name in ("kernels.py", "kernel_cache.py", "inner_kernels.py"):
-            shutil.copy(real / name, folder / "kinematics")
+        real = Path(kernel_cache.__file__).parent
+        for name in ("kernel.py", "kernel_cache.py", "inner_kernels.py"):
+            shutil.copy(real / name, folder / "softfinger" / "kinematics" / "compiled")
 
     def write(self, name: str, text: str) -> None:
         """Write one of its files."""
         file = self.folder / name
-        file.parent.mkdir(exist_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
 
     def run(self) -> tuple[list[str], str]:
@@ -83,11 +84,14 @@ def package(tmp_path: Path) -> Package:
 def test_a_changed_callee_or_constant_is_compiled_anew(package: Package) -> None:
     assert package.run() == (["3.0", "0"], "")
     assert package.run() == (["3.0", "1"], "")
-    package.write("kinematics/callee.py", FILES["kinematics/callee.py"].replace("2.0", "5.0"))
+    package.write(
+        "softfinger/kinematics/callee.py",
+        FILES["softfinger/kinematics/callee.py"].replace("2.0", "5.0"),
+    )
     assert package.run()[0] == ["6.0", "0"]
-    package.write("kinematics/layout.py", "OFFSET = 7.0\n")
+    package.write("softfinger/kinematics/layout.py", "OFFSET = 7.0\n")
     assert package.run()[0] == ["12.0", "0"]
-    package.write("kinematics/layout.py", "OFFSET = 1.0\n")
+    package.write("softfinger/kinematics/layout.py", "OFFSET = 1.0\n")
     assert package.run()[0] == ["6.0", "1"], "the folder of these sources is still there"
 
 

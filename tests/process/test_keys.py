@@ -13,9 +13,9 @@ import pytest
 import zmq
 import zmq.auth
 
-from daemon.client import Hand, NoStream
-from daemon.command_client import NoAnswer, send
-from daemon.keys import KeyFileError, load_client, load_server, make_keys
+from softfinger.daemon.client import Hand, NoStream
+from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.wire.keys import KeyFileError, load_client, load_server, make_keys
 from tests.conftest import until
 from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
 from tests.harness.gateway import Served

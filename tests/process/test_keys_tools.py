@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import pytest
 
-from daemon.client import AsyncHand, Hand, NoStream
-from daemon.keys import make_keys
+from softfinger.daemon.client import AsyncHand, Hand, NoStream
+from softfinger.daemon.wire.keys import make_keys
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.republish import Wire
 from tests.conftest import own_addresses, until
 from tests.harness.daemon_process import SOFTFINGER, Running, insist, softfinger, until_it_says
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
-from tools.recordings.republish import Wire
 
 Profile = Callable[[str], Path]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.client import Event, Hand, HandState
-from daemon.client.hand import Subscription
+from softfinger.daemon.client import Event, Hand, HandState
+from softfinger.daemon.client.hand import Subscription
 from tests.harness.daemon_process import Running
 
 Profile = Callable[[str], Path]

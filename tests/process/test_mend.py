@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
-from daemon.clock import RealClock
-from daemon.servos import mend as mending
-from daemon.servos import registers as reg
-from daemon.servos import scanning
-from daemon.servos.base import ServoError
-from daemon.servos.dynamixel import DynamixelServos
-from daemon.servos.mend import mend
-from daemon.servos.scanning import FoundServo, scan
-from daemon.settings import Settings
-from daemon.simulation.free_joints import FreeJoints
-from daemon.simulation.servo_bus import ServoBus
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import mend as mending
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import scanning
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.mend import mend
+from softfinger.daemon.servos.scanning import FoundServo, scan
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import RunningBus
 
 

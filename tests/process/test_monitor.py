@@ -15,7 +15,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from daemon.client import Hand
+from softfinger.daemon.client import Hand
 from tests.conftest import until
 from tests.harness.daemon_process import Running
 from tests.harness.descendants import ending
@@ -33,7 +33,7 @@ def fake() -> Iterator[FakeDaemon]:
 
 def command(fake: FakeDaemon, *more: str) -> list[str]:
     where = ["--state", fake.state_address, "--commands", fake.command_address]
-    return [sys.executable, "-m", "tools.monitor", *where, *more]
+    return [sys.executable, "-m", "softfinger.tools.monitor", *where, *more]
 
 
 def test_page_shows_the_hand(fake: FakeDaemon) -> None:
@@ -72,7 +72,8 @@ def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
 
 BREAKS_AT_THE_TENTH_PAGE = """
 import argparse, sys
-from tools import monitor, monitor_page
+from softfinger.tools import monitor
+from softfinger.tools.terminal import monitor_page
 whole, count = monitor_page.Page.lines, 0
 def lines(*arguments):
     global count
@@ -206,7 +207,7 @@ def test_beside_another_commander_of_a_real_daemon(
     stream, commands = addresses
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
     where = ["--state", stream, "--commands", commands]
-    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
         page.shows("DISARMED", "running, disarmed")  # told before the page was there
         page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook") as hand:
@@ -234,7 +235,7 @@ def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:
 
 def test_commands_without_a_daemon() -> None:
     where = ["--state", NOBODY, "--commands", NOBODY]
-    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
         page.shows("waiting for a daemon", "no stream yet", "—")
         page.type(b"a" * 12 + b" ")
         page.shows("stop: no answer")
@@ -304,7 +305,7 @@ def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
 
 def test_no_wait_without_a_daemon() -> None:
     where = ["--state", NOBODY, "--commands", NOBODY, "--no-wait"]
-    with TerminalProcess([sys.executable, "-m", "tools.monitor", *where]) as page:
+    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
         assert page.ended() == 1
         assert page.is_restored()
         assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
@@ -331,7 +332,7 @@ def test_no_wait_ends_with_the_stream(fake: FakeDaemon) -> None:
 
 DAEMON = """
 import signal, sys, threading
-from tools.beside import start_beside
+from softfinger.tools.processes.monitor_beside import start_beside
 over = threading.Event()
 signal.signal(signal.SIGINT, lambda *_: over.set())
 with start_beside(sys.argv[1], sys.argv[2], on_end=over.set) as page:

@@ -17,15 +17,15 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from daemon import messages
+from softfinger.daemon.wire import messages
+from softfinger.tools import plot
+from softfinger.tools.analysis import plots, plots_model
+from softfinger.tools.analysis.plots_data import MODES, Missing, Run, load_run
+from softfinger.tools.paper import style
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.daemon_process import softfinger
 from tests.harness.recorded_hand import record_hand
-from tools import plot
-from tools.analysis import plots, plots_model
-from tools.analysis.plots_data import MODES, Missing, Run, load_run
-from tools.figure_pages import style
-from tools.recordings.reader import Recording
-from tools.recordings.writer import RecordingWriter
 
 DUE = {
     50: {"command": "arm"},
@@ -303,7 +303,7 @@ def test_files_that_are_no_good(tmp_path: Path, path: Path, call: Call) -> None:
 def test_without_matplotlib_it_says_what_to_install(path: Path) -> None:
     code = (
         "import sys; sys.modules['matplotlib'] = None\n"
-        "from tools.cli import main\n"
+        "from softfinger.tools.cli import main\n"
         f"sys.exit(main(['plot', {str(path)!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

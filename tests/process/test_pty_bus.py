@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import serial
 
-from daemon.simulation import protocol
-from daemon.simulation.protocol import BROADCAST, frame
-from daemon.simulation.pty_bus import PASSAGE, PtyServoBus
-from daemon.simulation.servo_bus import ServoBus
+from softfinger.daemon.simulation.emulator.pty_bus import PASSAGE, PtyServoBus
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, frame
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import make_bus
 
 PING = frame(1, protocol.PING)

@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from daemon.clock import RealClock
-from daemon.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
-from daemon.settings import Settings
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.loop.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
+from softfinger.daemon.profile.settings import Settings
 
 # What the system says of a process that asked for everything: before, during and after.
 HELD = """
 import json, os, sys, threading
 from pathlib import Path
-from daemon.realtime import RealTime
-from daemon.settings import Settings
+from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.settings import Settings
 
 over = threading.Event()
 threading.Thread(target=over.wait, name="reader").start()
@@ -61,8 +61,8 @@ finally:
 # The same as a user who may do nothing of it.
 REFUSED = """
 import json, os, resource
-from daemon.realtime import RealTime
-from daemon.settings import Settings
+from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.settings import Settings
 
 settings = Settings.model_validate({"realtime": {"priority": 7, "cpus": (1023,)}})
 resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.commands import Refused
-from daemon.servos import registers as reg
-from daemon.settings import Settings
-from daemon.simulation.emulator import Emulator
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.simulation.emulator.emulator import Emulator
+from softfinger.daemon.wire.command_server import Refused
 from tests.conftest import until
 
 

@@ -19,19 +19,19 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon import contract, messages
-from daemon.client import Hand
+from softfinger.daemon.client import Hand
+from softfinger.daemon.wire import messages, schema
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.recover import recover
+from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger
 from tests.harness.fake_daemon import FakeDaemon, frame, state
 from tests.unit.test_contract import flat, sample
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
-from tools.recordings.recover import recover
-from tools.recordings.writer import RecordingWriter
 
 Profile = Callable[[str], Path]
-TOPICS = tuple(contract.TOPICS)
+TOPICS = tuple(schema.TOPICS)
 
 
 @pytest.fixture
@@ -355,7 +355,7 @@ def test_garbage_on_the_stream_is_counted_and_left_out(fake: FakeDaemon, tmp_pat
 def test_a_missing_extra_is_named(tmp_path: Path, missing: str) -> None:
     code = (
         f"import sys; sys.modules[{missing!r}] = None\n"
-        "from tools.cli import main\n"
+        "from softfinger.tools.cli import main\n"
         f"sys.exit(main(['record', {str(tmp_path / 'a.mcap')!r}]))"
     )
     done = subprocess.run(

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon.client.hand import Hand
+from softfinger.daemon.client.hand import Hand
+from softfinger.tools.recordings.reader import Recording
 from tests.conftest import until
 from tests.harness.daemon_process import Running, softfinger
-from tools.recordings.reader import Recording
 
 Profile = Callable[[str], Path]
 

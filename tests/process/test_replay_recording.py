@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon import messages
-from daemon.profiles import load
-from daemon.records import Frame
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.types import Frame
+from softfinger.daemon.wire import messages
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.recomputed import Comparison, recompute
+from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENT, SOFTFINGER, softfinger
 from tests.harness.recorded_hand import Messages, Script, published
 from tests.unit.test_contract import sample
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
-from tools.recordings.recomputed import Comparison, recompute
-from tools.recordings.writer import RecordingWriter
 
 Profile = Callable[[str], Path]
 

@@ -11,21 +11,21 @@ from typing import Any, Protocol
 
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.clock import Clock, VirtualClock
-from daemon.commands import Refused
-from daemon.records import Goal, Reading
-from daemon.servos import make_servos
-from daemon.servos import registers as reg
-from daemon.servos.base import ServoError, Servos
-from daemon.servos.modes import NUMBERS, current_toward
-from daemon.settings import ServoSettings, Settings
-from daemon.simulation.free_joints import FreeJoints
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.servo_bus import ServoBus
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.table import ContactTable
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.clock import Clock, VirtualClock
+from softfinger.daemon.profile.settings import ServoSettings, Settings
+from softfinger.daemon.servos import make_servos
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError, Servos
+from softfinger.daemon.servos.modes import NUMBERS, current_toward
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.types import Goal, Reading
+from softfinger.daemon.wire.command_server import Refused
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 from tests.harness.servos import RunningBus
 
 COUNT = 2 * math.pi / 4096
@@ -60,7 +60,7 @@ class SimulatedRig:
         self.servos = made
 
     def torque(self) -> list[bool]:
-        from daemon.simulation import layout
+        from softfinger.daemon.simulation.physics import layout
 
         self._hand.advance(self.clock.now())
         return [bool(on) for on in self._hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2]]

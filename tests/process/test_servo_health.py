@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.clock import RealClock, VirtualClock
-from daemon.records import Reading
-from daemon.servos import dynamixel, make_servos
-from daemon.servos.base import Servos
-from daemon.servos.models import by_name
-from daemon.servos.simulated import SimulatedServos
-from daemon.settings import Settings
-from daemon.simulation.servo_health import THERMAL_RISE, THERMAL_TIME
+from softfinger.daemon.loop.clock import RealClock, VirtualClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import dynamixel, make_servos
+from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos.simulated import SimulatedServos
+from softfinger.daemon.simulation.servo_model.servo_health import THERMAL_RISE, THERMAL_TIME
+from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.servos import RunningBus
 

@@ -15,7 +15,7 @@ import msgpack
 import pytest
 import zmq
 
-from daemon.client import Hand
+from softfinger.daemon.client import Hand
 from tests.harness.daemon_process import Running
 
 

@@ -8,12 +8,16 @@ import select
 import numpy as np
 import pytest
 
-from daemon.records import Frame
-from daemon.simulation.bus_faults import FaultError
-from daemon.simulation.encoders import ENCODERS, encode_flexitac
-from daemon.simulation.fault_words import Faults
-from daemon.simulation.tactile_board import BoardFault, FrameWriter, TactileBoard
-from daemon.tactile.flexitac import FlexiTacDecoder
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encode_flexitac
+from softfinger.daemon.simulation.emulator.fault_spec import Faults
+from softfinger.daemon.simulation.emulator.tactile_board import (
+    BoardFault,
+    FrameWriter,
+    TactileBoard,
+)
+from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
+from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
+from softfinger.daemon.types import Frame
 from tests.conftest import until
 
 ROWS, COLS = 8, 6

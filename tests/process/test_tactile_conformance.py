@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from daemon.records import Frame
-from daemon.tactile.base import TactileError
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.types import Frame
 from tests.harness.tactile import BACKENDS, COLS, ROWS, SERIAL, Rig, image
 
 

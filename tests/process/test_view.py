@@ -23,17 +23,17 @@ import rerun as rr
 import zmq
 from rerun.chunk import RrdReader
 
-from daemon import messages
+from softfinger.daemon.wire import messages
+from softfinger.tools import cli
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.viewing.bridge import TOPICS, Bridge
+from softfinger.tools.viewing.errors import ViewError
+from softfinger.tools.viewing.live import LiveStream
+from softfinger.tools.viewing.page import Page, policy
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 from tests.harness.recorded_hand import record_hand
-from tools import cli
-from tools.recordings.reader import Recording
-from tools.viewing.bridge import TOPICS, Bridge
-from tools.viewing.errors import ViewError
-from tools.viewing.live import LiveStream
-from tools.viewing.page import Page, policy
 
 GRASP = {
     30: {"command": "arm"},
@@ -356,7 +356,8 @@ EVERY = {"seq_step": 1}
 
 def test_without_the_extra_it_names_what_to_install() -> None:
     script = (
-        "import sys; sys.modules['rerun'] = None; import tools.cli as c; sys.exit(c.main(['view']))"
+        "import sys; sys.modules['rerun'] = None; import softfinger.tools.cli as c"
+        "; sys.exit(c.main(['view']))"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False

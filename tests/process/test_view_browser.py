@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from softfinger.tools.viewing.layout import COLOURS
 from tests.harness.daemon_process import SOFTFINGER, Running
 from tests.harness.headless_browser import Browser, browser_path
-from tools.viewing.layout import COLOURS
 
 Picture = NDArray[np.uint8]
 Region = tuple[float, float, float, float]  # left, right, top, bottom, as shares of the picture

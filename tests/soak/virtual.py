@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from daemon.assembly import Daemon
-from daemon.commands import Refused
-from daemon.modes import COMMANDS, Mode
-from daemon.records import Frame, Goal, Reading
-from daemon.servos.base import ServoError
-from daemon.settings import Settings
-from daemon.simulation import layout
+from softfinger.daemon.control.modes import COMMANDS, Mode
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.types import Frame, Goal, Reading
+from softfinger.daemon.wire.command_server import Refused
 
 TICKS = 10_000_000
 _GRIPPING = ("grasping", "holding", "rotating")

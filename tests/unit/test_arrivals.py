@@ -7,17 +7,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from daemon.clock import VirtualClock
-from daemon.settings import Settings
-from daemon.simulation.arrivals import Arrivals
-from daemon.simulation.encoders import ENCODERS
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.tactile_board import TactileBoard
-from daemon.tactile.cobs import CobsDecoder
-from daemon.tactile.simulated import SimulatedTactile
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.table import ContactTable
+from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.sensor.arrivals import Arrivals
+from softfinger.daemon.tactile.cobs import CobsDecoder
+from softfinger.daemon.tactile.simulated import SimulatedTactile
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 
 TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
 

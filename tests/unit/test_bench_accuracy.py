@@ -8,14 +8,19 @@ import math
 import numpy as np
 import pytest
 
-from kinematics.estimator import ContactEstimate
-from tools import bench
-from tools.benchmarks import accuracy, accuracy_detection, accuracy_envelope, accuracy_trials
-from tools.benchmarks.accuracy_detection import EIGHT_BITS, SIXTEEN_BITS
-from tools.benchmarks.accuracy_flaws import FlawRow
-from tools.benchmarks.accuracy_mismatch import MismatchRow, mismatches
-from tools.benchmarks.accuracy_trials import FLOAT, Board, Place
-from tools.benchmarks.estimator_bounds import LINEAR, SIZE, TIP
+from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.tools import bench
+from softfinger.tools.benchmarks import (
+    accuracy,
+    accuracy_detection,
+    accuracy_envelope,
+    accuracy_trials,
+)
+from softfinger.tools.benchmarks.accuracy_detection import EIGHT_BITS, SIXTEEN_BITS
+from softfinger.tools.benchmarks.accuracy_flaws import FlawRow
+from softfinger.tools.benchmarks.accuracy_mismatch import MismatchRow, mismatches
+from softfinger.tools.benchmarks.accuracy_trials import FLOAT, Board, Place
+from softfinger.tools.benchmarks.estimator_bounds import LINEAR, SIZE, TIP
 
 SHORT = accuracy.Effort(
     envelope=accuracy_envelope.Effort(

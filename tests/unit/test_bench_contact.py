@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kinematics.contact import closed_form
-from kinematics.lookup import lookup
-from kinematics.material import Material
-from kinematics.quadrature import integrate
-from kinematics.table import ContactTable
-from tools import cli
-from tools.benchmarks import contact, contact_kernels, contact_scipy, interleaved
-from tools.benchmarks.contact_report import ContactRow
-from tools.benchmarks.interleaved import Subject, interleave
-from tools.benchmarks.report import Row, row, table
+from softfinger.kinematics.contact.closed_form import closed_form
+from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.quadrature import integrate
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools import cli
+from softfinger.tools.benchmarks import contact, contact_kernels, contact_scipy, interleaved
+from softfinger.tools.benchmarks.contact_report import ContactRow
+from softfinger.tools.benchmarks.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.report import Row, row, table
 
 LAW = Material.table_i()
 

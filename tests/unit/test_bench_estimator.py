@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tools.benchmarks import estimator, estimator_bounds, estimator_rivals
+from softfinger.tools.benchmarks import estimator, estimator_bounds, estimator_rivals
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from daemon.model import make_estimator, make_grid, make_material
-from daemon.settings import Settings, SettingsError
-from daemon.simulation.sensor_model import Imperfections, SensorModel
-from kinematics.blur import PLACE_BITS, PLANES, spread, stencil, weights
-from kinematics.cells import CELL_PLANES, LIVE
-from kinematics.contact import Fingertip
-from kinematics.cut_cells import READING, WEIGHT
-from kinematics.estimator import ContactEstimator
-from kinematics.lane_sums import LANES
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.daemon.profile.factory import make_estimator, make_grid, make_material
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.kinematics.compiled.simd_sums import LANES
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.blur import PLACE_BITS, PLANES, spread, stencil, weights
+from softfinger.kinematics.estimation.cell_integrals import CELL_PLANES, LIVE
+from softfinger.kinematics.estimation.cut_cells import READING, WEIGHT
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.called import called
 
 # Inner kernels, made callable.

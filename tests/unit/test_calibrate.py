@@ -8,20 +8,20 @@ import math
 import numpy as np
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.calibration import (
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.perception.calibration_file import (
     CalibrationFileError,
     Converter,
     load_calibration,
     save_calibration,
 )
-from daemon.messages import tactile_message
-from daemon.profiles import load
-from daemon.settings import Settings
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from tools.cli import main
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.messages import tactile_message
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.cli import main
 
 TIP = Fingertip(0.020)
 E = 0.25e6

@@ -7,10 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.calibration import Calibration, ModulusStep, now, save_calibration, sensor_of
-from daemon.settings import Settings
-from kinematics.held import total_tilt
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.perception.calibration_file import (
+    Calibration,
+    ModulusStep,
+    now,
+    save_calibration,
+    sensor_of,
+)
+from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.hand.grasp_state import total_tilt
 
 LEFT = 0.25e6  # Pa, a constant modulus
 STRAIN = [0.0, 0.1, 0.2, 0.4, 0.6]

@@ -7,7 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from kinematics.calibration import (
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.calibration import (
     CalibrationError,
     cleared,
     equilibrate,
@@ -17,10 +19,8 @@ from kinematics.calibration import (
     fit_modulus,
     tare,
 )
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from kinematics.readings import look_up_pressure, to_pressure
+from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 TIP = Fingertip(0.020)
 E = 0.304e6

@@ -6,7 +6,13 @@ import warnings
 
 import pytest
 
-from daemon.calibration import Calibration, CalibrationFileError, Converter, CurveStep, Sensor
+from softfinger.daemon.perception.calibration_file import (
+    Calibration,
+    CalibrationFileError,
+    Converter,
+    CurveStep,
+    Sensor,
+)
 
 
 def calibration(exponent: float) -> Calibration:

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from daemon.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
-from daemon.settings import Settings
+from softfinger.daemon.loop.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
+from softfinger.daemon.profile.settings import Settings
 from tests.harness.late_machine import LateMachine
 
 

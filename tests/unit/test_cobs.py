@@ -10,9 +10,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from daemon.tactile.cobs import CobsDecoder, encode, longest_frame
-from daemon.tactile.cobs_packet import BAD_CRC, NOT_COBS, crc16, crc_tables, unpack
-from daemon.tactile.serial_reader import SensorClock
+from softfinger.daemon.tactile.cobs import CobsDecoder, encode, longest_frame
+from softfinger.daemon.tactile.cobs_packet import BAD_CRC, NOT_COBS, crc16, crc_tables, unpack
+from softfinger.daemon.tactile.serial_reader import SensorClock
 from tests.harness.called import called
 
 # Inner kernels, made callable.

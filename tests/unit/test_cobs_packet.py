@@ -7,9 +7,9 @@ import binascii
 import numpy as np
 import pytest
 
-from daemon.tactile.byte_masks import WIDTH, clear, equal, lowest
-from daemon.tactile.cobs_packet import BAD_CRC, NOT_COBS, crc16, crc_tables, unpack
-from kinematics.kernels import kernel
+from softfinger.daemon.tactile.byte_masks import WIDTH, clear, equal, lowest
+from softfinger.daemon.tactile.cobs_packet import BAD_CRC, NOT_COBS, crc16, crc_tables, unpack
+from softfinger.kinematics.compiled.kernel import kernel
 from tests.harness.called import called
 
 # Inner kernels, made callable.

@@ -14,14 +14,14 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon import assembly
-from daemon.clock import VirtualClock
-from daemon.command_client import NoAnswer, send
-from daemon.commands import Refused, decode
-from daemon.gateway.config import Config
-from daemon.gateway.supervisor import Gateway
-from daemon.settings import Settings
-from daemon.sockets import AddressError
+from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.supervisor import Gateway
+from softfinger.daemon.loop import build
+from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.command_server import Refused, decode
+from softfinger.daemon.wire.sockets import AddressError
 from tests.conftest import until
 from tests.harness.gateway import Served
 
@@ -301,10 +301,10 @@ def test_a_signal_while_the_sockets_are_made_ends_the_start(
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(assembly, "Gateway", Noted)
-    monkeypatch.setattr(assembly, "LocalStop", interrupted)
+    monkeypatch.setattr(build, "Gateway", Noted)
+    monkeypatch.setattr(build, "LocalStop", interrupted)
     wire = {"stream": {"address": addresses[0]}, "commands": {"address": addresses[1]}}
     with pytest.raises(KeyboardInterrupt):
-        assembly.Daemon(Settings.model_validate(wire))
+        build.Daemon(Settings.model_validate(wire))
     with pytest.raises(ProcessLookupError):
         os.kill(made[0].process, 0)

@@ -1,4 +1,4 @@
-"""MCAP files as `tools.recordings.container` writes them, read by the mcap package's own reader."""
+"""MCAP files as `recordings.container` writes them, read by the mcap package's own reader."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcap.records import Chunk, DataEnd, MessageIndex
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from tools.recordings.container import Container
+from softfinger.tools.recordings.container import Container
 
 CHUNK = 20_000
 SECOND = 10**9

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.commands import Refused
-from daemon.profiles import load
-from daemon.reference import Reference
-from daemon.settings import Settings
-from tools.benchmarks.control_rig import Watched
+from softfinger.daemon.control.setpoint import Reference
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.command_server import Refused
+from softfinger.tools.benchmarks.control_rig import Watched
 
 PAPER: dict[str, dict[str, Any]] = {
     "material": {"law": "constant"},

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from daemon.simulation.sensor_model import SensorModel
-from kinematics.contact import Fingertip
-from kinematics.estimator import ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 TIP = Fingertip(0.020)
 MATERIAL = Material.table_i()

@@ -8,10 +8,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from kinematics.contact import Fingertip
-from kinematics.estimator import ContactEstimate, ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A = 0.020
 E = 0.304e6
@@ -50,8 +50,8 @@ def errors(estimate, truth):
 
 
 def test_the_public_face():
-    from kinematics import ContactEstimator as Estimator
-    from kinematics import SensorGrid as Grid
+    from softfinger import ContactEstimator as Estimator
+    from softfinger import SensorGrid as Grid
 
     grid = Grid(rows=44, cols=44, pitch=0.058 / 44)
     p = grid.pressure(TIP, LINEAR, 0.004, 0.2, -0.1)

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from kinematics.contact import Fingertip
-from kinematics.estimator import ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A = 0.020
 E = 0.304e6

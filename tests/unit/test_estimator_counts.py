@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from kinematics.contact import Fingertip
-from kinematics.cut_cells import PLANES
-from kinematics.estimator import ContactEstimator
-from kinematics.gauss_newton import free_noise
-from kinematics.likelihood import CLIP_BELOW, accumulate, fit_law, press
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.cut_cells import PLANES
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.gauss_newton import free_noise
+from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, accumulate, fit_law, press
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.called import called
 
 # Inner kernels, made callable.

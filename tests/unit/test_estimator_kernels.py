@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from kinematics.activity import activity
-from kinematics.cut_cells import PLANES
-from kinematics.likelihood import SUMS, accumulate, fit_law, is_bent, press
-from kinematics.material import Material
-from kinematics.middles import cell_middles
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.cell_centres import cell_middles
+from softfinger.kinematics.estimation.cut_cells import PLANES
+from softfinger.kinematics.estimation.detection import activity
+from softfinger.kinematics.estimation.likelihood import SUMS, accumulate, fit_law, is_bent, press
 from tests.harness.called import called
 
 # Inner kernels, made callable.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tools.figure_pages import run_pages
-from tools.figure_pages.model_pages import DEPTHS, TILTS
-from tools.figure_pages.sheets import Sheet
+from softfinger.tools.paper import run_pages
+from softfinger.tools.paper.model_pages import DEPTHS, TILTS
+from softfinger.tools.paper.sheets import Sheet
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tools import cli, figures
-from tools.figure_pages import style
-from tools.figure_pages.integrals import double_integrals
-from tools.figure_pages.sheets import sheet
+from softfinger.tools import cli, figures
+from softfinger.tools.paper import style
+from softfinger.tools.paper.integrals import double_integrals
+from softfinger.tools.paper.sheets import sheet
 
 # Radius 20 mm, E = 0.304 MPa: d [mm], θ [deg], F [N], U [mJ].
 CHECKPOINTS = (

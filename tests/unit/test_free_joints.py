@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.servos import registers as reg
-from daemon.simulation.free_joints import FreeJoints
-from daemon.simulation.profile import Profile
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model.trajectory import Profile
 
 
 def twin(

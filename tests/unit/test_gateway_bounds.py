@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.clock import VirtualClock
-from daemon.gateway.zmtp import GREETING, Broken, Parser, frame
-from daemon.messages import EVENT, STATE, Parts
-from daemon.records import State
-from daemon.stream import bit
+from softfinger.daemon.gateway.zmtp import GREETING, Broken, Parser, frame
+from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.types import State
+from softfinger.daemon.wire.messages import EVENT, STATE, Parts
+from softfinger.daemon.wire.publisher import bit
 from tests.conftest import until
 from tests.harness.gateway import Served
 from tests.harness.zmtp_client import RawClient, ready
@@ -184,7 +184,7 @@ def test_who_comes_after_a_stop_is_heard_while_others_still_wait_to_be_let_in(
     addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A flood of connections never lets the queue of them be seen empty."""
-    monkeypatch.setattr("daemon.gateway.peers._ACCEPTED", 1)
+    monkeypatch.setattr("softfinger.daemon.gateway.peers._ACCEPTED", 1)
     with Served(commands=addresses[1]) as served:
         before = [RawClient(addresses[1], b"DEALER") for _ in range(3)]
         for client in before:

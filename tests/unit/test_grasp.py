@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from kinematics.contact import Fingertip
-from kinematics.fingers import HandGeometry
-from kinematics.grasp import (
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.hand.geometry import HandGeometry
+from softfinger.kinematics.hand.grasp import (
     Grasp,
     GraspError,
     GraspState,
@@ -17,8 +19,6 @@ from kinematics.grasp import (
     sheared_contact,
     slip_margin,
 )
-from kinematics.material import Material
-from kinematics.table import ContactTable
 
 MODULUS = 0.304e6
 TIP = Fingertip(radius=0.020)

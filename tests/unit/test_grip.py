@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from daemon.grip import Grip
-from daemon.prediction import Held
-from daemon.records import Contact, ObjectPose, Reading
-from daemon.settings import Settings
+from softfinger.daemon.control.grip import Grip
+from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Contact, ObjectPose, Reading
 
 DT = 0.002
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from daemon.settings import Settings
-from daemon.simulation import layout
-from daemon.simulation.hand import SimulatedHand
-from kinematics.fingers import HandGeometry
-from kinematics.grasp import Grasp
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.kinematics.hand.geometry import HandGeometry
+from softfinger.kinematics.hand.grasp import Grasp
 from tests.harness.plant import (
     BOUNDED,
     CONSTANT,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rich.color import ColorTriplet
 
-from tools import heatmap
-from tools.heatmap import Depth, FullScale, fit, picture, resample, round_up
+from softfinger.tools.terminal import heatmap
+from softfinger.tools.terminal.heatmap import Depth, FullScale, fit, picture, resample, round_up
 
 
 def lightness(colour: ColorTriplet) -> float:

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.joint_motion import JointMotion
-from daemon.records import Reading
-from daemon.settings import Settings
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.joint_motion import JointMotion
+from softfinger.daemon.types import Reading
 from tests.harness.loop import Make, advance_to, command, grasped
 
 TICK = 0.002

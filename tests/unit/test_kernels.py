@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 
-import daemon
-import kinematics
-from kinematics.contact import theta_limit
-from kinematics.kernel_cache import kernel_sources
-from kinematics.kernels import kernel
+from softfinger import daemon, kinematics
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.kernel_cache import kernel_sources
+from softfinger.kinematics.contact.closed_form import theta_limit
 
 
 @kernel
@@ -27,7 +26,7 @@ def limit_twice(radius: float, d: float) -> float:
 def test_an_inner_kernel_works_in_kernels_and_refuses_python() -> None:
     assert limit_twice(0.02, 0.02) == 0.0
     assert limit_twice(0.02, 0.0) == pytest.approx(math.pi)
-    with pytest.raises(TypeError, match=r"kinematics\.contact\.theta_limit is an inner kernel"):
+    with pytest.raises(TypeError, match=r"closed_form\.theta_limit is an inner kernel"):
         theta_limit(0.02, 0.0)
 
 
@@ -50,9 +49,7 @@ def test_the_caches_name_covers_all_that_kernels_are_made_of() -> None:
         assert Path(function.__code__.co_filename).resolve() in sources, function
         for name in function.__code__.co_names:
             used = function.__globals__.get(name)
-            if isinstance(used, types.ModuleType) and used.__name__.startswith(
-                ("kinematics", "daemon")
-            ):
+            if isinstance(used, types.ModuleType) and used.__name__.startswith("softfinger."):
                 assert used.__file__ is not None
                 assert Path(used.__file__).resolve() in sources, f"{function}: {name}"
     assert count > 150

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import daemon.assembly
-from daemon.assembly import Daemon
-from daemon.clock import HandClock
-from daemon.lateness import EVERY, FIRST, RECENT, Lateness
-from daemon.messages import Parts, state_message
-from daemon.records import Timing
-from daemon.settings import Settings
+from softfinger.daemon.loop import build as build_module
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.clock import HandClock
+from softfinger.daemon.loop.lateness import EVERY, FIRST, RECENT, Lateness
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Timing
+from softfinger.daemon.wire.messages import Parts, state_message
 from tests.harness.late_machine import LateMachine
 from tests.harness.loop import advance_to, grasped
 
@@ -32,7 +32,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
     def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
         machine, events = LateMachine(), []  # type: ignore[var-annotated]
         made = machine if clock == "real" else HandClock(machine)
-        monkeypatch.setattr(daemon.assembly, "make_clock", lambda _: made)
+        monkeypatch.setattr(build_module, "make_clock", lambda _: made)
         daemons.append(
             Daemon(
                 Settings.model_validate({"loop": {"clock": clock}, **sections}),
@@ -78,7 +78,7 @@ def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
         machine = LateMachine()
-        patch.setattr(daemon.assembly, "make_clock", lambda _: HandClock(machine))
+        patch.setattr(build_module, "make_clock", lambda _: HandClock(machine))
         chosen = Settings.model_validate({"task": {"name": "demo"}})
         with Daemon(chosen, wire=False) as hand:
             machine.late_by = list(itertools.chain.from_iterable((each, 0.0) for each in late))

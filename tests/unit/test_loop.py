@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.commands import Refused
-from daemon.messages import Parts, pack, state_message
-from daemon.records import Frame
-from daemon.settings import Settings
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Frame
+from softfinger.daemon.wire.command_server import Refused
+from softfinger.daemon.wire.messages import Parts, pack, state_message
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
 
 

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import messages
-from daemon.settings import Settings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire import messages
+from softfinger.tools.analysis.contacts import analyse
+from softfinger.tools.analysis.plots_data import load_run
+from softfinger.tools.analysis.sources import open_source
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.recomputed import recorded_settings
+from softfinger.tools.recordings.writer import RecordingWriter
 from tests.unit.test_contract import sample
-from tools.analysis.contacts import analyse
-from tools.analysis.plots_data import load_run
-from tools.analysis.sources import open_source
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
-from tools.recordings.recomputed import recorded_settings
-from tools.recordings.writer import RecordingWriter
 
 SPOILT: dict[str, Any] = {
     "no finger": ("finger", None),

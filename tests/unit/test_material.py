@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kinematics import Material
-from kinematics.material import (
+from softfinger import Material
+from softfinger.kinematics.contact.material import (
     TABLE_I_MODULUS,
     TABLE_I_STRAIN,
     MaterialError,
     energy_density_at,
     stress_at,
 )
-from kinematics.material_fit import fit_modulus, nonnegative
+from softfinger.kinematics.contact.material_fit import fit_modulus, nonnegative
 from tests.harness.called import called
 
 # Inner kernels, made callable.

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from daemon.commands import Refused
-from daemon.modes import COMMANDS, Command, Lease, Mode, parse
+from softfinger.daemon.control.modes import COMMANDS, Command, Lease, Mode, parse
+from softfinger.daemon.wire.command_server import Refused
 
 
 def heard(mode: Mode) -> set[str]:

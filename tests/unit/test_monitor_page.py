@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.segment import Segment
 
+from softfinger.tools.terminal.feed import HISTORY_STEP, Feed
+from softfinger.tools.terminal.feed_sockets import Reply
+from softfinger.tools.terminal.monitor_page import Page
+from softfinger.tools.terminal.terminal import Keys
 from tests.harness import fake_daemon
-from tools.feed import HISTORY_STEP, Feed
-from tools.feed_sockets import Reply
-from tools.monitor_page import Page
-from tools.terminal import Keys
 
 
 def fed(now: float = 0.0) -> Feed:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.settings import Settings
-from daemon.simulation import layout
-from kinematics.fingers import HandGeometry
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics import layout
+from softfinger.kinematics.hand.geometry import HandGeometry
 
 HAND = HandGeometry()
 SLOW: dict[str, Any] = {"rate": 25.0}

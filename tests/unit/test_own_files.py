@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from daemon import own_files
-from daemon.own_files import require_own, runtime_folder, write_bytes, write_text
-from daemon.simulation.link_folder import FolderError, LinkFolder
-from daemon.table_files import save_table
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.table import ContactTable
-from tools.event_log import EventLog
+from softfinger.daemon.profile.table_files import save_table
+from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
+from softfinger.daemon.wire import own_files
+from softfinger.daemon.wire.own_files import require_own, runtime_folder, write_bytes, write_text
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools.processes.event_log import EventLog
 
 STRANGER = 54321
 

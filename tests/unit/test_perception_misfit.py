@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from daemon.messages import Parts, state_message
-from daemon.model import make_models
-from daemon.perception import FingerPerception
-from daemon.records import Contact, Frame, State
-from daemon.safety import Safety
-from daemon.settings import Settings
-from daemon.tactile.given import GivenFrames
-from kinematics import Fingertip, Material, SensorGrid
+from softfinger import Fingertip, Material, SensorGrid
+from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.profile.factory import make_models
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.safety import Safety
+from softfinger.daemon.tactile.given import GivenFrames
+from softfinger.daemon.types import Contact, Frame, State
+from softfinger.daemon.wire.messages import Parts, state_message
 
 
 def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.calibration import (
+from softfinger import Fingertip, SensorGrid
+from softfinger.daemon.perception.calibration_file import (
     Calibration,
     Converter,
     TareStep,
     save_calibration,
     sensor_of,
 )
-from daemon.model import make_estimator, make_material, make_models
-from daemon.perception import FingerPerception
-from daemon.records import Contact, Frame
-from daemon.settings import Settings
-from kinematics import Fingertip, SensorGrid
+from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.profile.factory import make_estimator, make_material, make_models
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Contact, Frame
 
 PASCAL_PER_COUNT = 150.0
 FULL = 255  # 38 kPa, less than the contact's peak of 46 kPa

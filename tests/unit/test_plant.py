@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from daemon.simulation import layout
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.tip import evaluate_tip
-from kinematics.fingers import HandGeometry
-from kinematics.kernels import kernel
-from kinematics.lanes import address
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.tip import evaluate_tip
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.simd import address
+from softfinger.kinematics.hand.geometry import HandGeometry
 from tests.fuzz.plant import abuse, random_hand
 from tests.harness.plant import (
     CONSTANT,

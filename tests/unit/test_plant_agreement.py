@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from daemon.simulation import layout
+from softfinger.daemon.simulation.physics import layout
 from tests.harness import plant_reference as reference
 from tests.harness.plant import LOSSLESS, hold_with, make, place
 

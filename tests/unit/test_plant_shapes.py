@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from daemon.clock import VirtualClock
-from daemon.settings import Settings, Simulation
-from daemon.simulation import layout
-from daemon.simulation.hand import SimulatedHand
-from daemon.simulation.shapes import shape_of
-from daemon.tactile.simulated import SimulatedTactile
-from kinematics.fingers import HandGeometry
+from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.profile.settings import Settings, Simulation
+from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.shapes import shape_of
+from softfinger.daemon.tactile.simulated import SimulatedTactile
+from softfinger.kinematics.hand.geometry import HandGeometry
 from tests.harness.plant import (
     BOUNDED,
     CONSTANT,
@@ -364,7 +364,7 @@ def test_a_disc_rolls_down_an_incline():
 
 
 def test_a_long_wedge_whose_faces_meet_is_refused():
-    from daemon.contradictions import contradictions
+    from softfinger.daemon.profile.validation import contradictions
 
     def found(**simulation):
         settings = Settings.model_validate({"simulation": {"object_shape": "wedge", **simulation}})

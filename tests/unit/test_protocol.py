@@ -7,9 +7,16 @@ from dynamixel_sdk import PacketHandler as sdk_handler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.servos.crc import crc16
-from daemon.simulation import protocol
-from daemon.simulation.protocol import BROADCAST, Parser, frame, status, stuff, unstuff
+from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.protocol import (
+    BROADCAST,
+    Parser,
+    frame,
+    status,
+    stuff,
+    unstuff,
+)
 
 # From the maker's Protocol 2.0 manual: (id, instruction, parameters, packet).
 INSTRUCTIONS = [

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss
 
-from kinematics import Fingertip, Material
-from kinematics.contact import closed_forms
-from kinematics.profile import TipProfile, compress
-from kinematics.quadrature import circle_rule, gauss_rule, integrate, ratios_at
+from softfinger import Fingertip, Material
+from softfinger.kinematics.contact.closed_form import closed_forms
+from softfinger.kinematics.contact.quadrature import circle_rule, gauss_rule, integrate, ratios_at
+from softfinger.kinematics.contact.tip_profile import TipProfile, compress
 
 TIP = Fingertip(0.020)
 TABLE_I = Material.table_i()

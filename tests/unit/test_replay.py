@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.assembly import Daemon
-from daemon.clock import VirtualClock
-from daemon.settings import Settings, TactileSettings
-from daemon.tactile.base import TactileError
-from daemon.tactile.recording import Recording, RecordingError, load_recording, save_recording
-from daemon.tactile.replay import ReplayTactile
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.tactile.recording import (
+    Recording,
+    RecordingError,
+    load_recording,
+    save_recording,
+)
+from softfinger.daemon.tactile.replay import ReplayTactile
 
 FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)
 
@@ -137,7 +142,7 @@ def test_the_daemon_runs_on_a_recording_on_virtual_time(tmp_path):
             "tactile": {"backend": "replay", "recording": (str(path), "")},
         }
     )
-    from daemon.model import make_grid, make_material, make_tip
+    from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 
     for k in range(4):
         pressure = make_grid(settings).pressure(

@@ -16,13 +16,13 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from daemon.limits import ROWS
-from daemon.modes import Mode
-from daemon.prediction import Held
-from daemon.records import Contact, Frame, Goal, State
-from daemon.safety import Safety
-from daemon.settings import Safety as Limits
-from daemon.settings import Settings
+from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.profile.settings import Safety as Limits
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.limits import ROWS
+from softfinger.daemon.safety.safety import Safety
+from softfinger.daemon.types import Contact, Frame, Goal, State
 
 SETTINGS = Settings()
 LIMITS = SETTINGS.safety

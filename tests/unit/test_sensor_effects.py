@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from daemon.simulation import sensor_effects
-from daemon.simulation.sensor_model import Imperfections, SensorModel
-from kinematics.contact import Fingertip
-from kinematics.estimator import ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.daemon.simulation.sensor import sensor_effects
+from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A, E, PITCH = 0.020, 0.304e6, 0.058 / 44
 TIP = Fingertip(A)

@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.servos import registers as reg
-from daemon.servos.models import MODELS, by_name
-from daemon.settings import Settings
-from daemon.simulation import protocol
-from daemon.simulation.bus_faults import FaultError
-from daemon.simulation.free_joints import FreeJoints
-from daemon.simulation.protocol import BROADCAST, Parser, frame
-from daemon.simulation.servo import REBOOT_TIME
-from daemon.simulation.servo_bus import ServoBus
-from daemon.simulation.servo_health import OVERLOAD_TIME
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.models import MODELS, by_name
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
+from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, Parser, frame
+from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.simulation.servo_model.servo_health import OVERLOAD_TIME
 from tests.fuzz.servo_bus import fuzz
 from tests.harness.servos import RADIAN, make_bus
 

@@ -7,11 +7,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.servos import registers as reg
-from daemon.servos.groups import GroupRead
-from daemon.servos.packets import PacketHandler
-from daemon.servos.port import SerialPort
-from daemon.simulation.servo_bus import ServoBus
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.groups import GroupRead
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import RADIAN, make_bus
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.profiles import load
-from daemon.settings import Settings, SettingsError
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings, SettingsError
 
 CONFIG = Path(__file__).parents[2] / "config"
 

@@ -7,19 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from daemon.clock import VirtualClock
-from daemon.model import make_estimator, make_material
-from daemon.records import Goal, Reading
-from daemon.servos import make_servos
-from daemon.servos.base import ServoError
-from daemon.servos.simulated import SimulatedServos
-from daemon.settings import Settings
-from daemon.simulation.hand import SimulatedHand
-from daemon.tactile import make_sensor
-from daemon.tactile.simulated import SimulatedTactile
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.table import ContactTable
+from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.profile.factory import make_estimator, make_material
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import make_servos
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.simulated import SimulatedServos
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.tactile.simulated import SimulatedTactile
+from softfinger.daemon.types import Goal, Reading
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
@@ -86,7 +86,7 @@ def test_goals_are_whole_counts_too():
     bench.goal.q = [0.1003] * 2
     bench.goal.current = [0.3] * 2
     bench.run(1.0)
-    from daemon.simulation import layout
+    from softfinger.daemon.simulation.physics import layout
 
     goal_q = bench.hand.memory[layout.GOAL_Q : layout.GOAL_Q + 2]
     bound = bench.hand.memory[layout.GOAL_CURRENT : layout.GOAL_CURRENT + 2]

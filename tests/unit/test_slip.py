@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.prediction import Held
-from daemon.records import Contact
-from daemon.settings import Settings
-from daemon.slip import SlipWatch
+from softfinger.daemon.control.slip_monitor import SlipWatch
+from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Contact
+from softfinger.tools.benchmarks.control_rig import Watched, push_along
 from tests.unit.test_control import PAPER, grasped
-from tools.benchmarks.control_rig import Watched, push_along
 
 FORCE = 10.0
 BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip

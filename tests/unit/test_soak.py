@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from daemon.records import Goal, Reading
+from softfinger.daemon.types import Goal, Reading
 from tests.soak.virtual import Soak
 
 

@@ -14,7 +14,7 @@ from unittest.mock import patch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.gateway import peers
+from softfinger.daemon.gateway import peers
 from tests.conftest import until
 from tests.harness.gateway import Served
 from tests.harness.zmtp_client import RawClient

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import zmq
 
-from daemon.messages import (
+from softfinger.daemon.types import Contact, Frame, State
+from softfinger.daemon.wire.messages import (
     COMMAND,
     EVENT,
     SCHEMA,
@@ -21,8 +22,7 @@ from daemon.messages import (
     SensorFacts,
     state_message,
 )
-from daemon.records import Contact, Frame, State
-from daemon.stream import bit
+from softfinger.daemon.wire.publisher import bit
 from tests.conftest import until
 from tests.harness.gateway import Served
 

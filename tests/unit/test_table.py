@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kinematics import ContactTable, Fingertip, Material
-from kinematics.contact import closed_forms
-from kinematics.kernels import kernel
-from kinematics.lanes import SHAPES
-from kinematics.lookup import FORM, FORMS, MODULUS, RADIUS, START
-from kinematics.quadrature import integrate
-from kinematics.table import TableError, aligned, lookup, lookups
-from kinematics.table_build import MEMORY_LIMIT, hard_points
+from softfinger import ContactTable, Fingertip, Material
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.simd import SHAPES
+from softfinger.kinematics.contact.closed_form import closed_forms
+from softfinger.kinematics.contact.lookup import FORM, FORMS, MODULUS, RADIUS, START
+from softfinger.kinematics.contact.quadrature import integrate
+from softfinger.kinematics.contact.table import TableError, aligned, lookup, lookups
+from softfinger.kinematics.contact.table_build import MEMORY_LIMIT, hard_points
 
 TIP = Fingertip(0.020)
 TABLE_I = Material.table_i()

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import table_files
-from daemon.model import make_table
-from daemon.settings import Settings, SettingsError
-from daemon.table_files import load_or_build, load_table, save_table, table_file
-from kinematics import ContactTable, Fingertip, Material
-from kinematics.table import TableError
+from softfinger import ContactTable, Fingertip, Material
+from softfinger.daemon.profile import table_files
+from softfinger.daemon.profile.factory import make_table
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.profile.table_files import load_or_build, load_table, save_table, table_file
+from softfinger.kinematics.contact.table import TableError
 
 TIP = Fingertip(0.020)
 CONSTANT = Material.constant(0.304e6)

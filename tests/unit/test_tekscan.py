@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.tactile.recording import RecordingError, load_recording
-from daemon.tactile.tekscan import TekscanError, parse
+from softfinger.daemon.tactile.recording import RecordingError, load_recording
+from softfinger.daemon.tactile.tekscan import TekscanError, parse
 
 EXPORT = """\
 DATA_TYPE MOVIE

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.settings import Settings
-from kinematics.contact import Fingertip
-from kinematics.fingers import HandGeometry
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from kinematics.table import ContactTable
-from tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
-from tools.viewing.known import Hand, Wanted, read_settings
-from tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
-from tools.viewing.planar import Contact, HeldObject, finger_lines, tip_axes
-from tools.viewing.statistics import table
+from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.hand.geometry import HandGeometry
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
+from softfinger.tools.viewing.known import Hand, Wanted, read_settings
+from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
+from softfinger.tools.viewing.planar import Contact, HeldObject, finger_lines, tip_axes
+from softfinger.tools.viewing.statistics import table
 
 TIP = Fingertip(radius=0.020)
 GRIDS = (

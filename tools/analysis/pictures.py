@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tools.analysis.contacts import Contacts
-from tools.figure_pages import style
+from softfinger.tools.analysis.contacts import Contacts
+from softfinger.tools.paper import style
 
 # Title, value, its standard deviation, factor to what is shown, unit shown.
 _PANELS = (

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tools.analysis.plots_data import Missing, Run
-from tools.analysis.plots_error import draw_error
-from tools.analysis.plots_model import draw_angle, draw_landscape
-from tools.analysis.plots_time import draw_joints, draw_time
-from tools.analysis.plots_timing import draw_timing
-from tools.figure_pages import style
+from softfinger.tools.analysis.plots_data import Missing, Run
+from softfinger.tools.analysis.plots_error import draw_error
+from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
+from softfinger.tools.analysis.plots_time import draw_joints, draw_time
+from softfinger.tools.analysis.plots_timing import draw_timing
+from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

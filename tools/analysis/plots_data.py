@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import messages
-from daemon.model import FingerModel, make_models
-from daemon.modes import Mode
-from daemon.recompute import with_calibrations
-from daemon.records import FINGERS
-from daemon.settings import Settings, SettingsError
-from daemon.tactile.base import TactileError
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
-from tools.recordings.recomputed import recorded_settings
+from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.loop.process_replay import with_calibrations
+from softfinger.daemon.profile.factory import FingerModel, make_models
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire import messages
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.recomputed import recorded_settings
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

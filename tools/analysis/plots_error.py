@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daemon.records import FINGERS
-from tools.analysis.plots_data import BoolArray, FloatArray, Missing, Run
-from tools.analysis.plots_time import DEGREES, LINES
-from tools.figure_pages import style
+from softfinger.daemon.types import FINGERS
+from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, Run
+from softfinger.tools.analysis.plots_time import DEGREES, LINES
+from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.model import FingerModel
-from daemon.records import FINGERS
-from kinematics.table import ContactTable
-from tools.analysis.plots_data import FloatArray, Run
-from tools.analysis.plots_time import DEGREES, LINES
-from tools.figure_pages import style
+from softfinger.daemon.profile.factory import FingerModel
+from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools.analysis.plots_data import FloatArray, Run
+from softfinger.tools.analysis.plots_time import DEGREES, LINES
+from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tools.analysis.plots_data import MODES, FloatArray, Run
-from tools.figure_pages import style
+from softfinger.tools.analysis.plots_data import MODES, FloatArray, Run
+from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import messages
-from daemon.model import FingerModel, make_models
-from daemon.records import FINGERS
-from daemon.settings import Settings
-from daemon.tactile.recording import load_recording
-from tools.arguments import teller
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
+from softfinger.daemon.profile.factory import FingerModel, make_models
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.tactile.recording import load_recording
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire import messages
+from softfinger.tools.arguments import teller
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
 
 Counts = NDArray[np.uint16]
 Progress = Callable[[int], None]
@@ -49,7 +49,7 @@ def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -
     """Open a file of frames.
 
     With ``own`` a recording of the stream goes by the settings it was made with, else all go by
-    ``settings``. Raises RecordingError or `daemon.tactile.recording.RecordingError` naming the
+    ``settings``. Raises RecordingError or `tactile.recording.RecordingError` naming the
     file, and what the settings raise.
     """
     if path.suffix == ".mcap":
@@ -58,8 +58,8 @@ def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -
 
 
 def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
-    from daemon.recompute import with_calibrations
-    from tools.recordings.recomputed import recorded_settings
+    from softfinger.daemon.loop.process_replay import with_calibrations
+    from softfinger.tools.recordings.recomputed import recorded_settings
 
     recording = Recording(path, teller("analyse"))
     if not recording.count(messages.TACTILE):

@@ -12,12 +12,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from tools.benchmarks import accuracy_envelope, accuracy_trials
-from tools.benchmarks.accuracy_detection import AlarmRow, DetectionRow, detection, false_alarms
-from tools.benchmarks.accuracy_envelope import BiasRow, EnvelopeRow
-from tools.benchmarks.accuracy_flaws import FlawRow, flaws
-from tools.benchmarks.accuracy_mismatch import MismatchRow, mismatches
-from tools.benchmarks.estimator_bounds import MODULUS
+from softfinger.tools.benchmarks import accuracy_envelope, accuracy_trials
+from softfinger.tools.benchmarks.accuracy_detection import (
+    AlarmRow,
+    DetectionRow,
+    detection,
+    false_alarms,
+)
+from softfinger.tools.benchmarks.accuracy_envelope import BiasRow, EnvelopeRow
+from softfinger.tools.benchmarks.accuracy_flaws import FlawRow, flaws
+from softfinger.tools.benchmarks.accuracy_mismatch import MismatchRow, mismatches
+from softfinger.tools.benchmarks.estimator_bounds import MODULUS
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.estimator import ContactEstimator
-from kinematics.ladder import CLIPPED_MORE
-from kinematics.pressure import SensorGrid
-from tools.benchmarks import accuracy_trials as trials
-from tools.benchmarks.accuracy_trials import FLOAT, Board
-from tools.benchmarks.estimator_bounds import LINEAR, MODULUS, PITCH, SIZE, TIP
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.frame_pipeline import CLIPPED_MORE
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks import accuracy_trials as trials
+from softfinger.tools.benchmarks.accuracy_trials import FLOAT, Board
+from softfinger.tools.benchmarks.estimator_bounds import LINEAR, MODULUS, PITCH, SIZE, TIP
 
 FloatArray = NDArray[np.float64]
 

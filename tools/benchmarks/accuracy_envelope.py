@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.benchmarks import accuracy_trials as trials
-from tools.benchmarks.accuracy_trials import FLOAT, Board, Place
-from tools.benchmarks.estimator_bounds import LINEAR, SIZE, TIP
+from softfinger.tools.benchmarks import accuracy_trials as trials
+from softfinger.tools.benchmarks.accuracy_trials import FLOAT, Board, Place
+from softfinger.tools.benchmarks.estimator_bounds import LINEAR, SIZE, TIP
 
 FloatArray = NDArray[np.float64]
 
@@ -213,7 +213,7 @@ def _score(case: Case, clean: FloatArray, banks: Any) -> Score:
 
 
 def is_misfit(chi2: FloatArray, cells: FloatArray) -> NDArray[np.bool_]:
-    """As :attr:`kinematics.estimator.ContactEstimate.misfit`, of many."""
+    """As :attr:`estimation.estimator.ContactEstimate.misfit`, of many."""
     spread = 2.0 / (9.0 * np.maximum(cells - 4.0, 1.0))
     return np.asarray(chi2 > (1.0 - spread + 5.0 * np.sqrt(spread)) ** 3)
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from daemon.simulation.sensor_model import Imperfections, SensorModel
-from kinematics.estimator import ContactEstimator
-from kinematics.pressure import SensorGrid
-from tools.benchmarks.estimator_bounds import LINEAR, MODULUS, PITCH, SIZE, TIP
+from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks.estimator_bounds import LINEAR, MODULUS, PITCH, SIZE, TIP
 
 NOISE = 0.002 * MODULUS
 PASCAL_PER_COUNT = 4.0

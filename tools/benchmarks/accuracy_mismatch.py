@@ -1,7 +1,7 @@
 """Frames of other contact models, estimated as the linear one: how far off, and whether it shows.
 
 A fit's χ² a degree of freedom is beyond what noise makes above the limit of
-:func:`tools.benchmarks.accuracy_envelope.is_misfit`. Whether a wrong model goes beyond it depends
+:func:`benchmarks.accuracy_envelope.is_misfit`. Whether a wrong model goes beyond it depends
 on the noise that hides it.
 """
 
@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from tools.benchmarks import accuracy_trials as trials
-from tools.benchmarks.accuracy_envelope import is_misfit
-from tools.benchmarks.accuracy_trials import Place
-from tools.benchmarks.estimator_bounds import OTHER_MODELS, SIZE, frame_of
+from softfinger.tools.benchmarks import accuracy_trials as trials
+from softfinger.tools.benchmarks.accuracy_envelope import is_misfit
+from softfinger.tools.benchmarks.accuracy_trials import Place
+from softfinger.tools.benchmarks.estimator_bounds import OTHER_MODELS, SIZE, frame_of
 
 CONTACTS = (
     (0.001, 0.0),

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.estimator import ContactEstimator
-from kinematics.kernels import kernel
-from kinematics.pressure import SensorGrid
-from tools.benchmarks.estimator_bounds import (
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks.estimator_bounds import (
     LINEAR,
     MARGIN,
     MODULUS,

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.assembly import Daemon
-from daemon.clock import Clock
-from daemon.records import Frame, Goal, Reading
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.types import Frame, Goal, Reading
 
 _KEPT = 16  # frames that take turns
 

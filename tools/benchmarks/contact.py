@@ -19,15 +19,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.contact import Fingertip, closed_form, closed_forms, theta_limits
-from kinematics.lookup import CLOSED, FORMS, lookup
-from kinematics.material import Material
-from kinematics.quadrature import integrate
-from kinematics.table import ContactTable, TableError
-from tools.benchmarks import contact_kernels, contact_scipy
-from tools.benchmarks.contact_report import MODES, ContactRow, Timing, aligned_table
-from tools.benchmarks.interleaved import Subject, interleave
-from tools.benchmarks.report import Row, row
+from softfinger.kinematics.contact.closed_form import (
+    Fingertip,
+    closed_form,
+    closed_forms,
+    theta_limits,
+)
+from softfinger.kinematics.contact.lookup import CLOSED, FORMS, lookup
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.quadrature import integrate
+from softfinger.kinematics.contact.table import ContactTable, TableError
+from softfinger.tools.benchmarks import contact_kernels, contact_scipy
+from softfinger.tools.benchmarks.contact_report import MODES, ContactRow, Timing, aligned_table
+from softfinger.tools.benchmarks.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.report import Row, row
 
 FloatArray = NDArray[np.float64]
 
@@ -110,7 +115,7 @@ def table(rows: list[ContactRow]) -> str:
 
 def plot(rows: list[ContactRow], path: Path) -> None:
     """Run time against error, as a picture. Raises NoMatplotlib without the extra ``plot``."""
-    from tools.benchmarks.contact_plot import draw
+    from softfinger.tools.benchmarks.contact_plot import draw
 
     draw(rows, path)
 

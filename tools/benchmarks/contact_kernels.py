@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.contact import closed_form
-from kinematics.kernels import kernel
-from kinematics.lanes import address
-from kinematics.lookup import lookup_at
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.simd import address
+from softfinger.kinematics.contact.closed_form import closed_form
+from softfinger.kinematics.contact.lookup import lookup_at
 
 FloatArray = NDArray[np.float64]
 

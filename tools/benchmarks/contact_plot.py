@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tools.benchmarks.contact_report import ContactRow
-from tools.figure_pages import style
+from softfinger.tools.benchmarks.contact_report import ContactRow
+from softfinger.tools.paper import style
 
 # Kinds by how a row's name starts, with the legend's words.
 KINDS = {

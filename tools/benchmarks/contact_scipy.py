@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.contact import Fingertip, closed_forms
-from kinematics.material import Material
-from kinematics.quadrature import integrate
+from softfinger.kinematics.contact.closed_form import Fingertip, closed_forms
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.quadrature import integrate
 
 FloatArray = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from daemon.servos.registers import COUNTS_PER_TURN
-from daemon.settings import Settings
-from daemon.simulation.hand import SimulatedHand
-from tools.benchmarks.control_rig import Watched, push_along
-from tools.benchmarks.report import Row, row
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.registers import COUNTS_PER_TURN
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.tools.benchmarks.control_rig import Watched, push_along
+from softfinger.tools.benchmarks.report import Row, row
 
 _FORCE = 10.0  # N
 _ANGLE = math.radians(10.0)

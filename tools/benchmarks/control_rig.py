@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.assembly import Daemon
-from daemon.settings import Settings
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.tactile.cobs import CobsDecoder, encode
-from kinematics.estimator import ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from tools.benchmarks.estimator_bounds import (
+from softfinger.daemon.tactile.cobs import CobsDecoder, encode
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks.estimator_bounds import (
     LINEAR,
     MODULUS,
     PITCH,
@@ -34,9 +34,14 @@ from tools.benchmarks.estimator_bounds import (
     mismatches,
     tilts,
 )
-from tools.benchmarks.estimator_kernels import OUTPUTS, run_frames, run_moments, whole_grid
-from tools.benchmarks.estimator_rivals import Method, rivals
-from tools.benchmarks.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.estimator_kernels import (
+    OUTPUTS,
+    run_frames,
+    run_moments,
+    whole_grid,
+)
+from softfinger.tools.benchmarks.estimator_rivals import Method, rivals
+from softfinger.tools.benchmarks.interleaved import Subject, interleave
 
 FloatArray = NDArray[np.float64]
 Truth: TypeAlias = tuple[float, float, float]  # d, tilt_x, tilt_y

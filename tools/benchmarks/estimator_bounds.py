@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.contact import Fingertip
-from kinematics.estimator import ContactEstimator
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from tools.benchmarks.estimator_kernels import OUTPUTS, run_frames
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks.estimator_kernels import OUTPUTS, run_frames
 
 FloatArray = NDArray[np.float64]
 

@@ -5,13 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics import ladder
-from kinematics.estimator import ContactEstimator
-from kinematics.footprint import plane
-from kinematics.kernels import kernel
-from kinematics.lanes import address
-from kinematics.middles import BOUNDS, FIRST, HEIGHT, LAST, PLANES, sums_inside
-from kinematics.moments import footprint_moments
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.simd import address
+from softfinger.kinematics.estimation import frame_pipeline
+from softfinger.kinematics.estimation.cell_centres import (
+    BOUNDS,
+    FIRST,
+    HEIGHT,
+    LAST,
+    PLANES,
+    sums_inside,
+)
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.footprint import plane
+from softfinger.kinematics.estimation.moments import footprint_moments
 
 FloatArray = NDArray[np.float64]
 OUTPUTS = 4  # d, tilt_x, tilt_y, 1 for a valid contact
@@ -33,12 +40,14 @@ def _loop(
     for _ in range(repeat):
         for k in range(frames.shape[0]):
             if cold:
-                state[ladder.WARM] = 0.0
-            ladder.estimate_frame(frames[k], 1.0, 0.0, plan, cells, tables, state, floats, integers)
-            out[k, 0] = state[ladder.D]
-            out[k, 1] = state[ladder.TILT_X]
-            out[k, 2] = state[ladder.TILT_Y]
-            out[k, 3] = state[ladder.VALID] * state[ladder.CONTACT]
+                state[frame_pipeline.WARM] = 0.0
+            frame_pipeline.estimate_frame(
+                frames[k], 1.0, 0.0, plan, cells, tables, state, floats, integers
+            )
+            out[k, 0] = state[frame_pipeline.D]
+            out[k, 1] = state[frame_pipeline.TILT_X]
+            out[k, 2] = state[frame_pipeline.TILT_Y]
+            out[k, 3] = state[frame_pipeline.VALID] * state[frame_pipeline.CONTACT]
 
 
 def run_frames(

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
 Answer = tuple[float, float, float]  # d, tilt_x, tilt_y

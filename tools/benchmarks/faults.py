@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from tools.benchmarks.faults_cases import CASES, Case
-from tools.benchmarks.faults_clock import STEPS, clock_rig
-from tools.benchmarks.faults_rig import Rig, RigError
-from tools.benchmarks.faults_trials import Trial, trial
+from softfinger.tools.benchmarks.faults_cases import CASES, Case
+from softfinger.tools.benchmarks.faults_clock import STEPS, clock_rig
+from softfinger.tools.benchmarks.faults_rig import Rig, RigError
+from softfinger.tools.benchmarks.faults_trials import Trial, trial
 
 OPTIONS = ("trials", "only")
 _TELL = 5  # failures that are told of each fault

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from daemon.settings import Settings
-from tools.benchmarks import faults_pressures as pressures
-from tools.benchmarks.faults_rig import Rig
+from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.benchmarks import faults_pressures as pressures
+from softfinger.tools.benchmarks.faults_rig import Rig
 
 Inject = Callable[[Rig, random.Random], AbstractContextManager[None]]
 # works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints

@@ -14,10 +14,10 @@ import time
 from collections.abc import Iterator
 from unittest import mock
 
-from daemon.assembly import Daemon
-from daemon.commands import Refused
-from tools.benchmarks.faults_rig import Rig, RigError, stopped
-from tools.benchmarks.faults_trials import Trial, judge_wire
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.wire.command_server import Refused
+from softfinger.tools.benchmarks.faults_rig import Rig, RigError, stopped
+from softfinger.tools.benchmarks.faults_trials import Trial, judge_wire
 
 STEPS = {"clock stepped by +1 h": 3600.0, "clock stepped by -1 h": -3600.0}
 _BEFORE = 0.04  # s, at most

@@ -19,7 +19,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from tools.benchmarks.faults_rig import SOFTFINGER, Rig, RigError
+from softfinger.tools.benchmarks.faults_rig import SOFTFINGER, Rig, RigError
 
 _FLOODERS = 4
 _STUCK = 5

@@ -19,13 +19,13 @@ from typing import Any
 import msgpack
 import zmq
 
-from daemon.command_client import NoAnswer
-from daemon.messages import STATE
-from daemon.profiles import load
-from daemon.simulation.control_port import NoEmulator, send_words
+from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
+from softfinger.daemon.wire.messages import STATE
 
-PROFILE = Path(__file__).resolve().parents[2] / "config" / "hil.toml"
-SOFTFINGER = (sys.executable, "-m", "tools.cli")
+PROFILE = Path(__file__).parents[2] / "config" / "hil.toml"
+SOFTFINGER = (sys.executable, "-m", "softfinger")
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new
 _STATE_RATE = 250.0  # Hz
 _LOOK = 0.003  # s between two looks at the hand

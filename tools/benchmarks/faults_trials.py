@@ -12,9 +12,9 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from daemon.command_client import NoAnswer
-from tools.benchmarks.faults_cases import Case
-from tools.benchmarks.faults_rig import Rig, RigError, stopped
+from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.tools.benchmarks.faults_cases import Case
+from softfinger.tools.benchmarks.faults_rig import Rig, RigError, stopped
 
 _SLACK = 0.05  # s that a look may come after what it sees, and a process be late
 _ASIDE = 0.015  # s between two looks that others took: what is late then is theirs

@@ -9,14 +9,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.assembly import Daemon
-from daemon.loop import Loop
-from daemon.profiles import load
-from tools.benchmarks.report import Row, row
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.loop import Loop
+from softfinger.daemon.profile.load import load
+from softfinger.tools.benchmarks.report import Row, row
 
 _SECONDS = 10.0
-_EMULATE = ("-m", "tools.cli", "emulate")
-_PROFILE = Path(__file__).resolve().parents[2] / "config" / "hil.toml"
+_EMULATE = ("-m", "softfinger", "emulate")
+_PROFILE = Path(__file__).parents[2] / "config" / "hil.toml"
 
 
 def measure() -> list[Row]:

@@ -22,16 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from daemon.assembly import Daemon
-from daemon.gateway.config import Config
-from daemon.gateway.supervisor import Gateway
-from daemon.messages import Parts
-from daemon.realtime import RealTime
-from daemon.records import State
-from daemon.settings import Settings
-from daemon.stream import TOPICS, Publisher
-from tools.benchmarks.canned import can, hold, make_noisy
-from tools.benchmarks.wakeup import may_hurry
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.supervisor import Gateway
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import State
+from softfinger.daemon.wire.messages import Parts
+from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.tools.benchmarks.canned import can, hold, make_noisy
+from softfinger.tools.benchmarks.wakeup import may_hurry
 
 _ROUNDS = 5
 _SECONDS = 2.0  # of each turn
@@ -135,7 +135,7 @@ def _beside(priority: int, rounds: int, seconds: float) -> list[Beside]:
         noisy = stack.enter_context(_daemon(f"ipc://{folder}/noisy", priority, noise=True))
         subscribe = [sys.executable, "-c", _SUBSCRIBERS, address]
         busy = [sys.executable, "-c", _BUSY]
-        record = [sys.executable, "-m", "tools.cli", "record", "--address", address]
+        record = [sys.executable, "-m", "softfinger", "record", "--address", address]
         file = str(folder / "run.mcap")
         neighbours: dict[str, tuple[Connection, list[list[str]]]] = {
             "quiet": (holding, []),

@@ -19,16 +19,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daemon import messages
-from daemon.client import Hand
-from daemon.records import Frame
-from daemon.settings import Settings
-from kinematics.contact import Fingertip
-from kinematics.material import Material
-from kinematics.pressure import SensorGrid
-from tools.benchmarks.report import Row, row
-from tools.recordings.reader import Recording
-from tools.recordings.writer import RecordingWriter
+from softfinger.daemon.client import Hand
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Frame
+from softfinger.daemon.wire import messages
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks.report import Row, row
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.writer import RecordingWriter
 
 _SECONDS = 600.0
 _SHORTER = 60.0  # of the recorder of every topic, and of the loop on its own processor
@@ -170,8 +170,8 @@ def _lost(out: str) -> float:
 
 
 def _analysis(folder: Path) -> list[Row]:
-    from tools.analysis.contacts import analyse
-    from tools.analysis.sources import open_source
+    from softfinger.tools.analysis.contacts import analyse
+    from softfinger.tools.analysis.sources import open_source
 
     path = folder / "frames.mcap"
     tip, pitch = Fingertip(0.020), 0.058 / 44
@@ -219,7 +219,7 @@ def _summary(folder: Path, hour: float) -> list[Row]:
 @contextlib.contextmanager
 def _process(words: list[str]) -> Iterator[subprocess.Popen[str]]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "tools.cli", *words],
+        [sys.executable, "-m", "softfinger", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,

@@ -19,15 +19,15 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon import messages
-from daemon.assembly import Daemon
-from daemon.settings import Settings
-from daemon.stream import bit
-from kinematics import ladder
-from kinematics.kernels import kernel
-from kinematics.table import ContactTable, lookup
-from tools.benchmarks.canned import can, hold
-from tools.benchmarks.interleaved import Subject, interleave
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire import messages
+from softfinger.daemon.wire.publisher import bit
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.contact.table import ContactTable, lookup
+from softfinger.kinematics.estimation import frame_pipeline
+from softfinger.tools.benchmarks.canned import can, hold
+from softfinger.tools.benchmarks.interleaved import Subject, interleave
 
 _ROUNDS = 1000
 _TICKS = 20  # of a call: whole periods of the frames, as of the published topics
@@ -111,7 +111,7 @@ def _every_tick_estimated(daemon: Daemon) -> None:
 def _always_fitted(daemon: Daemon) -> None:
     for perception in daemon.loop.perceptions:
         plan = perception._estimator.compiled_arguments()[0]
-        plan[ladder.PEAK_LEVEL] = plan[ladder.PATCH_LEVEL] = -1e9
+        plan[frame_pipeline.PEAK_LEVEL] = plan[frame_pipeline.PATCH_LEVEL] = -1e9
 
 
 def _always_cold(daemon: Daemon) -> None:

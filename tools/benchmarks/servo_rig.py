@@ -13,12 +13,12 @@ from typing import Any
 
 import dynamixel_sdk as sdk
 
-from daemon.clock import RealClock
-from daemon.profiles import load
-from daemon.records import Goal, Reading
-from daemon.servos import registers as reg
-from daemon.servos.dynamixel import DynamixelServos
-from daemon.settings import Settings
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.types import Goal, Reading
 
 PROFILE = """\
 tactile.backend = "none"
@@ -46,7 +46,7 @@ def emulated(baud: int = 0) -> Iterator[Stand]:
         folder = Path(name)
         config = folder / "servos.toml"
         config.write_text(PROFILE)
-        command = [sys.executable, "-m", "tools.cli", "emulate", "--dir", name]
+        command = [sys.executable, "-m", "softfinger", "emulate", "--dir", name]
         process = subprocess.Popen(
             [*command, "--config", str(config), "--baud", str(baud)],
             stdout=subprocess.PIPE,

@@ -11,12 +11,12 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from daemon.realtime import RealTime
-from daemon.settings import Settings
-from daemon.simulation.control_port import send_words
-from tools.benchmarks.bare_pty import bare
-from tools.benchmarks.report import Row, row
-from tools.benchmarks.servo_rig import OurCycle, PlainCycle, emulated
+from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.emulator.control_port import send_words
+from softfinger.tools.benchmarks.bare_pty import bare
+from softfinger.tools.benchmarks.report import Row, row
+from softfinger.tools.benchmarks.servo_rig import OurCycle, PlainCycle, emulated
 
 _ROUNDS = 100
 _CYCLES = 20  # of each in a round

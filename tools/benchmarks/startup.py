@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import zmq
 
-from tools.benchmarks.report import Row, row
+from softfinger.tools.benchmarks.report import Row, row
 
 _STATE = "tcp://127.0.0.1:19874"
 _COMMANDS = "tcp://127.0.0.1:19875"
@@ -59,7 +59,7 @@ def _start(config: Path, environment: dict[str, str]) -> _Start:
     socket.connect(_STATE)
     before = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", "tools.cli", "run", "--config", str(config)],
+        [sys.executable, "-m", "softfinger", "run", "--config", str(config)],
         env=environment,
         stderr=subprocess.DEVNULL,
     )

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.realtime import RealTime
-from daemon.settings import Settings
-from tools.benchmarks.blame import CAUSES, OWN, Cycle, cause
-from tools.benchmarks.report import Row, row
-from tools.benchmarks.servo_rig import OurCycle, emulated
+from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.benchmarks.blame import CAUSES, OWN, Cycle, cause
+from softfinger.tools.benchmarks.report import Row, row
+from softfinger.tools.benchmarks.servo_rig import OurCycle, emulated
 
 _SECONDS = 60.0
 _BAUD = 2_000_000

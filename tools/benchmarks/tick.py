@@ -9,12 +9,12 @@ from typing import Any
 
 import zmq
 
-from daemon import messages
-from daemon.assembly import Daemon
-from daemon.loop import Loop
-from daemon.settings import Settings
-from tools.benchmarks.canned import can, hold
-from tools.benchmarks.report import Row, row
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.loop import Loop
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire import messages
+from softfinger.tools.benchmarks.canned import can, hold
+from softfinger.tools.benchmarks.report import Row, row
 
 _TICKS = 20_000
 _SECONDS = 20  # of virtual time

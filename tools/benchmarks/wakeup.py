@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.assembly import Daemon
-from daemon.realtime import RealTime
-from daemon.settings import Settings
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.settings import Settings
 
 _RATE = 1000.0  # Hz
 _ROUNDS = 8

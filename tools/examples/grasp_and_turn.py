@@ -2,7 +2,7 @@
 
 Start a daemon with ``softfinger run``, then run this file as a whole,
 
-    python -m tools.examples.grasp_and_turn --picture grasp_and_turn.png
+    python -m softfinger.tools.examples.grasp_and_turn --picture grasp_and_turn.png
 
 or cell by cell where ``# %%`` is understood. Needs matplotlib, the extra ``plot``.
 """
@@ -16,9 +16,11 @@ import math
 import numpy as np
 from matplotlib.figure import Figure
 
-from daemon.client import Hand, HandState, to_columns
-from daemon.client.hand import COMMANDS, STREAM
-from kinematics import ContactTable, Fingertip, Material
+from softfinger.daemon.client import Hand, HandState, to_columns
+from softfinger.daemon.client.hand import COMMANDS, STREAM
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--stream", default=STREAM)

@@ -7,15 +7,15 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from daemon import contract, messages
-from daemon.records import FINGERS
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire import messages, schema
 
 ENCODING = "json"
 SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 _IMAGE = "foxglove.RawImage"
-_TACTILE = tuple(field.name for field in contract.TOPICS[messages.TACTILE])  # in their order
+_TACTILE = tuple(field.name for field in schema.TOPICS[messages.TACTILE])  # in their order
 
 _MOST_CELLS = 4096  # in a row or column
 
@@ -37,17 +37,17 @@ def topic_of(channel: str) -> bytes:
 
 def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
     """Name and JSON schema of a topic's channels; anything is an object where we know no more."""
-    if topic not in contract.TOPICS:
+    if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
-    schema = contract.json_schema(topic)
+    told = schema.json_schema(topic)
     if topic != messages.TACTILE:
-        return topic.decode().replace("/", "."), schema
-    own = schema["properties"]
+        return topic.decode().replace("/", "."), told
+    own = told["properties"]
     stamp = {
         "type": "object",
         "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
     }
-    schema["properties"] = {
+    told["properties"] = {
         "timestamp": stamp,
         "frame_id": {"type": "string"},
         "width": {"type": "integer"},
@@ -56,7 +56,7 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
         "step": {"type": "integer"},
         **{("unix" if name == "timestamp" else name): field for name, field in own.items()},
     }
-    return _IMAGE, schema
+    return _IMAGE, told
 
 
 def to_json(topic: bytes) -> Converter:
@@ -67,7 +67,7 @@ def to_json(topic: bytes) -> Converter:
 def from_json(topic: bytes) -> Converter:
     """What makes the map of the wire from a channel's JSON."""
     floats = [
-        field.name.split(".") for field in contract.TOPICS.get(topic, ()) if field.kind == "float"
+        field.name.split(".") for field in schema.TOPICS.get(topic, ()) if field.kind == "float"
     ]
     return _Restored(floats, topic == messages.TACTILE)
 

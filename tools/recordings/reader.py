@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tools.recordings.errors import RecordingError, require_packages
-from tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
+from softfinger.tools.recordings.errors import RecordingError, require_packages
+from softfinger.tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
     from mcap.records import Chunk

@@ -12,12 +12,12 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from daemon import messages
-from daemon.recompute import Recomputation
-from daemon.records import FINGERS, Frame
-from daemon.settings import Settings
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
+from softfinger.daemon.loop.process_replay import Recomputation
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS, Frame
+from softfinger.daemon.wire import messages
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
 
 # What depends on the machine and the moment, and not on what the loop took in.
 _MOMENT = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
-from tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.writer import RecordingWriter
 
 
 def recover(path: Path) -> tuple[int, str]:

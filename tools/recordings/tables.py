@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from daemon import contract, messages
-from daemon.own_files import write_bytes, write_text
-from tools.recordings.errors import RecordingError
-from tools.recordings.reader import Recording
+from softfinger.daemon.wire import messages, schema
+from softfinger.daemon.wire.own_files import write_bytes, write_text
+from softfinger.tools.recordings.errors import RecordingError
+from softfinger.tools.recordings.reader import Recording
 
 BLOCK = 2000  # rows
 Row = dict[str, Any]
@@ -103,7 +103,7 @@ class ParquetTable:
 
 
 def _columns(topic: bytes, first: Row) -> list[tuple[str, str]]:
-    known = [(field.name, str(field.kind)) for field in contract.TOPICS.get(topic, ())]
+    known = [(field.name, str(field.kind)) for field in schema.TOPICS.get(topic, ())]
     names = {name for name, _ in known}
     kinds = {bool: "bool", int: "int", float: "float", str: "str", bytes: "bin"}
     return known + [

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from daemon import messages
-from daemon.client.wire import Gaps
-from daemon.records import FINGERS
-from tools.feed import number, printable, text
-from tools.viewing import layout
-from tools.viewing.drawing import Drawing
-from tools.viewing.known import Hand, Wanted, read_settings
-from tools.viewing.statistics import table
+from softfinger.daemon.client.wire import Gaps
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire import messages
+from softfinger.tools.terminal.feed import number, printable, text
+from softfinger.tools.viewing import layout
+from softfinger.tools.viewing.drawing import Drawing
+from softfinger.tools.viewing.known import Hand, Wanted, read_settings
+from softfinger.tools.viewing.statistics import table
 
 TOPICS = (
     messages.SETTINGS,

@@ -14,14 +14,14 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from daemon.client.records import read_frame
-from daemon.records import FINGERS
-from tools.feed import field, number
-from tools.viewing import layout
-from tools.viewing.footprint import Footprint, footprint, grid_of, tip_circle
-from tools.viewing.known import Hand
-from tools.viewing.landscape import Landscape
-from tools.viewing.planar import Contact, FingerLines, HeldObject, finger_lines
+from softfinger.daemon.client.records import read_frame
+from softfinger.daemon.types import FINGERS
+from softfinger.tools.terminal.feed import field, number
+from softfinger.tools.viewing import layout
+from softfinger.tools.viewing.footprint import Footprint, footprint, grid_of, tip_circle
+from softfinger.tools.viewing.known import Hand
+from softfinger.tools.viewing.landscape import Landscape
+from softfinger.tools.viewing.planar import Contact, FingerLines, HeldObject, finger_lines
 
 _TRAIL = 160  # points in a trail on the landscape
 _ARROW = 1.6e-3  # m of a force's arrow a newton

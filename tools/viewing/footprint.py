@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.pressure import SensorGrid
-from tools.feed import number
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.terminal.feed import number
 
 FloatArray = NDArray[np.float64]
 

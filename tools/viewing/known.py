@@ -12,13 +12,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from daemon.model import make_material, make_tip
-from daemon.records import FINGERS
-from daemon.settings import Settings, SettingsError
-from kinematics.fingers import HandGeometry
-from kinematics.table import ContactTable, TableError
-from tools.feed import number, text
-from tools.viewing.landscape import Landscape
+from softfinger.daemon.profile.factory import make_material, make_tip
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.table import ContactTable, TableError
+from softfinger.kinematics.hand.geometry import HandGeometry
+from softfinger.tools.terminal.feed import number, text
+from softfinger.tools.viewing.landscape import Landscape
 
 _PICTURE = 1e-6  # relative error of a table that is only looked at
 _GRIPPING = ("grasping", "holding", "rotating")

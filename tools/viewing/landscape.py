@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.contact import theta_limits
-from kinematics.table import ContactTable
+from softfinger.kinematics.contact.closed_form import theta_limits
+from softfinger.kinematics.contact.table import ContactTable
 
 FloatArray = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from tools.viewing.known import Hand
-from tools.viewing.landscape import HEIGHT, WIDTH
+from softfinger.tools.viewing.known import Hand
+from softfinger.tools.viewing.landscape import HEIGHT, WIDTH
 
 TIME = "time"  # the timeline: Unix time of the daemon
 SECONDS = 12.0  # of the past in the plots

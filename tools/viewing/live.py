@@ -14,10 +14,10 @@ from typing import Any
 import msgpack
 import zmq
 
-from daemon import messages
-from daemon.keys import ClientKeys
-from tools.viewing.bridge import TOPICS, Bridge
-from tools.viewing.errors import ViewError
+from softfinger.daemon.wire import messages
+from softfinger.daemon.wire.keys import ClientKeys
+from softfinger.tools.viewing.bridge import TOPICS, Bridge
+from softfinger.tools.viewing.errors import ViewError
 
 _QUEUE = 40_000  # messages: 40 MB, 20 s of state and truth at 1 kHz
 _FRAMES = 1_000  # frames: 4 MB, 5 s of two sensors at 100 Hz; 131 MB of the largest grid

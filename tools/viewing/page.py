@@ -14,7 +14,7 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import quote, urlsplit
 
-from tools.viewing.errors import ViewError
+from softfinger.tools.viewing.errors import ViewError
 
 _LOOPBACK = "127.0.0.1"
 _FILE = re.compile(r"/([\w-]+(\.[\w-]+)*)?")

@@ -2,7 +2,7 @@
 
 Pure geometry, in the hand's plane: m, x from the left pivot to the right one, y away from the palm.
 A tip's own axes are x along its base and z out of it; the object's face stands at
-``x sin θ + z cos θ = a − d`` in them (`kinematics.fingers` has where the tips are).
+``x sin θ + z cos θ = a − d`` in them (`hand.geometry` has where the tips are).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinematics.fingers import HandGeometry
+from softfinger.kinematics.hand.geometry import HandGeometry
 
 FloatArray = NDArray[np.float64]
 

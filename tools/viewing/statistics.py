@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from tools.feed import number
+from softfinger.tools.terminal.feed import number
 
 _ROWS = {
     "wake": "wake-up late",

@@ -2,7 +2,7 @@
 
 All its sockets are on the loopback, its memory is bounded, and it ends with this process, whatever
 ends this one. It reaches no other machine, for news, examples or its makers' usage statistics: the
-window by its environment, the web viewer by what the page is allowed to (`tools.viewing.page`).
+window by its environment, the web viewer by what the page is allowed to (`viewing.page`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 from typing import IO
 
-from tools.viewing.errors import NoRerun, ViewError
-from tools.viewing.page import Page, viewer_address
+from softfinger.tools.viewing.errors import NoRerun, ViewError
+from softfinger.tools.viewing.page import Page, viewer_address
 
 LOOPBACK = "127.0.0.1"
 _START = 20.0  # s that a viewer may take until it listens

@@ -1,5 +1,0 @@
-"""What `softfinger doctor` looks at: one module an area, each a few functions that return results.
-
-Nothing here changes anything, stiffens or moves the hand; what may be mended is in
-:mod:`daemon.checkup.mending`, which is called when it is asked for.
-"""

@@ -1,0 +1,432 @@
+"""The control law's modes: commands in, one goal for the servos a tick out.
+
+Holds what each mode does and when it passes into the next. Which command is heard when stands in
+`control.modes`, the grip law in `control.grip`, limits that must not be trusted to a control law in
+`safety.safety`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from softfinger.daemon.control.grip import Grip
+from softfinger.daemon.control.modes import Command, Mode
+from softfinger.daemon.control.setpoint import Reference
+from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
+from softfinger.daemon.types import FINGERS, Contact, Goal, ObjectPose, Reading
+from softfinger.daemon.wire.command_server import Refused
+
+Event = tuple[str, str, str]  # level, kind, text
+
+_REACH = 0.35  # rad beyond the present angle: far enough that the servo's current bound decides
+_ARRIVED = 0.03  # rad from the goal
+_GRACE = 1.0  # s after the ramp's end in which a joint that friction holds may still arrive
+_SETTLED_FORCE = 0.03  # share of the force target
+_SETTLED_ANGLE = 0.5 * math.pi / 180.0
+_SETTLED_FOR = 0.2  # s
+_TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
+_RAISED = 1.02  # of the force asked for: told as raised
+_LOST_AFTER = 0.1  # s without contact in a grip
+_EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
+
+
+class Control:
+    """Modes and their laws. ``command`` and ``step`` are called from the loop's thread only."""
+
+    def __init__(self, settings: Settings, has_servos: bool, has_sensors: bool) -> None:
+        self._settings = settings
+        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self._has_servos = has_servos
+        self._has_sensors = has_sensors
+        self._grip = Grip(settings, self._fingers)
+        self._by_position = settings.control.law == "position" and len(self._fingers) == 2
+        self._force = settings.control.force_default  # N that the next grip goes to
+        self.mode = Mode.DISARMED
+        self.torque = False  # what the servos' torque shall be
+        self.events: list[Event] = []
+        self._reading = Reading()
+        self._held = Held()
+        self._contacts = [Contact(), Contact()]
+        self._touched: list[Contact] = []  # those of the fingers that take part
+        self._pose = ObjectPose()
+        dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
+        self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
+        self._next_angle: float | None = None  # rad to turn to once the grip holds
+        self._raised = False  # the grip is firmer than was asked for
+        self._touching = [False, False]
+        self._gripping = False
+        self._rest_current = settings.safety.current_move  # A, with which the joints hold a goal
+        self._waiting = 0.0  # s since the ramps ended, or the grip has been settled
+        self._lost = 0.0  # s without contact in a grip
+        self._empty = 0.0  # s in which a grip has been too narrow to hold anything
+        self._turn_ended = False  # before its target, since the tips would slip
+
+    # Commands
+
+    def command(self, command: Command) -> dict[str, Any]:
+        """Carry out a command that `modes.parse` let through. Raises Refused with the reason."""
+        told = getattr(self, f"_{command.name}")(command.numbers)
+        return {"mode": self.mode.value} | (told or {})
+
+    def fail(self, reason: str, name: str) -> None:
+        """Latch a fault: torque off until ``clear``. ``name`` is its row of `safety.limits`."""
+        self._enter(Mode.FAULT)
+        self.torque = False
+        self.events.append(("error", name, reason))
+
+    def _arm(self, _: dict[str, float]) -> None:
+        if not self._has_servos:
+            raise Refused("arm: this scene has no servos")
+        self._hold_here()
+        self.torque = True
+        self._enter(Mode.ARMED)
+
+    def _disarm(self, _: dict[str, float]) -> None:
+        self.torque = False
+        self._enter(Mode.DISARMED)
+
+    def _stop(self, _: dict[str, float]) -> None:
+        self.torque = False
+        if self.mode is not Mode.FAULT:
+            self._enter(Mode.DISARMED)
+
+    def _clear(self, _: dict[str, float]) -> None:
+        self._enter(Mode.DISARMED)
+
+    def _status(self, _: dict[str, float]) -> None:
+        pass
+
+    def _tare(self, _: dict[str, float]) -> None:
+        if not self._has_sensors:
+            raise Refused("tare: this scene has no tactile sensors")
+
+    def _move(self, numbers: dict[str, float]) -> None:
+        if not numbers:
+            raise Refused("move: left or right is missing")
+        hand = self._settings.hand
+        for name, q in numbers.items():
+            index = FINGERS.index(name)
+            if index not in self._fingers:
+                raise Refused(f"move: this scene has no {name} finger")
+            low, high = hand.q_min[index], hand.q_max[index]
+            if not low <= q <= high:
+                raise Refused(f"move: {name}: found {q:g} rad, expected {low:g} to {high:g}")
+        if self.mode is not Mode.MOVING:
+            self._hold_here()
+        for name, q in numbers.items():
+            self._ways[FINGERS.index(name)].target = q
+        self._enter(Mode.MOVING)
+
+    def _grasp(self, numbers: dict[str, float]) -> None:
+        if not self._has_sensors:
+            raise Refused("grasp: each finger needs a tactile sensor in this scene")
+        if self._settings.servos.mode == "position":
+            raise Refused('grasp: nothing bounds the current while servos.mode is "position"')
+        force = numbers.get("force", self._settings.control.force_default)
+        low = self._settings.control.contact_force
+        high = GRIP_SHARE * self._settings.safety.force_max
+        if not low < force <= high:
+            raise Refused(f"grasp: force: found {force:g} N, expected above {low:g} to {high:g}")
+        if self._gripping:
+            self._grip.retarget(force)
+        else:
+            if self.mode is not Mode.GRASPING:
+                self._hold_here()
+                self._touching = [False, False]
+            self._force = force
+        self._enter(Mode.GRASPING)
+
+    def _rotate(self, numbers: dict[str, float]) -> dict[str, Any] | None:
+        if len(self._fingers) < 2 or not self._settings.scene.object_model:
+            raise Refused("rotate: needs both fingers and the object model in the scene")
+        angle = numbers["angle"]
+        if self.mode is Mode.GRASPING:
+            self._next_angle = angle
+            return {"queued": "rotate", "until": Mode.HOLDING.value}
+        self._turn_to(angle)
+        return None
+
+    def _turn_to(self, angle: float) -> None:
+        if not self._pose.valid:
+            raise Refused("rotate: the object's angle is not known")
+        low, high = self._turns()
+        if not low <= angle <= high:
+            raise Refused(
+                f"rotate: angle: found {angle:.4g} rad, "
+                f"expected {low:.2f} to {high:.2f} in this grip"
+            )
+        self._grip.steer(self._pose.angle, angle)
+        self._turn_ended = False
+        self._enter(Mode.ROTATING)
+
+    def _set(self, numbers: dict[str, float]) -> None:
+        compliance = numbers["compliance"]
+        low, high = 0.01, 1.0
+        if not low <= compliance <= high:
+            raise Refused(
+                f"set: compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
+            )
+        self._grip.soften(1.0 / compliance)
+
+    def _turns(self) -> tuple[float, float]:
+        """The object's angles [rad] that this grip reaches within the tips' and joints' limits.
+
+        While the object turns by φ, each joint leans by φ over the sum of its turns, and each tip's
+        tilt changes by both.
+        """
+        settings, present = self._settings, self._pose.angle
+        lean = 1.0 / max(self._held.turn[0] + self._held.turn[1], 0.1)
+        low, high = -math.inf, math.inf
+        for index, sense in ((0, 1.0), (1, -1.0)):
+            contact, q = self._contacts[index], self._reading.q[index]
+            depth = 1.0 - contact.d / settings.tip.radius
+            reach = math.asin(max(depth, 0.0)) - settings.safety.theta_margin - _TURN_RESERVE
+            low = max(low, (-reach - contact.theta) / (1.0 + lean))
+            high = min(high, (reach - contact.theta) / (1.0 + lean))
+            down, up = settings.hand.q_min[index] - q, settings.hand.q_max[index] - q
+            ends = sorted((sense * down / lean, sense * up / lean))
+            low, high = max(low, ends[0]), min(high, ends[1])
+        return present + min(low, 0.0), present + max(high, 0.0)
+
+    def _release(self, _: dict[str, float]) -> None:
+        self._hold_here()
+        for index in self._fingers:
+            self._ways[index].target = self._settings.hand.open_angle[index]
+        self._gripping = False
+        self._enter(Mode.RELEASING)
+
+    def _enter(self, mode: Mode) -> None:
+        if mode is not self.mode:
+            self.events.append(("info", "mode", f"{self.mode.value} → {mode.value}"))
+        self.mode = mode
+        if self._next_angle is not None and mode not in (Mode.GRASPING, Mode.HOLDING):
+            self._next_angle = None
+            text = f"rotate: dropped, since the grasp ended in {mode.value}"
+            self.events.append(("warning", "rotate", text))
+        self._rest_current = self._settings.safety.current_move
+        self._waiting = self._lost = self._empty = 0.0
+        if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
+            self._gripping = False
+
+    def _hold_here(self) -> None:
+        for way, q in zip(self._ways, self._reading.q, strict=True):
+            way.reset(q)
+
+    # One tick
+
+    def observe(
+        self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: Held
+    ) -> None:
+        """Take in what the servos and sensors said. Commands are carried out on this picture."""
+        self._reading = reading
+        self._held = held
+        if contacts is not self._contacts:
+            self._contacts = contacts
+            self._touched = [contacts[index] for index in self._fingers]
+        self._pose = pose
+
+    def step(self, dt: float, goal: Goal) -> None:
+        """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
+        goal.valid = self.torque
+        if not self.torque:
+            goal.force = goal.angle = math.nan
+            return
+        mode = self.mode
+        if mode is Mode.MOVING or mode is Mode.RELEASING:
+            self._travel(dt)
+        elif mode is Mode.GRASPING and not self._gripping:
+            self._approach(dt)
+        if self._gripping:
+            self._hold(dt, goal)
+        else:
+            closing = mode is Mode.GRASPING
+            bound = self._approach_current() if closing else self._rest_current
+            for index in self._fingers:
+                goal.q[index] = self._ways[index].value
+                goal.current[index] = bound
+        self._tell_goal(goal)
+
+    def _tell_goal(self, goal: Goal) -> None:
+        """What the grip goes to, for those who look on; nothing here follows it."""
+        grip = self._grip
+        goal.force = goal.angle = math.nan
+        if self._gripping:
+            goal.force = grip.force.target
+            if grip.steering:
+                goal.angle = grip.angle.target
+        elif self.mode is Mode.GRASPING:
+            goal.force = self._force
+
+    def coast(self, goal: Goal) -> None:
+        """In the place of `step` while frames are late: goals stay as they are.
+
+        Those that stand for torques do not: a grip goes on to damp its joints, and a turn rests.
+        """
+        if goal.valid and self._gripping and self._lost == 0.0 and not self._by_position:
+            self._pull(self._grip.coast(self._reading, self._held), goal)
+
+    def _travel(self, dt: float) -> None:
+        if self._ramp(self._settings.control.move_speed):
+            return
+        self._waiting += dt
+        off = max(abs(self._reading.q[i] - self._ways[i].target) for i in self._fingers)
+        if off < _ARRIVED or self._waiting > _GRACE:
+            if off >= _ARRIVED:
+                text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
+                self.events.append(("warning", "short", text))
+            self._enter(Mode.ARMED)
+
+    def _ramp(self, speed: float) -> bool:
+        """Move the goals one tick toward their targets; False when all are there."""
+        for index in self._fingers:
+            self._ways[index].step(speed)
+        return not all(self._ways[index].arrived for index in self._fingers)
+
+    def _approach(self, dt: float) -> None:
+        """Close until every finger touches; a finger that touches waits for the other."""
+        law = self._settings.control
+        for index in self._fingers:
+            contact = self._contacts[index]
+            touches = contact.valid and contact.contact and contact.force > law.contact_force
+            if touches and not self._touching[index]:
+                self._ways[index].reset(self._reading.q[index])
+            self._touching[index] = touches
+            if not touches:
+                self._ways[index].target = self._settings.hand.q_max[index]
+        if all(self._touching[index] for index in self._fingers):
+            if self._is_empty(dt):
+                return
+            felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
+            self._gripping = True
+            self._grip.start(self._held, felt, self._force)
+        elif not self._ramp(law.approach_speed) and self._waited(dt) > _GRACE:
+            self.events.append(("warning", "grasp", "nothing to grasp within the joints' limits"))
+            self._hold_here()
+            self._enter(Mode.ARMED)
+
+    def _approach_current(self) -> float:
+        """A tip that meets the object before it is felt shall not press beyond the force wanted."""
+        law = self._settings.control
+        pressed = 0.5 * self._force * self._settings.hand.finger_length + law.joint_friction
+        return min(law.approach_current, pressed / law.torque_constant)
+
+    def _waited(self, dt: float) -> float:
+        self._waiting += dt
+        return self._waiting
+
+    def _hold(self, dt: float, goal: Goal) -> None:
+        contacts = self._touched
+        grip = self._grip
+        grip.holding = self.mode is Mode.HOLDING
+        if self._loses(dt, contacts, goal):
+            return
+        self._is_empty(dt)
+        if self._by_position:
+            goal.q[:] = grip.angles(self._contacts, self._pose, self._held)
+            goal.current[0] = goal.current[1] = self._settings.safety.current_max
+        else:
+            torques = grip.torques(self._reading, self._contacts, self._pose, self._held)
+            self._pull(torques, goal)
+        self._watch_slip()
+        self._watch_settling(dt, contacts)
+
+    def _pull(self, torques: tuple[float, float], goal: Goal) -> None:
+        for index in self._fingers:
+            current = torques[index] / self._settings.control.torque_constant
+            goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
+            goal.current[index] = abs(current)
+
+    def _loses(self, dt: float, contacts: list[Contact], goal: Goal) -> bool:
+        """Without a contact the joints hold where they are; when it stays away the grip ends."""
+        lost = False
+        for contact in contacts:
+            lost = lost or not contact.contact
+        if not lost:
+            self._lost = 0.0
+            return False
+        if self._lost == 0.0:
+            self._hold_here()
+            # A board that went blind must not make the joints press harder than they did.
+            pressed = max(goal.current[index] for index in self._fingers)
+            self._rest_current = min(pressed, self._settings.safety.current_move)
+        for index in self._fingers:
+            goal.q[index] = self._ways[index].value
+            goal.current[index] = self._rest_current
+        self._lost += dt
+        if self._lost > _LOST_AFTER:
+            self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
+            rest = self._rest_current
+            self._enter(Mode.ARMED)
+            self._rest_current = rest
+        return True
+
+    def _is_empty(self, dt: float) -> bool:
+        """Whether there seems to be nothing between the tips; when that stays, the hand opens.
+
+        Tips that press each other would roll off to one side. Their contacts are one, so that the
+        object's width by joints and sensors is 0 up to their errors.
+        """
+        least = self._settings.object.width_min
+        if not self._pose.valid or self._pose.width >= least:
+            self._empty = 0.0
+            return False
+        self._empty += dt
+        if self._empty > _EMPTY_AFTER:
+            text = (
+                f"nothing between the tips: {self._pose.width * 1e3:.1f} mm, "
+                f"less than object.width_min {least * 1e3:g} mm; opening"
+            )
+            self.events.append(("warning", "grasp", text))
+            self._release({})
+        return True
+
+    def _watch_slip(self) -> None:
+        """Tell when the grip is raised by itself. Turning ends where the tips would slip."""
+        law = self._settings.control
+        most = law.tip_friction * (1.0 - law.slip_margin)
+        grip = self._grip
+        if grip.slip.turned:
+            self.events.append(("warning", "slip", "the object turns in the grip"))
+        asked, given = grip.force_target, grip.force.target
+        if given > _RAISED * asked and not self._raised:
+            self._raised = True
+            text = f"grip raised above {asked:.1f} N: each tip may bear {grip.slip.load:.1f} N"
+            self.events.append(("warning", "slip", f"{text} along its face"))
+        elif given <= asked:
+            self._raised = False
+        if self.mode is Mode.ROTATING and self._held.shear * grip.turning_on > most:
+            if not self._turn_ended:
+                angle = math.degrees(self._pose.angle)
+                text = f"turning ended at {angle:.1f}°: the tips would slip"
+                self.events.append(("warning", "slip", text))
+            self._turn_ended = True
+            grip.steer(self._pose.angle, self._pose.angle)
+
+    def _watch_settling(self, dt: float, contacts: list[Contact]) -> None:
+        if self.mode not in (Mode.GRASPING, Mode.ROTATING):
+            return
+        # The mean, since what the object rubs on may take some force between the tips.
+        target = self._grip.force.target
+        felt = sum(contact.force for contact in contacts) / len(contacts)
+        settled = abs(felt - target) < _SETTLED_FORCE * target
+        if self.mode is Mode.ROTATING:
+            settled = abs(self._pose.angle - self._grip.angle_target) < _SETTLED_ANGLE
+        self._waiting = self._waiting + dt if settled else 0.0
+        if self._waiting > _SETTLED_FOR:
+            if self._pose.valid and not self._grip.steering:
+                self._grip.steer(self._pose.angle, self._pose.angle)
+            self._grip.slip.begin(self._held)
+            self._enter(Mode.HOLDING)
+            self._turn_next()
+
+    def _turn_next(self) -> None:
+        """Carry out a turn that waited for the grip."""
+        angle, self._next_angle = self._next_angle, None
+        if angle is None:
+            return
+        try:
+            self._turn_to(angle)
+        except Refused as reason:
+            self.events.append(("warning", "rotate", str(reason)))

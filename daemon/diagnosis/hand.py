@@ -1,0 +1,166 @@
+"""The hand itself: each servo of the scene, asked without a change, and each board's frames."""
+
+from __future__ import annotations
+
+import time
+
+from softfinger.daemon.diagnosis.result import Result, Status
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.checks import check_angle
+from softfinger.daemon.servos.examine import Examined, examine, servo_name
+from softfinger.daemon.servos.identity import plan
+from softfinger.daemon.servos.line import ServoLine
+from softfinger.daemon.servos.models import ServoModel, by_name
+from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.scanning import ALONE, FoundServo, search
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.types import FINGERS
+
+_PATIENCE = 0.05  # s for a reply: a factory-new servo behind a slow adapter answers within it
+_LISTEN = 0.5  # s of a board's frames
+_OFF_RATE = 0.1  # share of the rate by which a board may be off
+
+
+def check_servos(
+    settings: Settings, patience: float = _PATIENCE, wait: float = 0.8
+) -> list[Result]:
+    """Each servo of the scene; where one does not answer, what answers at every rate instead.
+
+    ``patience`` [s] is given to each reply, ``wait`` [s] to each rate that is searched.
+    """
+    servos = settings.servos
+    model = by_name(servos.model)
+    # The adapter's low-latency mode would be a change, so it is not asked for.
+    port = SerialPort(servos.port, servos.baud, patience, low_latency=False)
+    try:
+        port.openPort()
+        try:
+            found = examine(ServoLine(port, PacketHandler()), settings, model)
+        finally:
+            port.closePort()
+        results = [line for each in found for line in _judge(each, settings, model)]
+        if not all(each.answers for each in found):
+            results += _search(settings, model, wait)
+    except ServoError as error:
+        return [Result("FAIL", "servos", str(error))]
+    return results
+
+
+def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Result]:
+    name = servo.name
+    if not servo.answers:
+        return [
+            Result(
+                "FAIL",
+                name,
+                f"no answer at {settings.servos.baud} baud",
+                "check its power and cable, then see what was found below",
+            )
+        ]
+    results = [_result("FAIL", name, text) for text in servo.findings.errors]
+    results += [_result("warn", name, text) for text in servo.findings.notices]
+    if servo.table and not servo.findings.errors:
+        hand = settings.hand
+        low, high = hand.q_min[servo.finger], hand.q_max[servo.finger]
+        angle = JointScale.of(settings.servos, servo.finger, model).angle(servo.position)
+        strayed = check_angle(name, angle, low, high)
+        if strayed:
+            results.append(_result("FAIL", name, strayed))
+        else:
+            results.append(Result("pass", name, _described(servo, model)))
+    return results
+
+
+def _described(servo: Examined, model: ServoModel) -> str:
+    volts = servo.word(reg.PRESENT_INPUT_VOLTAGE) * reg.VOLTAGE_UNIT
+    mode = reg.MODE_NAMES[servo.table[reg.OPERATING_MODE]]
+    return (
+        f"{model.name}, firmware {servo.table[reg.FIRMWARE_VERSION]}, {mode} mode, {volts:.1f} V, "
+        f"{servo.table[reg.PRESENT_TEMPERATURE]} °C"
+    )
+
+
+def _result(status: Status, name: str, text: str) -> Result:
+    """A finding's line, ``what is wrong: what mends it`` behind the servo's name, taken apart."""
+    what, colon, mend = text.removeprefix(f"{name}: ").rpartition(": ")
+    if not colon:
+        return Result(status, name, mend)
+    return Result(status, name, what, mend.replace("`", ""))
+
+
+def _search(settings: Settings, model: ServoModel, wait: float) -> list[Result]:
+    """What answers on the port at any rate that the model has, and what is to be done about it."""
+    servos = settings.servos
+    found = search(servos.port, model.baud_rates, wait, {1, *servos.ids})
+    if not found.servos and not found.garbled:
+        return [
+            Result(
+                "FAIL",
+                "servos",
+                f"nothing answers on {servos.port} at any rate",
+                "check the bus's power and cable",
+            )
+        ]
+    what = plan(found, settings, model, model.baud_rates)
+    lines = [Result("FAIL", "servos", str(each), ALONE) for each in found.garbled]
+    for change in what.changes:
+        same = change.servo.id == change.id
+        other = f"servos.baud = {change.servo.baud}" if same else "servos.ids as it is"
+        name = servo_name(change.id, change.finger)
+        fix = f"softfinger doctor --fix makes it {name}: {change}; or set {other}"
+        lines.append(Result("note", "found", _told(change.servo), fix))
+    for each in what.strangers:
+        mend = ALONE if what.missing and each.number == model.number else ""
+        lines.append(Result("note", "found", _told(each), mend))
+    return lines or [Result("note", "found", "no other servo answers at any rate")]
+
+
+def _told(servo: FoundServo) -> str:
+    return f"ID {servo.id} at {servo.baud} baud: {servo.model}, firmware {servo.firmware}"
+
+
+def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Result:
+    """Whether a board sends frames of the settings' grid at their rate; ``listen`` s are heard."""
+    tactile = settings.tactile
+    name = f"tactile {FINGERS[finger]}"
+    sensor = make_sensor(settings, RealClock(), None, finger)
+    assert sensor is not None
+    try:
+        sensor.open()
+    except TactileError as error:
+        what, _, mend = str(error).rpartition(": ")
+        if mend.startswith(("set ", "move ")):
+            return Result("FAIL", name, what, mend)
+        return Result("FAIL", name, str(error), "check tactile.port, its baud and its cable")
+    try:
+        before, start = sensor.counters(), time.monotonic()
+        time.sleep(listen)
+        after, spent = sensor.counters(), time.monotonic() - start
+    finally:
+        sensor.close()
+    frames = after["frames"] - before["frames"]
+    rate = frames / spent
+    grid = f"{tactile.rows} × {tactile.cols} cells"
+    lost = after.get("skipped_bytes", 0) - before.get("skipped_bytes", 0)
+    if lost:
+        return Result(
+            "warn",
+            name,
+            f"{grid}, {rate:.0f} frames a second, but {lost} bytes were damaged or lost",
+            "check its cable and what else loads the USB hub",
+        )
+    # One frame more or less falls into the time that was listened for.
+    if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
+        return Result(
+            "warn",
+            name,
+            f"{grid}, {rate:.0f} frames a second, not {tactile.rate:g}",
+            f"set tactile.rate = {rate:.0f}",
+        )
+    return Result("pass", name, f"{grid}, {rate:.0f} frames a second")

@@ -1,0 +1,139 @@
+"""Whether this machine lets a process keep a steady tick: scheduling, memory, idle states, clock.
+
+All of it makes the tick worse at most, so nothing here fails; limits are this process's own, as
+the daemon started from the same shell has them.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from pathlib import Path
+
+from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.loop import rights
+
+_MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
+_WAKE_UPS = 100
+_PERIOD = 0.002  # s
+_OLDEST = 1_700_000_000.0  # Unix s: a clock that says less was never set
+
+
+def check_machine() -> list[Result]:
+    """Every check of this module."""
+    return [
+        check_scheduling(),
+        check_memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]),
+        check_idle_states(Path("/dev/cpu_dma_latency")),
+        check_clock_source(
+            Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+        ),
+        check_wall_clock(time.time()),
+        check_wake_ups(wake_ups()),
+    ]
+
+
+def check_scheduling() -> Result:
+    """Whether SCHED_FIFO is allowed; it is tried for an instant, on this thread alone."""
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except OSError:
+        soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+        return Result(
+            "warn",
+            "scheduling",
+            f"SCHED_FIFO is not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick",
+            rights.PRIORITY,
+        )
+    os.sched_setscheduler(0, *before)
+    return Result("pass", "scheduling", "SCHED_FIFO is allowed")
+
+
+def check_memory_lock(limit: int) -> Result:
+    """Judge RLIMIT_MEMLOCK [bytes], RLIM_INFINITY for none."""
+    if os.geteuid() == 0:
+        return Result("pass", "memory lock", "not limited for root")
+    if limit == resource.RLIM_INFINITY:
+        return Result("pass", "memory lock", "not limited")
+    size = f"{limit >> 10} KiB"
+    if limit >= _MEMORY:
+        return Result("pass", "memory lock", size)
+    return Result(
+        "warn",
+        "memory lock",
+        f"{size} may be locked, {_MEMORY >> 20} MiB wanted: pages of the loop can be swapped out",
+        rights.MEMORY_LOCK,
+    )
+
+
+def check_idle_states(path: Path) -> Result:
+    """Whether the processors can be kept out of deep idle states, from which waking takes long."""
+    name = str(path)
+    if not path.exists():
+        return Result("warn", name, "this kernel has none: wake-ups take what idle states take")
+    if os.access(path, os.W_OK):
+        return Result("pass", name, "may be held")
+    return Result(
+        "warn",
+        name,
+        "no permission to hold it: wake-ups take what idle states take",
+        rights.LATENCY,
+    )
+
+
+def check_clock_source(path: Path) -> Result:
+    """Whether reading the time is cheap and fine enough."""
+    resolution = time.clock_getres(time.CLOCK_MONOTONIC)
+    if resolution > 1e-6:
+        return Result(
+            "warn", "clock", f"monotonic time has steps of {resolution * 1e6:g} µs, not ≤ 1 µs"
+        )
+    try:
+        source = path.read_text().strip()
+    except OSError:
+        source = "unknown"
+    if source in ("hpet", "acpi_pm", "jiffies"):
+        return Result(
+            "warn",
+            "clock",
+            f"the kernel reads {source}, about a microsecond each time",
+            "boot with clocksource=tsc where the processor's is stable",
+        )
+    return Result("pass", "clock", f"monotonic, {resolution * 1e9:g} ns, source {source}")
+
+
+def check_wall_clock(now: float) -> Result:
+    """Whether Unix time ``now`` [s] can be one: it stands in every published message."""
+    if now >= _OLDEST:
+        return Result("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
+    return Result(
+        "warn",
+        "wall clock",
+        f"says {time.strftime('%Y-%m-%d', time.gmtime(now))}: published timestamps will be wrong",
+        "sudo timedatectl set-ntp true",
+    )
+
+
+def wake_ups() -> list[float]:
+    """How late sleeps until a deadline end [s], as the daemon's ticks would."""
+    late = []
+    deadline = time.monotonic()
+    for _ in range(_WAKE_UPS):
+        deadline += _PERIOD
+        time.sleep(max(deadline - time.monotonic(), 0.0))
+        late.append(time.monotonic() - deadline)
+    return late
+
+
+def check_wake_ups(late: list[float]) -> Result:
+    """Judge how late wake-ups were [s]: half a tick's period is too late."""
+    worst = max(late)
+    middle = sorted(late)[len(late) // 2]
+    text = f"late by {middle * 1e6:.0f} µs, at most {worst * 1e6:.0f} µs in {len(late)} ticks"
+    if middle < 0.25 * _PERIOD:
+        return Result("pass", "wake-ups", text)
+    return Result(
+        "warn", "wake-ups", f"{text}: the machine is busy or slow to wake", "end what else runs"
+    )

@@ -1,0 +1,51 @@
+"""What `softfinger doctor --fix` changes, and nothing else: adapters and servos.
+
+The hand lets go where a servo's EEPROM has to be written; nothing is ever stiffened or moved.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from softfinger.daemon.diagnosis.ports import check_latency_timer, latency_file
+from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.servos.mend import mend
+
+
+def mend_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
+    """Set the adapter's latency timer to 1 ms; None when there is nothing to mend."""
+    places = () if sysfs is None else (sysfs,)
+    place = latency_file(path, *places)
+    found = check_latency_timer(path, 1.0, *places)
+    if place is None or found is None or found.status == "pass":
+        return None
+    subject = f"{path} latency timer"
+    try:
+        place.write_text("1")
+    except OSError as error:
+        return Result(
+            "warn",
+            subject,
+            f"could not be set: {(error.strerror or 'refused').lower()}",
+            f"echo 1 | sudo tee {place}",
+        )
+    return Result("fixed", subject, "set to 1 ms")
+
+
+def mend_servos(settings: Settings) -> list[Result]:
+    """Set the scene's servos up as the daemon needs them; one line for each thing done."""
+    try:
+        done = mend(settings)
+    except ServoError as error:
+        return [_line(text) for text in str(error).splitlines()]
+    return [_line(f"(done: {text})") for text in done]
+
+
+def _line(text: str) -> Result:
+    done = text.removeprefix("(done: ")
+    name, _, what = done.partition(": ")
+    if done == text:
+        return Result("warn", name, f"not mended: {what}")
+    return Result("fixed", name, what.removesuffix(")"))

@@ -1,0 +1,234 @@
+"""Which request goes to the loop next, and which is refused: pace, fairness, and what a stop ends.
+
+A ``stop`` goes first, whoever else speaks, and one stop to the loop answers all that wait. Of all
+else few are on their way to the loop at a time; the rest waits here, where every client has a place
+and none more than its share. A client that sends more than it may a second is refused until it
+pauses. Nothing here reads or sends.
+
+Each request carries the epoch that its connection was in when it was read. The loop counts epochs
+up, with every stop and whenever it could not act for a while, and carries out requests of the
+present one alone; a connection comes into it only once nothing is left in it that arrived before.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import msgpack
+
+from softfinger.daemon.wire.command_server import PASSED, Refused, decode
+
+_UNDER_WAY = 4  # requests that the loop has and hasn't answered; a stop goes beside them
+_WAITING_EACH = 64  # requests of one client that wait here …
+_WAITING = 2048  # … and of all, beyond one of each
+_ALL = 2000.0  # requests a second of all clients together …
+_FEWEST = 2.0  # … but each may send so many
+_OLDEST = 1.0  # s after which a request that waits is too old to act upon
+_LOST = 2.0  # s after which an answer of the loop is given up
+_NUMBERS = 1 << 30  # that requests are told apart by
+_REFUSALS = 1  # that are answered at one read from a client that floods
+_FULL = "too many commands wait already"
+_OLD = "waited too long for its turn; send it again"
+
+
+class Client(Protocol):
+    """Somebody who asks. ``pace`` is the account of what it sends."""
+
+    alive: bool
+    pace: Pace
+
+    @property
+    def name(self) -> str:
+        """By its key; empty without."""
+
+    @property
+    def epoch(self) -> int:
+        """Of which its connection is."""
+
+    def answer(self, envelope: Any, reply: bytes) -> None:
+        """Send the reply to one of its requests, unless it has gone."""
+
+
+class Pace:
+    """What a client may still send: so many a second, of which one second's worth at once."""
+
+    __slots__ = ("_left", "_then", "behind", "refusals", "stopped")
+
+    def __init__(self, per_second: float, now: float) -> None:
+        self._left = per_second
+        self._then = now
+        self.behind = False  # it sent too much, and has not paused since
+        self.begin_read()
+
+    @property
+    def tired(self) -> bool:
+        """It sent too much at this read: it is not to be read for a while."""
+        return self.stopped or self.refusals > 0
+
+    def begin_read(self) -> None:
+        """Some more of what it sent is going to be taken."""
+        self.refusals = 0  # at this read
+        self.stopped = False  # a stop was heard in a flood
+
+    def take(self, per_second: float, now: float) -> bool:
+        """Count one more request; False when it is too many."""
+        left = self._left + (now - self._then) * per_second
+        self._left = min(left, per_second) - 1.0
+        self._then = now
+        if self._left < 0.0:
+            self._left = 0.0
+            self.behind = True
+        return not self.behind
+
+
+class _Request(NamedTuple):
+    envelope: Any
+    epoch: int
+    came: float
+    packed: bytes
+
+
+class Requests:
+    """The requests of all clients on their way to the loop, and the replies on their way back."""
+
+    def __init__(
+        self, max_bytes: int, per_second: float, forward: Callable[[bool, int, int, bytes], bool]
+    ) -> None:
+        """``forward`` gives the loop a request: whether it is a stop, epoch, number, packed map.
+
+        It returns False when there is no room.
+        """
+        self._max_bytes = max_bytes
+        self._per_second = per_second
+        self._forward = forward
+        self._number = 1
+        self._waiting: dict[Client, deque[_Request]] = {}  # the next client's turn is first
+        self._count = 0  # of them
+        self._stops: list[tuple[Client, Any]] = []
+        self._active: set[Client] = set()  # who has sent something in this second
+        self._share_until = 0.0
+        self._asked: dict[int, tuple[list[tuple[Client, Any]], float]] = {}
+        self._stop = 0  # the number of the stop that the loop has
+        self.epoch = 0
+        self.refused = 0  # because too many came
+
+    def new_pace(self, now: float) -> Pace:
+        """The account of a new client."""
+        return Pace(self._per_second, now)
+
+    def take(self, client: Client, envelope: Any, payload: bytes, now: float) -> None:
+        """One message of a client: it waits for its turn, or is refused."""
+        pace = client.pace
+        in_pace = pace.take(self._shared(client, now), now)
+        if not in_pace and (pace.stopped or b"stop" not in payload):
+            self._refuse_flood(client, envelope)
+            return
+        try:
+            if len(payload) > self._max_bytes:
+                raise Refused(f"message of {len(payload)} bytes; at most {self._max_bytes}")
+            request = decode(payload)
+        except Refused as refusal:
+            _refuse(client, envelope, str(refusal))
+            return
+        if client.name:
+            request["client"] = client.name
+        if request["command"] == "stop":
+            self._stops.append((client, envelope))
+            pace.stopped = pace.behind
+        elif pace.behind:
+            self._refuse_flood(client, envelope)
+        else:
+            self._queue(client, envelope, msgpack.packb(request), now)
+
+    def _shared(self, client: Client, now: float) -> float:
+        """What each client may send in a second: less when many send."""
+        if now > self._share_until:
+            self._share_until = now + 1.0
+            self._active.clear()
+        self._active.add(client)
+        return min(self._per_second, max(_ALL / len(self._active), _FEWEST))
+
+    def _refuse_flood(self, client: Client, envelope: Any) -> None:
+        self.refused += 1
+        client.pace.refusals += 1
+        if client.pace.refusals <= _REFUSALS:
+            _refuse(client, envelope, f"too many commands: at most {self._per_second:g} a second")
+
+    def _queue(self, client: Client, envelope: Any, packed: bytes, now: float) -> None:
+        held = self._waiting.get(client)
+        if held is None:
+            self._waiting[client] = held = deque()
+        elif len(held) >= _WAITING_EACH or self._count >= _WAITING:
+            self.refused += 1
+            _refuse(client, envelope, _FULL)
+            return
+        held.append(_Request(envelope, client.epoch, now, packed))
+        self._count += 1
+
+    def pump(self, now: float) -> None:
+        """Give the loop what it may have now."""
+        while self._asked:
+            number, (_, then) = next(iter(self._asked.items()))
+            if now - then < _LOST:
+                break
+            self.reply(number, None)
+        if self._stops and not self._stop:
+            packed = msgpack.packb({"command": "stop", "client": self._stops[0][0].name})
+            self._stop = self._ask(self._stops, self.epoch, packed, now, stop=True)
+            if self._stop:
+                self._stops = []
+        while self._waiting and len(self._asked) < _UNDER_WAY + bool(self._stop):
+            client, held = next(iter(self._waiting.items()))
+            request = held[0]
+            if request.epoch != self.epoch:
+                _refuse(client, request.envelope, PASSED)
+            elif now - request.came > _OLDEST:
+                _refuse(client, request.envelope, _OLD)
+            elif client.alive:
+                target = [(client, request.envelope)]
+                if not self._ask(target, request.epoch, request.packed, now):
+                    return
+            held.popleft()
+            self._count -= 1
+            del self._waiting[client]
+            if held:
+                self._waiting[client] = held  # behind all others
+
+    def _ask(
+        self,
+        targets: list[tuple[Client, Any]],
+        epoch: int,
+        packed: bytes,
+        now: float,
+        stop: bool = False,
+    ) -> int:
+        """The number that the request was given; 0 when there was no room."""
+        number = self._number
+        if not self._forward(stop, epoch, number, packed):
+            return 0
+        self._number = number % _NUMBERS + 1
+        self._asked[number] = (targets, now)
+        return number
+
+    def reply(self, number: int, reply: bytes | None) -> None:
+        """The loop's answer to request ``number``; None: none came."""
+        if number == self._stop:
+            self._stop = 0
+        targets, _ = self._asked.pop(number, ((), 0.0))
+        for client, envelope in targets:
+            if reply is not None:
+                client.answer(envelope, reply)
+
+    def begin_epoch(self, epoch: int) -> None:
+        """Refuse all that waits; what is read from now on carries its client's epoch."""
+        self.epoch = epoch
+        waiting, self._waiting, self._count = self._waiting, {}, 0
+        for client, held in waiting.items():
+            for request in held:
+                _refuse(client, request.envelope, PASSED)
+
+
+def _refuse(client: Client, envelope: Any, error: str) -> None:
+    client.answer(envelope, msgpack.packb({"ok": False, "error": error}))

@@ -1,0 +1,188 @@
+"""From settings to a running daemon: builds, connects and warms up everything, in the safe order.
+
+Sockets are bound before any hardware is touched, so that a second daemon ends without. Kernels
+are compiled and warm before the loop exists, and so before torque can be on.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.supervisor import Gateway
+from softfinger.daemon.loop.clock import LoopClock, make_clock
+from softfinger.daemon.loop.loop import EventSink, Loop
+from softfinger.daemon.loop.warm_up import Scene, warm_up
+from softfinger.daemon.perception.contact_filter import Prediction
+from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.profile.factory import FingerModel, make_material, make_table
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import make_servos
+from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.command_server import CommandServer
+from softfinger.daemon.wire.local_stop import LocalStop
+from softfinger.daemon.wire.messages import Facts
+from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.kinematics.contact.table import ContactTable
+
+if TYPE_CHECKING:
+    from softfinger.daemon.simulation.physics.hand import SimulatedHand
+
+
+class Daemon:
+    """A hand that is ready to run: ``with Daemon(settings) as daemon: loop.loop.run()``.
+
+    Raises SettingsError, AddressError (keys included), ServoError or TactileError when it can't be
+    made ready; whatever was opened until then is closed again.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        on_event: EventSink | None = None,
+        wire: bool = True,
+        table_cache: Path | None = None,
+    ) -> None:
+        self.settings = settings
+        self.clock: LoopClock = make_clock(settings)
+        self._closers: list[Callable[[], None]] = []
+        self.gateway: Gateway | None = None  # the process that serves clients
+        try:
+            self._assemble(on_event, wire, table_cache)
+        except BaseException:
+            self.close()
+            raise
+
+    def _assemble(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
+        settings = self.settings
+        publisher, server = self._bind() if wire else (None, None)
+        self.publisher = publisher
+        scene = Scene(settings, cache, on_event)
+        self.models = scene.models
+        warm_up(scene)
+        self.hand = self._make_hand(cache, on_event)
+        self.servos = make_servos(settings, self.clock, self.hand)
+        perceptions = self._make_perceptions()
+        self.prediction: Prediction | None = None
+        if perceptions and self.servos is not None:
+            self.prediction = Prediction(settings, self.tables)
+        if self.gateway is not None:
+            self.gateway.wait()  # a second daemon touches no hardware
+        if self.servos is not None:
+            self._connect(self.servos)
+        for perception in perceptions:
+            self._closers.append(perception.sensor.close)
+            perception.sensor.open()
+        self.loop = Loop(
+            settings,
+            self.clock,
+            self.servos,
+            perceptions,
+            self.prediction,
+            publisher,
+            server,
+            on_event,
+        )
+        self.loop.tell_truth(self.hand)
+        if publisher is not None:
+            publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
+
+    def _bind(self) -> tuple[Publisher, CommandServer]:
+        stream, commands = self.settings.stream, self.settings.commands
+        access = self.settings.access
+        gateway = self.gateway = Gateway(
+            Config(
+                stream.address,
+                commands.address,
+                TOPICS,
+                stream.queue,
+                commands.max_bytes,
+                commands.per_second,
+                int(access.ipc_mode, 8),
+                access.keys,
+            )
+        )
+        self._closers.append(gateway.close)
+        local = LocalStop(commands.address)
+        self._closers.append(local.close)
+        return Publisher(gateway.link), CommandServer(gateway.link, local)
+
+    def _make_hand(self, cache: Path | None, on_event: EventSink | None) -> SimulatedHand | None:
+        """The simulated hand, where a backend wants one.
+
+        Its tips are of the settings' material, whatever a calibration says of them.
+        """
+        settings = self.settings
+        if "simulated" not in (settings.servos.backend, settings.tactile.backend):
+            return None
+        from softfinger.daemon.simulation.physics.hand import SimulatedHand
+
+        table = next((each.table for each in self.models if not each.own_material), None)
+        if table is None:
+            table = make_table(settings, make_material(settings.material), cache, on_event)
+        return SimulatedHand(settings, self.clock.now(), table)
+
+    def _make_perceptions(self) -> list[FingerPerception]:
+        settings = self.settings
+        made = []
+        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+            sensor = make_sensor(settings, self.clock, self.hand, finger)
+            if sensor is not None:
+                made.append(FingerPerception(sensor, self.models[finger], settings))
+        return made
+
+    @property
+    def tables(self) -> tuple[ContactTable, ContactTable]:
+        """The contact tables of both tips; one and the same where their material is."""
+        return self.models[0].table, self.models[1].table
+
+    def _connect(self, servos: Servos) -> None:
+        self._closers.append(servos.close)
+        servos.connect()
+
+    def close(self) -> None:
+        """Torque off, then everything closed, last opened first. Never raises."""
+        while self._closers:
+            closer = self._closers.pop()
+            try:
+                closer()
+            except Exception as error:  # the others, torque off among them, must still run
+                logging.getLogger(__name__).error("closing: %s", error)
+
+    def __enter__(self) -> Daemon:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> Facts:
+    """What subscribers are told of this hand once: settings, calibrations, tables' certificates."""
+    calibrations = [
+        "" if model.calibration is None else model.calibration.model_dump_json() for model in models
+    ]
+    tables = [
+        json.dumps(
+            {
+                "form": model.table.form.name,
+                "tolerance": model.table.tolerance,
+                "certificate": model.table.certificate._asdict(),
+            }
+        )
+        for model in models
+    ]
+    return Facts(version("softfinger"), settings.model_dump_json(), *calibrations, *tables)

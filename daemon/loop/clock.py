@@ -1,0 +1,133 @@
+"""Whose time the hand lives in. The pipeline asks its clock and never the system itself."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+from softfinger.daemon.profile.settings import Settings
+
+
+class Clock(Protocol):
+    """Time for the pipeline, in seconds."""
+
+    def now(self) -> float:
+        """Monotonic time [s]."""
+
+    def wall(self) -> float:
+        """Unix time [s] that belongs to now."""
+
+    def sleep_until(self, t: float) -> float:
+        """Return at monotonic time ``t``, at once if that has passed: how late it woke up [s]."""
+
+
+class LoopClock(Clock, Protocol):
+    """What the loop asks beside: how much of the machine's own time things take."""
+
+    behind: float  # s that `now` has been kept back since the clock was made
+
+    def host(self) -> float:
+        """The machine's monotonic time [s], by which work and lateness are measured."""
+
+
+def make_clock(settings: Settings) -> LoopClock:
+    """The clock that ``loop.clock`` names."""
+    name = settings.loop.clock
+    if name == "auto":
+        name = "hand" if settings.simulated else "real"
+    if name == "virtual":
+        return VirtualClock()
+    real = RealClock(settings.realtime.spin)
+    return HandClock(real) if name == "hand" else real
+
+
+class RealClock:
+    """The machine's monotonic clock.
+
+    The last ``spin`` s before the end of a sleep are waited awake: the system's own wake-up takes
+    tens of microseconds, which the spin covers. That time is lost to others on the processor.
+    """
+
+    now = staticmethod(time.monotonic)
+    host = staticmethod(time.monotonic)
+    wall = staticmethod(time.time)
+    behind = 0.0
+
+    def __init__(self, spin: float = 0.0) -> None:
+        self._spin = spin
+
+    def sleep_until(self, t: float) -> float:
+        """Sleep; a signal handler may run meanwhile, and the sleep goes on after it."""
+        now = time.monotonic
+        delay = t - self._spin - now()
+        if delay > 0.0:
+            time.sleep(delay)
+        while (woke := now()) < t:
+            pass
+        return woke - t
+
+
+class HandClock:
+    """Time of a hand that is simulated in this process: the machine's, but it waits for it.
+
+    Time stands between two sleeps, and a sleep ends at its deadline to the bit however late the
+    machine wakes up. What that takes from the time to the next deadline is made up for; what goes
+    beyond never happens for the hand, and adds to ``behind``.
+    """
+
+    def __init__(self, machine: LoopClock) -> None:
+        self._machine = machine
+        self._now = machine.now()
+        self.behind = 0.0
+
+    def now(self) -> float:
+        """The hand's time [s]: the machine's less ``behind`` when the last sleep was to end."""
+        return self._now
+
+    def wall(self) -> float:
+        """The machine's Unix time [s]."""
+        return self._machine.wall()
+
+    def host(self) -> float:
+        """The machine's monotonic time [s]."""
+        return self._machine.host()
+
+    def sleep_until(self, t: float) -> float:
+        """Sleep until the machine has come to ``t``; a deadline that it has missed is now."""
+        self._now = max(t, self._now)
+        due = self._now + self.behind
+        missed = self._machine.now() - due
+        if missed <= 0.0:
+            return self._machine.sleep_until(due)
+        self.behind += missed
+        return 0.0
+
+
+class VirtualClock:
+    """Time that moves only when the loop waits for it, as fast as the machine can.
+
+    All its times start at ``start``, so that two runs with one seed are the same to the bit.
+    """
+
+    behind = 0.0
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
+
+    def now(self) -> float:
+        """Virtual time [s]."""
+        return self._now
+
+    def wall(self) -> float:
+        """Virtual time [s]: the virtual epoch is 1970."""
+        return self._now
+
+    def host(self) -> float:
+        """Virtual time [s]: whatever is done takes none."""
+        return self._now
+
+    def sleep_until(self, t: float) -> float:
+        """Move time to ``t`` unless it is there already; never late."""
+        if t > self._now:
+            self._now = t
+        return 0.0

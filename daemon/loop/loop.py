@@ -1,0 +1,371 @@
+"""The tick, and nothing else: read, feel, decide, bound, write, publish.
+
+The loop owns the order of the stages; the clock owns the time. Everything it calls has been built,
+connected and warmed up before (`loop.build`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from softfinger.daemon.control.modes import Command, Mode
+from softfinger.daemon.control.state_machine import Control
+from softfinger.daemon.control.task import Task, TaskOver
+from softfinger.daemon.loop.clock import LoopClock
+from softfinger.daemon.loop.lateness import Lateness
+from softfinger.daemon.loop.publishing import Broadcast
+from softfinger.daemon.loop.requests import Orders
+from softfinger.daemon.loop.timing import Statistics, record
+from softfinger.daemon.perception.contact_filter import Held, Prediction
+from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.safety import BUS, Safety
+from softfinger.daemon.safety.torque_state import Drive
+from softfinger.daemon.servos.base import ServoError, Servos
+from softfinger.daemon.types import FINGERS, Contact, State
+from softfinger.daemon.wire.command_server import Handler, Refused
+from softfinger.daemon.wire.messages import Truth
+from softfinger.daemon.wire.publisher import Publisher
+
+EventSink = Callable[[str, str, str], None]
+
+# Both in the machine's time, whose clients sent the commands.
+_STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
+
+
+class Commands(Protocol):
+    """Where commands come from: `wire.command_server.CommandServer`, or a recording."""
+
+    @property
+    def refused_by_pace(self) -> int:
+        """Commands refused because too many came."""
+
+    @property
+    def notices(self) -> deque[str]:
+        """What is to be told of the process that serves clients."""
+
+    def serve(self, handler: Handler) -> None:
+        """Carry out through ``handler`` what is due at this tick."""
+
+    def begin_epoch(self) -> None:
+        """Refuse all that has arrived until now, but for a stop."""
+
+
+class Loop:
+    """Runs the pipeline on a clock. All of it happens in the thread that calls `run`."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        clock: LoopClock,
+        servos: Servos | None,
+        perceptions: list[FingerPerception],
+        prediction: Prediction | None,
+        publisher: Publisher | None,
+        server: Commands | None,
+        on_event: EventSink | None = None,
+    ) -> None:
+        self.state = State(t=clock.now(), wall=clock.wall())
+        self.period = 1.0 / settings.loop.rate
+        self._settings = settings
+        self._clock = clock
+        self.perceptions = perceptions
+        self._prediction = prediction
+        self._held = Held() if prediction is None else prediction.held
+        self._publisher = publisher
+        self._server = server
+        self._on_event = on_event
+        self._control = Control(settings, servos is not None, bool(perceptions))
+        self._task = Task.named(settings)
+        self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
+        sensors = bool(perceptions)
+        self._safety = Safety(
+            settings, servos is not None, sensors, self._held, self._frames, perceptions
+        )
+        self._drive = Drive(
+            servos, settings.servos, self.state, self._safety, self._fail, self.emit
+        )
+        self._orders = Orders(
+            settings,
+            self.state,
+            self._control,
+            self._safety,
+            self._drive,
+            perceptions,
+            self.emit,
+            self._feel,
+            self._paced,
+        )
+        self._fault_after_opening = ("", "")  # name and reason
+        self.statistics = Statistics()
+        self._lateness = Lateness(settings, self.state.timing)
+        self._broadcast = None
+        if publisher is not None:
+            self._broadcast = Broadcast(settings, publisher, perceptions, self.statistics)
+        self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
+        self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
+        self._ending = False
+        self._stopping = False
+        self._began = -math.inf  # the present tick, in the machine's time
+        self._commanded = False  # a command was carried out at this tick, which may take long
+
+    @property
+    def servos(self) -> Servos | None:
+        """What is read and driven."""
+        return self._drive.servos
+
+    @servos.setter
+    def servos(self, servos: Servos | None) -> None:
+        self._drive.servos = servos
+
+    # What may be asked from outside the tick, a signal handler included
+
+    def end(self) -> None:
+        """Leave `run` after this tick, with torque off."""
+        self._ending = True
+
+    def stop(self) -> None:
+        """Turn torque off at the next tick, as the command does."""
+        self._stopping = True
+
+    def report(self, level: str, kind: str, text: str) -> None:
+        """Emit an event at the next tick; any thread may call it."""
+        self._reports.append((level, kind, text))
+
+    def tell_truth(self, truth: Truth | None) -> None:
+        """Publish what a simulated hand knows, too, to those who ask."""
+        if self._broadcast is not None:
+            self._broadcast.truth = truth
+
+    # Time
+
+    def run(self, duration: float | None = None) -> None:
+        """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
+        self.state.t = self._clock.now()
+        self.state.wall = self._clock.wall()
+        if self._server is not None:
+            self._server.begin_epoch()
+        self.emit("info", "start", "running, disarmed")
+        try:
+            self.advance(duration)
+        finally:
+            self._control.torque = False
+            self._drive.end()
+            if self.state.torque:
+                self.emit("error", "end", "ended, torque MAY STILL BE ON")
+            else:
+                self.emit("info", "end", "ended, torque off")
+
+    def advance(self, duration: float | None = None) -> None:
+        """Tick for ``duration`` s of the machine, or until `end`, and leave the hand as it is then.
+
+        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst:
+        real time has gone on meanwhile, a simulated hand's own has waited.
+        """
+        clock, timing = self._clock, self.state.timing
+        clock.sleep_until(clock.now())  # what went before is no lateness of a tick
+        before = clock.behind - timing.behind_s
+        deadline = clock.now()
+        last = clock.host() - self.period
+        finish = math.inf
+        if duration is not None:
+            finish = deadline + clock.behind + duration - 0.5 * self.period
+        while not self._ending and deadline + clock.behind < finish:
+            timing.wake_late_s = clock.sleep_until(deadline)
+            timing.behind_s = clock.behind - before
+            began = clock.host()
+            timing.tick_s = began - last
+            last = began
+            event = self._lateness.look(began, self._commanded)
+            if event is not None:
+                self.emit(*event)
+            self._commanded = False
+            if timing.tick_s > _STALL and self._server is not None:
+                self._server.begin_epoch()
+            done = self.tick(clock.now())
+            deadline += self.period
+            if done > deadline + clock.behind:
+                timing.overruns += 1
+            if (now := clock.now()) > deadline:
+                timing.late_in_row += 1
+                deadline = now
+            else:
+                timing.late_in_row = 0
+            if self.heartbeat is not None:
+                self.heartbeat(done)
+        clock.sleep_until(deadline)
+
+    # The tick
+
+    def tick(self, now: float) -> float:
+        """One pass of the pipeline at clock time ``now``; the machine's time at its end."""
+        state, clock, statistics = self.state, self._clock, self.statistics
+        began = self._began = clock.host()
+        state.seq += 1
+        state.t = now
+        state.wall = clock.wall()
+        self._read()
+        read = clock.host()
+        self._feel()
+        self._decide()
+        decided = clock.host()
+        self._drive.write(self._control.torque, now)
+        written = clock.host()
+        if self._broadcast is not None:
+            self._broadcast(state)
+        done = clock.host()
+        state.timing.compute_s = done - began
+        record(
+            statistics.counts,
+            statistics.largest,
+            state.timing.wake_late_s,
+            done - began,
+            (read - began) + (written - decided),
+            done - written,
+        )
+        return done
+
+    def _read(self) -> None:
+        state, reading = self.state, self.state.reading
+        state.read_error = state.write_error = ""
+        try:
+            self._drive.read(reading)
+        except ServoError as error:
+            reading.valid = False
+            state.read_error = str(error)
+            self._fail(str(error))
+        if reading.valid and self._prediction is not None:
+            self._prediction.advance(reading)
+
+    def _feel(self) -> None:
+        contacts, prediction = self.state.contacts, self._prediction
+        for perception in self.perceptions:
+            finger = perception.finger
+            if prediction is None:
+                perception.update(contacts[finger])
+            elif perception.update(self._frames[finger]):
+                prediction.correct(finger, self._frames[finger], contacts[finger])
+            if perception.tare_failed:
+                reason, perception.tare_failed = perception.tare_failed, ""
+                self.emit("warning", "tare", f"{FINGERS[finger]} sensor's zero stays: {reason}")
+        if prediction is not None:
+            prediction.fill(contacts, self.state.object)
+        self._safety.mark_stale(self.state)
+
+    def _decide(self) -> None:
+        state, control = self.state, self._control
+        control.observe(state.reading, state.contacts, state.object, self._held)
+        stopped, self._stopping = self._stopping, False
+        if stopped:
+            self._by_person({"command": "stop"})
+        if self._server is not None:
+            if stopped:
+                self._server.begin_epoch()
+            self._server.serve(self._by_person)
+            while self._server.notices:
+                self.emit("warning", "clients", self._server.notices.popleft())
+        if self._task is not None:
+            self._follow(self._task)
+        state.mode = control.mode
+        self._judge()
+        if self._safety.must_hold(state):
+            control.coast(state.goal)
+        else:
+            control.step(self.period, state.goal)
+        self._tell_events()
+        state.mode = control.mode
+
+    def _tell_events(self) -> None:
+        for event in self._control.events:
+            self.emit(*event)
+        self._control.events.clear()
+        while self._reports:
+            self.emit(*self._reports.popleft())
+
+    def _judge(self) -> None:
+        state, control, safety = self.state, self._control, self._safety
+        finding = safety.judge(state)
+        for warning in safety.warnings:
+            self.emit("warning", *warning)
+        safety.warnings.clear()
+        if not control.torque:
+            self._fault_after_opening = ("", "")
+            return
+        if finding is not None:
+            finding = finding._replace(text=self._with_cause(*finding))
+        if finding is not None and safety.opens_first(finding, state.mode):
+            self.emit("error", *finding)
+            self._fault_after_opening = finding
+            control.command(Command("release", {}, ""))
+        elif finding is not None:
+            self._fail(finding.text, finding.name)
+        elif self._fault_after_opening[0] and state.mode != Mode.RELEASING:
+            name, reason = self._fault_after_opening
+            self._fail(reason, name)
+
+    # Commands, events and faults
+
+    def command(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Carry out one request at the present tick. Raises Refused with the reason."""
+        try:
+            reply = self._orders.carry_out(request)
+        except Refused as refusal:
+            self._tell(request, str(refusal))
+            raise
+        self._tell(request, "")
+        self._commanded = self._commanded or request["command"] != "status"
+        return reply
+
+    def _tell(self, request: dict[str, Any], error: str) -> None:
+        if self._publisher is not None and request["command"] != "status":
+            state = self.state
+            self._publisher.command(state.wall, state.t, state.seq, request, error)
+
+    def _paced(self) -> int:
+        return 0 if self._server is None else self._server.refused_by_pace
+
+    def _by_person(self, request: dict[str, Any]) -> dict[str, Any]:
+        reply = self.command(request)
+        if self._task is not None and request["command"] != "status":
+            self._end_task(f"ended by the command {request['command']}")
+        return reply
+
+    def _follow(self, task: Task) -> None:
+        """Carry out what the task says is due; one that can't go on ends, or begins again."""
+        try:
+            request = task.next(self.state, self.period)
+            if request is not None:
+                self.command(request)
+        except (TaskOver, Refused) as reason:
+            if task.lasting:
+                self.emit("warning", "task", task.begin_again(self.state, str(reason)))
+            else:
+                self._end_task(str(reason))
+
+    def _end_task(self, reason: str) -> None:
+        self._task = None
+        self.emit("warning", "task", f"task over: {reason}")
+
+    def emit(self, level: str, kind: str, text: str) -> None:
+        """Publish an event and hand it to the log."""
+        if self._publisher is not None:
+            self._publisher.event(self.state.wall, self.state.t, level, kind, text)
+        if self._on_event is not None:
+            self._on_event(level, kind, text)
+
+    def _with_cause(self, name: str, text: str) -> str:
+        # A command may keep the bus busy for long by itself.
+        at_work = 0.0 if self._commanded else self._clock.host() - self._began
+        return self._lateness.with_cause(name, text, at_work)
+
+    def _fail(self, reason: str, name: str = BUS) -> None:
+        if not self.state.fault:
+            if name == BUS:
+                reason = self._with_cause(name, reason)
+            self.state.fault, self.state.fault_name = reason, name
+            self._control.fail(reason, name)
+            self._tell_events()
+            self.state.mode = self._control.mode

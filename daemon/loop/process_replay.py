@@ -1,0 +1,197 @@
+"""The loop run again on what it took in: recorded readings, frames and commands, tick by tick.
+
+Servos, sensors, clock and commands here say what the recording says; estimator, tables, prediction,
+control and limits are today's. Whoever gives it all inputs from the first tick on, with the same
+code and settings, gets the same states to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from softfinger.daemon.loop.loop import Loop
+from softfinger.daemon.perception.contact_filter import Prediction
+from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.profile.factory import make_models
+from softfinger.daemon.profile.settings import Settings, Task
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.tactile.given import GivenFrames
+from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
+from softfinger.daemon.wire.command_server import Handler, Refused
+
+
+class Recomputation:
+    """A loop that is fed. ``calibrations`` are the recorded ones as JSON, empty where none was."""
+
+    def __init__(
+        self, settings: Settings, calibrations: Sequence[str], cache: Path | None = None
+    ) -> None:
+        """Raises SettingsError or TactileError when settings and calibrations don't fit."""
+        with tempfile.TemporaryDirectory() as folder:
+            settings = with_calibrations(settings, calibrations, Path(folder))
+            models = make_models(settings, cache)
+        settings = settings.model_copy(update={"task": Task()})  # its commands are recorded
+        self._clock = _Clock()
+        self._commands = _Commands()
+        self._servos = _Servos() if settings.servos.backend != "none" else None
+        self._sensors: dict[int, GivenFrames] = {}
+        perceptions = []
+        if settings.tactile.backend != "none":
+            for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+                sensor = self._sensors[finger] = GivenFrames()
+                perceptions.append(FingerPerception(sensor, models[finger], settings))
+        prediction = None
+        if perceptions and self._servos is not None:
+            prediction = Prediction(settings, (models[0].table, models[1].table))
+        self._loop = Loop(
+            settings,
+            self._clock,
+            self._servos,
+            perceptions,
+            prediction,
+            None,
+            self._commands,
+        )
+
+    @property
+    def fingers(self) -> tuple[int, ...]:
+        """The fingers whose frames are wanted."""
+        return tuple(self._sensors)
+
+    def tick(
+        self,
+        taken: Mapping[str, Any],
+        frames: Mapping[int, Frame],
+        commands: Sequence[dict[str, Any]],
+    ) -> State:
+        """The state after one tick: its ``hand/input``, new frames by finger, its commands.
+
+        The state is the loop's own, and changes with the next call.
+        """
+        loop = self._loop
+        self._clock.t, self._clock.unix = taken["t"], taken["timestamp"]
+        for finger, frame in frames.items():
+            self._sensors[finger].frame = frame
+        if self._servos is not None:
+            self._servos.taken = taken
+        self._commands.waiting = list(commands)
+        loop.state.seq = taken["seq"] - 1
+        loop.state.timing.late_in_row = taken["late_in_row"]
+        loop.state.timing.busy_s = taken["busy_s"]
+        loop.tick(taken["t"])
+        return loop.state
+
+
+def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
+    """Settings whose calibrations are files in ``folder``, made of these texts of JSON."""
+    files = ["", ""]
+    for finger, text in enumerate(calibrations):
+        if text:
+            path = folder / f"{FINGERS[finger]}.json"
+            path.write_text(text, encoding="utf-8")
+            files[finger] = str(path)
+    tactile = settings.tactile.model_copy(update={"calibration": (files[0], files[1])})
+    return settings.model_copy(update={"tactile": tactile})
+
+
+class _Clock:
+    """The recorded time."""
+
+    behind = 0.0
+
+    def __init__(self) -> None:
+        self.t = 0.0
+        self.unix = 0.0
+
+    def now(self) -> float:
+        return self.t
+
+    def wall(self) -> float:
+        return self.unix
+
+    def host(self) -> float:
+        return self.t
+
+    def sleep_until(self, t: float) -> float:
+        self.t = t
+        return 0.0
+
+
+class _Servos:
+    """The recorded readings; what is written goes nowhere, and fails where it failed."""
+
+    def __init__(self) -> None:
+        self.taken: Mapping[str, Any] = {}
+
+    def connect(self) -> None:
+        pass
+
+    def read(self, reading: Reading) -> None:
+        taken = self.taken
+        said = taken["reading"]
+        reading.seq = said["seq"]
+        reading.t = said["t"] if said["t"] is not None else -math.inf
+        reading.valid = said["valid"]
+        reading.alert = said["alert"]
+        reading.lost = said.get("lost", 0)
+        reading.frozen = said.get("frozen", 0)
+        for finger, name in enumerate(FINGERS):
+            part = taken[name]
+            reading.q[finger] = part["q"]
+            reading.dq[finger] = part["dq"]
+            reading.current[finger] = part["current"]
+            reading.hardware[finger] = part["hardware"]
+            reading.temperature[finger] = part["temperature"]
+            reading.voltage[finger] = part["voltage"]
+        if said["error"]:
+            raise ServoError(said["error"])
+
+    def torque_on(self) -> None:
+        self._fail_as_recorded()
+
+    def torque_off(self, reading: Reading) -> bool:
+        self.read(reading)
+        confirmed: bool = self.taken.get("torque_off", not self.taken["write_error"])
+        return confirmed
+
+    def write(self, goal: Goal) -> None:
+        self._fail_as_recorded()
+
+    def _fail_as_recorded(self) -> None:
+        if self.taken["write_error"]:
+            raise ServoError(self.taken["write_error"])
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+class _Commands:
+    """The commands of a tick, in the place of the command server."""
+
+    refused_by_pace = 0
+
+    def __init__(self) -> None:
+        self.waiting: list[dict[str, Any]] = []
+        self.notices: deque[str] = deque()
+
+    def serve(self, handler: Handler) -> None:
+        for request in self.waiting:
+            try:
+                handler(request)
+            except Refused:
+                pass  # it was carried out when it was recorded: the states will differ and be told
+        self.waiting = []
+
+    def begin_epoch(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass

@@ -1,0 +1,197 @@
+"""The kernels that a scene needs, by parts of the pipeline: run once, so that no tick compiles any.
+
+`loop.build` runs every part before there is a loop, and so before torque can be on. Where a
+part was never compiled, `processes.kernel_build` runs it before in a process of its own. A part
+builds what it needs, runs it on a made-up contact, and throws it away; what a scene lacks has no
+part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from softfinger.daemon.perception.calibration_file import Converter, calibration_for
+from softfinger.daemon.profile.factory import (
+    FingerModel,
+    make_estimator,
+    make_material,
+    make_models,
+)
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS, Contact, ObjectPose, Reading
+from softfinger.kinematics.compiled.kernel_cache import kernel_folder
+from softfinger.kinematics.hand.grasp_state import total_tilt
+
+
+class Scene:
+    """A scene whose kernels are wanted; ``cache`` is where contact tables are kept.
+
+    What is wrong with a kept table is told to ``on_event``.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        cache: Path | None,
+        on_event: Callable[[str, str, str], None] | None = None,
+    ) -> None:
+        self.settings = settings
+        self._cache = cache
+        self._on_event = on_event
+
+    @cached_property
+    def models(self) -> tuple[FingerModel, FingerModel]:
+        """Both fingers' models, their contact tables built or loaded."""
+        return make_models(self.settings, self._cache, self._on_event)
+
+    @property
+    def sensing(self) -> list[int]:
+        """The fingers with a sensor."""
+        if self.settings.tactile.backend == "none":
+            return []
+        return sorted(FINGERS.index(name) for name in self.settings.scene.fingers)
+
+
+class Part(NamedTuple):
+    """One part of the pipeline and its kernels."""
+
+    name: str
+    kernels: int  # that it compiles, about: for a progress bar
+    run: Callable[[Scene], None]
+    after: str = ""  # the part whose result it needs, if that is to be built as well
+
+
+def parts(settings: Settings) -> list[Part]:
+    """What ``settings`` has kernels for, in the order in which two processes best share them.
+
+    One has the estimator, the longest; the other the contact table and then what looks up in it,
+    whose kernels it has compiled in part by then.
+    """
+    simulated = "simulated" in (settings.servos.backend, settings.tactile.backend)
+    found = [_TABLE]
+    if settings.tactile.backend != "none":
+        found.append(_ESTIMATOR)
+    if simulated:
+        found.append(_HAND)
+    if settings.servos.backend != "none":
+        found.append(_CONTROL)
+    if settings.tactile.backend == "simulated":
+        found.append(_SENSOR)
+    return found
+
+
+def named(name: str) -> Part:
+    """A part by its name. Raises KeyError when there is none."""
+    return {each.name: each for each in ALL}[name]
+
+
+def is_built(part: Part) -> bool:
+    """Whether ``part`` was compiled from the present sources and is kept."""
+    folder = kernel_folder()
+    return folder is not None and _mark(folder, part).exists()
+
+
+def mark_built(part: Part) -> None:
+    """``part`` was compiled and is kept, where anything can be."""
+    folder = kernel_folder()
+    if folder is not None:
+        _mark(folder, part).touch()
+
+
+def _mark(folder: Path, part: Part) -> Path:
+    return folder / f"{part.name.replace(' ', '-')}.built"
+
+
+def warm_up(scene: Scene) -> None:
+    """Run every part of ``scene``. Raises as `profile.factory` for settings that can't be met."""
+    for part in parts(scene.settings):
+        part.run(scene)
+        mark_built(part)
+
+
+def _table(scene: Scene) -> None:
+    radius = scene.settings.tip.radius
+    for model in scene.models:
+        model.table(0.2 * radius, 0.1)
+
+
+def _estimator(scene: Scene) -> None:
+    settings = scene.settings
+    rows, cols = settings.tactile.rows, settings.tactile.cols
+    y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : cols * 1j]
+    counts = np.clip(3e3 - 3e4 * (x**2 + y**2), 0, settings.tactile.full_count).astype(np.uint16)
+    law = make_material(settings.material)
+    for finger in scene.sensing:
+        calibration = calibration_for(settings, finger)
+        if calibration is not None:
+            Converter(calibration, settings.tactile.pascal_per_count)
+        estimator = make_estimator(settings, law, finger, None, calibration)
+        estimator.update(counts, settings.tactile.pascal_per_count)
+        total_tilt(0.1, 0.1)
+
+
+def _hand(scene: Scene) -> None:
+    from softfinger.daemon.simulation.physics.hand import SimulatedHand
+
+    SimulatedHand(scene.settings, 0.0, scene.models[0].table)
+
+
+def _sensor(scene: Scene) -> None:
+    from softfinger.daemon.tactile.simulated import make_sensor_model
+
+    if not scene.sensing:
+        return
+    settings = scene.settings
+    model, depth = make_sensor_model(settings, scene.sensing[0]), 0.1 * settings.tip.radius
+    counts = np.empty((settings.tactile.rows, settings.tactile.cols), np.uint16)
+    model.frame(depth, 0.1, 0.0, counts)
+    if settings.simulation.object_shape == "disc":
+        model.frame(depth, 0.1, 0.0, counts, bend=1.0 / settings.simulation.object_radius)
+
+
+def _control(scene: Scene) -> None:
+    from softfinger.daemon.control.grip import Grip
+    from softfinger.daemon.loop.timing import Statistics
+    from softfinger.daemon.perception.contact_filter import Prediction
+
+    settings, fingers = scene.settings, scene.sensing
+    Statistics()
+    if not fingers:
+        return
+    left, right = scene.models
+    prediction = Prediction(settings, (left.table, right.table))
+    contacts, pose, reading = [Contact(), Contact()], ObjectPose(), Reading()
+    for k in (1, 2):
+        prediction.advance(Reading(t=0.01 * k))
+        for finger in fingers:
+            touch = Contact(valid=True, contact=True, d=1e-3, force=1.0, d_std=1e-5)
+            prediction.correct(finger, touch, contacts[finger])
+        prediction.fill(contacts, pose)
+    grip = Grip(settings, fingers)
+    grip.start(prediction.held, 1.0, 2.0)
+    grip.steer(0.0, 0.1)
+    grip.torques(reading, contacts, pose, prediction.held)
+    grip.coast(reading, prediction.held)
+    if len(fingers) == len(FINGERS):
+        grip.angles(contacts, pose, prediction.held)
+
+
+def _many(scene: Scene) -> None:
+    scene.models[0].table(np.zeros(2), np.zeros(2))
+
+
+_TABLE = Part("contact table", 31, _table)
+_ESTIMATOR = Part("estimator", 69, _estimator)
+_HAND = Part("simulated hand", 57, _hand, after=_TABLE.name)
+_SENSOR = Part("simulated sensor", 16, _sensor)
+_CONTROL = Part("filter and grip", 38, _control, after=_TABLE.name)
+_MANY = Part("lookup of many points", 2, _many, after=_TABLE.name)
+ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _CONTROL, _MANY)
+EMULATED = (_TABLE, _HAND, _SENSOR)  # what the stand-in hand needs
+LANDSCAPE = (_TABLE, _MANY)  # what a picture of the energy needs
+FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # what frames are analysed with

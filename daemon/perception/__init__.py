@@ -1,0 +1,1 @@
+"""From tactile frames to contacts: calibration, estimate, and the filter between frames."""

@@ -1,0 +1,333 @@
+"""The calibration file of one sensor: reading, checking whose it is, writing, applying.
+
+One JSON file a sensor, written whole or not at all. A step that was not done yet is null, and the
+settings' value stands for it. What the numbers mean is in `sensing.calibration`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from softfinger.daemon.profile.settings import Finite, Positive, Settings
+from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.wire.own_files import write_text
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
+
+FloatArray = NDArray[np.float64]
+_NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+_STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
+_PITCH = 1e-9  # m within which pitches are equal
+_MONOTONE_POINTS = 257
+_TABLE_STEPS = 8192  # of a curve's table: 64 KB
+_FAULTY = 0.2  # of the usual end: a cell whose range is less rests all but full
+
+
+class CalibrationFileError(TactileError):
+    """The file can't be used, or belongs to another sensor. The message says why."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Sensor(_Part):
+    """Which sensor it is: under which finger, its label or serial number, and its grid."""
+
+    finger: Literal["left", "right"]
+    label: str
+    rows: Annotated[int, Field(ge=1, le=256)]
+    cols: Annotated[int, Field(ge=1, le=256)]
+    pitch: tuple[Positive, Positive]  # x, y [m]
+    full_count: Annotated[int, Field(ge=1, le=65535)]
+
+
+class TareStep(_Part):
+    """Mean count of each unloaded cell, and their typical standard deviation [counts]."""
+
+    date: str
+    zero: list[list[Finite]]
+    noise: Finite
+    frames: int
+
+
+class EquilibrateStep(_Part):
+    """Gain of each cell, 0 for a dead one; relative spread before and after."""
+
+    date: str
+    gain: list[list[Finite]]
+    dead: int
+    spread: Finite
+    residual: Finite
+
+
+class CurveStep(_Part):
+    """(exponent, c_1, c_2, c_3) as for sensing.counts.to_pressure; relative residual."""
+
+    date: str
+    kind: Literal["power", "cubic"]
+    coefficients: tuple[Positive, Finite, Finite, Finite]
+    residual: Finite
+
+
+class CentreStep(_Part):
+    """Tip's centre on the sensor [m]; rotation [rad], null where it was not measured."""
+
+    date: str
+    centre: tuple[Finite, Finite]
+    rotation: Finite | None
+    scale: Finite
+    residual: Finite
+
+
+class ModulusStep(_Part):
+    """Modulus [Pa], or the points of a law: strain and stress [Pa]; relative residual for E."""
+
+    date: str
+    modulus: Positive
+    strain: list[Finite] = []
+    stress: list[Finite] = []
+    offset: Finite
+    residual: Finite
+
+    def material(self) -> Material:
+        """The tip's law. Raises ValueError for points that make none."""
+        if self.strain:
+            return Material.from_points(self.strain, self.stress)
+        return Material.constant(self.modulus)
+
+
+class Calibration(_Part):
+    """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``."""
+
+    format: Literal[1] = 1
+    sensor: Sensor
+    date: str
+    tare: TareStep | None = None
+    equilibrate: EquilibrateStep | None = None
+    curve: CurveStep | None = None
+    centre: CentreStep | None = None
+    modulus: ModulusStep | None = None
+
+    @property
+    def identity(self) -> str:
+        """Whose and of when: the sensor's name, its finger without one, and the file's date."""
+        return f"{self.sensor.label or self.sensor.finger} {self.date}"
+
+    def summary(self) -> str:
+        """Whose, of when, and which steps were done, in one line."""
+        steps = [name for name in _STEPS if getattr(self, name) is not None]
+        return f"{self.identity}: {', '.join(steps) or 'no step'}"
+
+
+def now() -> str:
+    """The present date and time as the file has it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def sensor_of(settings: Settings, finger: int) -> Sensor:
+    """Which sensor the settings put under ``finger``; a USB port's serial number if none is set."""
+    tactile = settings.tactile
+    return Sensor(
+        finger=_NAMES[finger],
+        label=tactile.sensor[finger] or _usb_serial(settings, finger),
+        rows=tactile.rows,
+        cols=tactile.cols,
+        pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
+        full_count=tactile.full_count,
+    )
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read and check a file. Raises CalibrationFileError."""
+    try:
+        calibration = Calibration.model_validate_json(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise CalibrationFileError(f"{path}: can't be read: {reason}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise CalibrationFileError(
+            f"{path}: no calibration of this version: {where}: {first['msg']}"
+        ) from None
+    wrong = _contradiction(calibration)
+    if wrong:
+        raise CalibrationFileError(f"{path}: {wrong}")
+    return calibration
+
+
+def calibration_for(settings: Settings, finger: int) -> Calibration | None:
+    """The settings' calibration of one finger's sensor, None where they name none.
+
+    Raises CalibrationFileError when it can't be read or is another sensor's.
+    """
+    name = settings.tactile.calibration[finger]
+    if not name:
+        return None
+    calibration = load_calibration(Path(name))
+    wrong = difference(calibration.sensor, sensor_of(settings, finger))
+    if wrong:
+        raise CalibrationFileError(f"{name}: this is the calibration of another sensor: {wrong}")
+    return calibration
+
+
+def difference(file: Sensor, there: Sensor) -> str:
+    """What tells the file's sensor from the one that is there; empty when they are one."""
+    pairs = [
+        ("finger", file.finger, there.finger),
+        ("sensor", file.label or "no name", there.label or "no name"),
+        ("grid", f"{file.rows} × {file.cols}", f"{there.rows} × {there.cols}"),
+        ("full_count", str(file.full_count), str(there.full_count)),
+    ]
+    if max(abs(a - b) for a, b in zip(file.pitch, there.pitch, strict=True)) > _PITCH:
+        pairs.append(("pitch", _millimetres(file.pitch), _millimetres(there.pitch)))
+    return ", ".join(
+        f"{name} {theirs}, here {ours}" for name, theirs, ours in pairs if theirs != ours
+    )
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Write the file whole, or leave the one that is there. Raises CalibrationFileError."""
+    text = json.dumps(calibration.model_dump(mode="json"), ensure_ascii=False) + "\n"
+    temporary = path.with_name(path.name + ".new")
+    try:
+        with write_text(temporary) as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise CalibrationFileError(f"{path}: can't be written: {error.strerror}") from None
+
+
+class Converter:
+    """Counts → Pa of one sensor, into one array that is used again."""
+
+    def __init__(self, calibration: Calibration, pascal_per_count: float) -> None:
+        """``pascal_per_count`` stands for a curve that was not measured."""
+        sensor = calibration.sensor
+        shape = (sensor.rows, sensor.cols)
+        tare, gain, curve = calibration.tare, calibration.equilibrate, calibration.curve
+        self.zero: FloatArray = np.array(tare.zero) if tare else np.zeros(shape)
+        self._gain: FloatArray = np.array(gain.gain) if gain else np.ones(shape)
+        self._curve = np.array(curve.coefficients if curve else (1.0, pascal_per_count, 0.0, 0.0))
+        self._out = np.zeros(shape)
+        self._full = sensor.full_count
+        self._table, self._per_step = self._tabulated(float(self._gain.max()) * sensor.full_count)
+        self.live: NDArray[np.bool_] = self._gain > 0.0
+        self(np.zeros(shape, np.uint16))  # compiled here, not in the loop
+
+    def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
+        """Pressure [Pa] of counts [rows, cols]; the array is valid until the next call."""
+        if self._table is None:
+            to_pressure(counts, self.zero, self._gain, self._curve, self._out)
+        else:
+            look_up_pressure(counts, self.zero, self._gain, self._table, self._per_step, self._out)
+        return self._out
+
+    def _tabulated(self, largest: float) -> tuple[FloatArray | None, float]:
+        """A power's table up to x = ``largest`` and its steps a count; None for a polynomial."""
+        exponent, factor = float(self._curve[0]), float(self._curve[1])
+        if exponent == 1.0:
+            return None, 1.0
+        step = max(self._full / _TABLE_STEPS, 1.0)
+        x = step * np.arange(int(largest / step) + 2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            table = np.asarray(factor * x**exponent, np.float64)
+        if not np.isfinite(table).all():
+            raise CalibrationFileError(
+                f"calibration: its curve {factor:g}·x^{exponent:g} has no number of Pa for "
+                f"x = {largest:g}"
+            )
+        return table, 1.0 / step
+
+    def readings(self, counts: FloatArray) -> FloatArray:
+        """x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
+        return np.asarray(np.maximum(counts - self.zero, 0.0) * self._gain)
+
+    def at(self, count: int) -> FloatArray:
+        """Pressure [Pa] of each cell when it reads ``count``, fresh."""
+        return self(np.full(self._out.shape, count, np.uint16)).copy()
+
+    @property
+    def saturation(self) -> float:
+        """The least pressure [Pa] at which a live cell is full, see :func:`least_end`."""
+        pressure = self.at(self._full)[self.live]
+        return least_end(pressure) if pressure.size else np.inf
+
+    @property
+    def largest(self) -> float:
+        """The greatest pressure [Pa] that any cell can read."""
+        return float(self.at(self._full).max())
+
+    @property
+    def quantum(self) -> float:
+        """A count's typical width [Pa]: the mean slope of the curve."""
+        return self.saturation / self._full
+
+
+def least_end(ends: FloatArray) -> float:
+    """The least of the readings at which cells are full, each over its own zero.
+
+    But for a cell that reads all but full where nothing presses: it would make all others full.
+    """
+    return float(ends[ends >= _FAULTY * np.median(ends)].min())
+
+
+def _contradiction(calibration: Calibration) -> str:
+    """What can't be in a file whose single values are all right; empty when nothing."""
+    sensor = calibration.sensor
+    shape = (sensor.rows, sensor.cols)
+    tables = []
+    if calibration.tare:
+        tables.append(("tare.zero", calibration.tare.zero))
+    if calibration.equilibrate:
+        tables.append(("equilibrate.gain", calibration.equilibrate.gain))
+    for name, rows in tables:
+        if len(rows) != sensor.rows or any(len(row) != sensor.cols for row in rows):
+            return f"{name}: expected {shape[0]} rows of {shape[1]} numbers"
+        if min(min(row) for row in rows) < 0.0:
+            return f"{name}: expected no number below 0"
+    if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
+        return "equilibrate.gain: every cell is dead"
+    if calibration.curve:
+        converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
+        points = min(_MONOTONE_POINTS, sensor.full_count + 1)
+        steps = np.linspace(0, sensor.full_count, points).astype(int)
+        pressures = [float(converter.at(int(count)).max()) for count in steps]
+        if not np.isfinite(pressures).all() or (np.diff(pressures) <= 0.0).any():
+            return "curve.coefficients: the pressure doesn't rise with the count"
+    if calibration.modulus:
+        try:
+            calibration.modulus.material()
+        except ValueError as error:
+            return f"modulus: {error}"
+    return ""
+
+
+def _usb_serial(settings: Settings, finger: int) -> str:
+    """The serial number of the USB adapter at the finger's port; empty where there is none."""
+    tactile = settings.tactile
+    if tactile.backend in ("simulated", "replay", "none"):
+        return ""
+    from serial.tools.list_ports import comports
+
+    wanted = os.path.realpath(tactile.port[finger])
+    for port in comports():
+        if os.path.realpath(port.device) == wanted:
+            return port.serial_number or ""
+    return ""
+
+
+def _millimetres(pitch: tuple[float, float]) -> str:
+    return f"{pitch[0] * 1e3:.4g} × {pitch[1] * 1e3:.4g} mm"

@@ -1,0 +1,148 @@
+"""Profiles: a TOML file in, validated `Settings` out, or one report with everything that is wrong.
+
+Holds the reading and the report's words. What the keys allow one by one stands in
+`profile.settings`, what they don't allow together in `profile.validation`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.profile.validation import contradictions, shown
+
+_DEEPEST = 8  # tables and arrays in each other
+_EXPECTED = (
+    ("Input should ", ""),
+    ("Tuple should have ", ""),
+    ("be ", ""),
+    (" after validation", ""),
+    ("a valid tuple", "an array"),
+    ("a valid integer", "a whole number"),
+    ("a valid ", "a "),
+)
+
+
+def load(
+    path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
+) -> Settings:
+    """Read and check a profile; None gives the built-in simulated hand.
+
+    ``directory`` replaces ``{dir}`` in the ports. ``changes``, as ``loop.rate=1000``, go over the
+    file. Raises SettingsError with one line for every unknown key, wrong type, broken bound and
+    contradiction.
+    """
+    name = str(path) if path else "built-in settings"
+    data = _read(path, name) if path else {}
+    changed = {_change(data, change) for change in changes}
+    wrong: set[str] = set()
+    problems: list[str] = []
+    try:
+        settings = Settings.model_validate(data)
+    except ValidationError as error:
+        settings, wrong = _sound_sections(data)
+        problems = [_line(details) for details in error.errors()]
+    problems += contradictions(settings, directory, wrong)
+    if problems:
+        raise SettingsError(
+            "\n".join(
+                f"{'--set' if problem.split(':')[0] in changed else name}: {problem}"
+                for problem in problems
+            )
+        )
+    return settings if directory is None else _with_directory(settings, directory)
+
+
+def _read(path: Path, name: str) -> dict[str, Any]:
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return {key: _tuples(item) for key, item in raw.items()}
+    except OSError as error:
+        raise SettingsError(f"{name}: can't be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
+    except RecursionError:
+        raise SettingsError(f"{name}: nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits another
+        raise SettingsError(f"{name}: not TOML: {error}") from None
+
+
+def _change(data: dict[str, Any], change: str) -> str:
+    """Put one ``section.key=value`` into ``data`` and return its key. Raises SettingsError."""
+    key, equals, text = change.partition("=")
+    section, dot, inner = key.strip().partition(".")
+    if not (equals and dot and section and inner):
+        raise SettingsError(f"--set: found {change!r}, expected section.key=value")
+    try:
+        value = _tuples(tomllib.loads(f"value = {text}")["value"])
+    except (ValueError, RecursionError):
+        value = text.strip()  # a text needs no quotes of its own: the shell has taken them
+    held = data.setdefault(section, {})
+    if isinstance(held, dict):
+        held[inner] = value
+    return f"{section}.{inner}"
+
+
+def _tuples(value: Any, depth: int = 0) -> Any:
+    """Lists as tuples, tables as they are. Raises RecursionError beyond any profile's depth."""
+    if depth > _DEEPEST:
+        raise RecursionError
+    if isinstance(value, dict):
+        return {key: _tuples(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_tuples(item, depth + 1) for item in value)
+    return value
+
+
+def _sound_sections(data: dict[str, Any]) -> tuple[Settings, set[str]]:
+    """Settings of those sections that hold good, and the names of the others."""
+    sound: dict[str, Any] = {}
+    wrong = set()
+    for name, field in Settings.model_fields.items():
+        try:
+            sound[name] = type(field.default).model_validate(data.get(name, {}))
+        except ValidationError:
+            wrong.add(name)
+    return Settings(**sound), wrong
+
+
+def _line(details: ErrorDetails) -> str:
+    location = [str(part) for part in details["loc"]]
+    key = shown(".".join(location))[1:-1]
+    if details["type"] == "extra_forbidden":
+        known = _known_keys(location[:-1])
+        near = difflib.get_close_matches(location[-1][:80], known, n=1, cutoff=0.0)
+        return f"{key}: found an unknown key, expected a known one; nearest: {near[0]}"
+    if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{key}: found {shown(details['input'])}, expected a table"
+    expected = details["msg"]
+    for old, new in _EXPECTED:
+        expected = expected.replace(old, new, 1)
+    return f"{key}: found {shown(details['input'])}, expected {expected}"
+
+
+def _known_keys(location: list[str]) -> list[str]:
+    model: type[BaseModel] = Settings
+    for part in location:
+        inner = model.model_fields[part].annotation
+        assert isinstance(inner, type)
+        assert issubclass(inner, BaseModel)
+        model = inner
+    return list(model.model_fields)
+
+
+def _with_directory(settings: Settings, directory: Path) -> Settings:
+    def filled(port: str) -> str:
+        return port.replace("{dir}", str(directory))
+
+    left, right = settings.tactile.port
+    servos = settings.servos.model_copy(update={"port": filled(settings.servos.port)})
+    tactile = settings.tactile.model_copy(update={"port": (filled(left), filled(right))})
+    return settings.model_copy(update={"servos": servos, "tactile": tactile})

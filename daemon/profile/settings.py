@@ -1,0 +1,360 @@
+"""Settings: the sections of a profile, with their defaults, bounds and units.
+
+Nothing here acts on them; `profile.load` reads and checks a file. The defaults alone are the
+built-in simulated hand; ``config/sim.toml`` spells them out. Lengths are m, angles rad, currents A,
+rates Hz; pairs are (left, right).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+# Every number has an end on both sides: what no hand has is a slip of the pen, and must not reach
+# an integral. Bounds are closed or open as the quantity is.
+Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+Length = Annotated[float, Field(ge=1e-4, le=10, allow_inf_nan=False)]  # m
+Place = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]  # m
+Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]  # rad
+Seconds = Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)]
+Delay = Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]  # s
+Rate = Annotated[float, Field(ge=0.1, le=10_000, allow_inf_nan=False)]  # Hz
+Acceleration = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]  # m/s²
+Factor = Annotated[float, Field(ge=1e-5, le=1e5, allow_inf_nan=False)]
+Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
+Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Finger = Literal["left", "right"]
+FINGER_NAMES = ("left", "right")
+Index = Annotated[int, Field(ge=0, le=255)]
+Cells = tuple[tuple[Index, Index], ...]
+ServoMode = Literal["current-based position", "current", "position"]
+
+
+SIMULATED = ("simulated", "replay", "none")  # backends behind which there is no metal
+
+
+def _known(name: str) -> str:
+    from softfinger.daemon.servos.models import MODELS, by_name
+
+    try:
+        by_name(name)
+    except KeyError:
+        known = ", ".join(MODELS)
+        raise PydanticCustomError("servo_model", "one of {known}", {"known": known}) from None
+    return name
+
+
+Model = Annotated[str, AfterValidator(_known)]  # of a servo
+
+
+class SettingsError(Exception):
+    """The settings can't be used. The message lists every error: file, key, found, expected."""
+
+
+class Section(BaseModel):
+    """What all sections share: unknown keys are errors, values are not converted, nothing changes.
+
+    A whole number is accepted where a float is asked for; a string never is.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class Scene(Section):
+    """What takes part. A backend set to ``none`` takes the servos or the sensors out."""
+
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, max_length=2)] = ("left", "right")
+    object_model: bool = True  # estimate the object's angle and width from the two contacts
+
+
+class Hand(Section):
+    """Two rotational fingers in a plane: pivots at (∓pivot_separation/2, 0), q > 0 closes."""
+
+    pivot_separation: Length = 0.100
+    finger_length: Length = 0.080
+    finger_offset: Place = 0.0
+    q_min: tuple[Angle, Angle] = (-0.5, -0.5)
+    q_max: tuple[Angle, Angle] = (1.0, 1.0)
+    open_angle: tuple[Angle, Angle] = (0.0, 0.0)  # where release goes
+
+
+class Tip(Section):
+    """The soft hemispherical fingertip."""
+
+    radius: Length = 0.020
+
+
+class MaterialLaw(Section):
+    """Stress-strain law of the tip: the paper's Table I, a constant modulus, or measured points."""
+
+    law: Literal["table_i", "constant", "points"] = "table_i"
+    modulus: Modulus = 0.304e6  # Pa, for law = "constant"
+    strain: tuple[Finite, ...] = ()  # for law = "points"
+    stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
+
+
+class Table(Section):
+    """The contact table: largest relative error of force, energy and their partials."""
+
+    tolerance: Annotated[float, Field(ge=1e-13, le=1e-2)] = 1e-9
+
+
+class ServoSettings(Section):
+    """The joints."""
+
+    backend: Literal["simulated", "dynamixel", "none"] = "simulated"
+    port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
+    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000
+    model: Model = "XM430-W350"
+    ids: tuple[Annotated[int, Field(ge=0, le=252)], Annotated[int, Field(ge=0, le=252)]] = (1, 2)
+    direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
+    zero: tuple[Counts, Counts] = (2048, 2048)  # counts at q = 0
+    gear_ratio: Positive = 1.0  # servo turns for one joint turn
+    current_limit: tuple[Positive, Positive] = (6.0, 6.0)  # A; the servo's own limit binds too
+    mode: ServoMode = "current-based position"  # or "current", or "position" (can't grasp)
+    stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
+    damping: NonNegative = 0.4  # A·s/rad, likewise
+    reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
+    fault_after: Seconds = 0.05  # s without a good reading → fault
+    watchdog: Annotated[float, Field(ge=0, le=2.54)] = 0.1  # s, the servo's own; 0 leaves it off
+
+
+class TactileSettings(Section):
+    """The pressure grids under the tips."""
+
+    backend: Literal["simulated", "flexitac", "glove", "cobs", "replay", "none"] = "simulated"
+    port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")
+    baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
+    rows: Annotated[int, Field(ge=4, le=256)] = 44
+    cols: Annotated[int, Field(ge=4, le=256)] = 44
+    pitch: Length = 0.058 / 44
+    pitch_y: NonNegative = 0.0  # from row to row; 0: as pitch
+    centre: tuple[Place, Place] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
+    rotation: tuple[Angle, Angle] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
+    blur: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, the elastomer's standard deviation
+    dead: tuple[Cells, Cells] = ((), ())  # cells [row, col] that are left out
+    threshold: Annotated[int, Field(ge=0, le=255)] = 0  # smallest count sent; 0 stands for less
+    pascal_per_count: Positive = 4.0
+    full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
+    rate: Rate = 100.0  # frames a second that are expected
+    noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
+    latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
+    open_timeout: Seconds = 2.0  # s to wait for a first good frame
+    sensor: tuple[str, str] = ("", "")  # what tells the sensors from others, as a serial number
+    calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
+    recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, folder of .npy, ASCII export
+    replay_again: bool = True  # backend = "replay": from the start at the end, else it ends
+
+
+class EstimatorSettings(Section):
+    """How d and θ come from a frame."""
+
+    method: Literal["moments", "ml"] = "ml"
+    free_gain: bool = True  # estimate measured/modelled pressure too
+
+
+class Loop(Section):
+    """The tick, and whose time it goes by.
+
+    ``real`` is this machine's time; ``hand`` a simulated hand's own, which waits while the machine
+    is busy; ``virtual`` runs as fast as the machine can. The latter two need simulated backends;
+    ``auto`` is ``hand`` with these and ``real`` with others.
+    """
+
+    rate: Annotated[float, Field(ge=10, le=5000)] = 500.0
+    clock: Literal["auto", "hand", "real", "virtual"] = "auto"
+
+
+class Realtime(Section):
+    """How the process is made fit for a steady tick; what isn't allowed is told and done without.
+
+    All but the priority are harmless: a program at SCHED_FIFO keeps others off its processor.
+    """
+
+    priority: Annotated[int, Field(ge=0, le=80)] = 0  # of SCHED_FIFO; 0: the usual scheduling
+    slice: Annotated[float, Field(ge=0, le=0.1)] = 1e-4  # s; short ones run sooner; 0: the system's
+    cpus: tuple[Annotated[int, Field(ge=0, le=1023)], ...] = ()  # the loop's; none named: all
+    lock_memory: bool = True  # nothing of the process is swapped out
+    hold_latency: bool = True  # processors stay out of idle states that take long to leave
+    timer_slack: Annotated[float, Field(ge=0, le=1e-3)] = 1e-9  # s; 0: the system's, 50 µs
+    freeze_collector: bool = True  # a full collection would take tens of milliseconds
+    spin: Annotated[float, Field(ge=0, le=1e-3)] = 5e-5  # s before a tick that are waited awake
+
+
+class Stream(Section):
+    """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
+
+    address: str = "tcp://127.0.0.1:9872"
+    state_rate: Rate = 100.0
+    tactile_rate: Rate = 100.0
+    tactile_unit: Literal["count", "Pa"] = "count"  # raw, or what the estimator makes of it
+    queue: Annotated[int, Field(ge=1, le=100_000)] = 2000  # messages kept for a slow subscriber
+
+
+class CommandSettings(Section):
+    """The command server."""
+
+    address: str = "tcp://127.0.0.1:9873"
+    lease: Seconds = 2.0  # s a commander keeps the hand after its last command
+    max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
+    per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is free
+
+
+class Access(Section):
+    """Who may subscribe and command. Addresses off this machine need keys."""
+
+    keys: str = ""  # folder that `softfinger keys` made: both sockets take only its clients
+    ipc_mode: Literal["0600", "0660", "0666"] = "0600"  # rights of an ipc address's file
+
+
+class Control(Section):
+    """Gains and rates of the control law; each default was chosen in simulation."""
+
+    torque_constant: Factor = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
+    approach_speed: Positive = 0.3  # rad/s
+    approach_current: Positive = 0.15  # A, while closing: a tip that feels nothing presses no more
+    move_speed: Positive = 1.0  # rad/s
+    contact_force: Positive = 0.5  # N at which a finger counts as touching
+    force_default: Positive = 5.0  # N, grasp without force=
+    law: Literal["energy", "two_phase", "position"] = "energy"  # "position" is for comparison
+    force_time: Seconds = 0.1  # s in which the force goes from what is felt to what is wanted
+    smooth_time: Seconds = 0.1  # s over which references are averaged: bounds their jerk
+    force_gain: NonNegative = 1.0  # N a N of force error
+    force_bandwidth: NonNegative = 1.0  # Hz of the force integral
+    rotate_speed: Positive = 1.3  # rad/s of the object's angle
+    rotate_bandwidth: NonNegative = 4.0  # Hz of the angle integral
+    joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
+    joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
+    damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
+    joint_friction: NonNegative = 0.05  # N·m of Coulomb friction, given where motion is wanted
+    friction_speed: Positive = 0.02  # rad/s wanted from which on all of it is given
+    tip_friction: Positive = 0.6  # Coulomb, tip on object, that is counted on
+    slip_margin: Fraction = 0.2  # share of that friction which is kept unused
+    object_load: NonNegative = 0.0  # N along the tips' faces, the object's weight as a rule
+    grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin
+
+
+GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
+
+
+class Safety(Section):
+    """Limits. The goal is bounded by them; crossing a hard one latches a fault."""
+
+    current_max: Positive = 1.2  # A
+    current_move: Positive = 0.4  # A, while nothing is grasped
+    force_max: Positive = 30.0  # N
+    d_max: Length = 0.012  # m
+    theta_margin: Annotated[float, Field(ge=0, le=1)] = 0.05  # rad kept from the domain's limit
+    velocity_max: Positive = 6.0  # rad/s
+    frame_age_hold: Positive = 3.0  # frame periods: nothing is moved on
+    frame_age_fault: Positive = 10.0  # frame periods: fault
+    frame_age_action: Literal["torque off", "open"] = "torque off"  # open: first, then the fault
+    goal_reach: Positive = 0.5  # rad off the present angle within which a goal may jump
+    goal_speed: Positive = 3.0  # rad/s of a goal that is further off
+    current_rate: Positive = 30.0  # A/s with which a goal current may rise
+    current_fault: Positive = 1.8  # A measured for 0.1 s → fault
+    stall_error: Positive = 0.1  # rad off its goal, with all the current it may take …
+    stall_time: Seconds = 2.0  # … for so many s: a joint has stalled → fault
+    temperature_warn: Positive = 60.0  # °C of a servo
+    temperature_max: Positive = 70.0  # °C → fault
+    voltage_min: NonNegative = 0.0  # V of a servo's supply → fault; 0: the model's own limit
+    voltage_max: NonNegative = 0.0  # V, likewise
+    residual_angle: Positive = 0.2  # rad between the object's angles by the two fingers → fault
+    residual_width: Positive = 0.004  # m of the held object's width since the grip → fault
+    residual_force: Positive = 0.5  # share by which the two tips' forces differ: warning
+    residual_torque: Positive = 0.5  # share by which a joint's torque misses its tip's force
+    saturated: Fraction = 0.05  # share of a sensor's cells that are full: warning
+    frozen_after: Delay = 0.5  # s of identical frames while something touches → fault; 0: never
+    overruns_fault: Annotated[int, Field(ge=1)] = 100  # ticks late in a row → fault
+
+
+class ObjectSettings(Section):
+    """What the daemon assumes of the object."""
+
+    width: Length = 0.040
+    taper: Annotated[float, Field(ge=-1.5, le=1.5)] = (
+        0.0  # rad between its faces; above 0 it is wider at the palm
+    )
+    width_min: NonNegative = 0.002  # m; tips nearer to each other hold nothing: the hand opens
+
+
+class Simulation(Section):
+    """The plant behind simulated backends and the emulator; these defaults are our own choice."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    object_mass: Factor = 0.10  # kg
+    object_shape: Literal["rectangle", "disc", "wedge", "none"] = "rectangle"
+    object_width: Length = 0.040  # of a wedge: at half its height
+    object_height: Length = 0.060
+    object_radius: Length = 0.020  # of a disc
+    object_taper: Annotated[float, Field(ge=-1.5, le=1.5)] = 0.17  # rad between a wedge's faces
+    object_position: tuple[Place, Place] = (0.0, 0.080)  # m, in the hand's plane
+    object_angle: Angle = 0.0
+    gravity: tuple[Acceleration, Acceleration] = (
+        0.0,
+        0.0,
+    )  # m/s²; the hand lies on a table
+    table_friction: NonNegative = 0.3  # Coulomb, object on the table it lies on
+    tip_friction: NonNegative = 0.6  # Coulomb, tip on object
+    modulus_scale: Factor = 1.0  # the real tip over the settings' material
+    tactile_noise: NonNegative = 1520.0  # Pa a cell
+    tactile_gain_spread: Fraction = 0.0  # standard deviation of the cells' sensitivities
+    tactile_dead: Fraction = 0.0  # share of cells that read 0, beside those of tactile.dead
+    tactile_blur: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # m, standard deviation
+    tactile_hysteresis: Fraction = 0.0  # reads up to so much more while a cell is unloaded
+    tactile_creep: Fraction = 0.0  # rise of the reading under a lasting pressure
+    tactile_creep_time: Positive = 10.0  # s in which it comes about
+    tactile_crosstalk: Fraction = 0.0  # share of a line's mean that its cells read too much
+    tactile_drift: NonNegative = 0.0  # Pa, how far the cells' zeros wander
+    tactile_drift_time: Positive = 60.0  # s in which they do
+    tactile_delay: Delay = 0.010  # s from the middle of a scan to its arrival
+    tactile_jitter: Delay = 0.0  # s that a frame may come later still
+    tactile_dropped: Annotated[float, Field(ge=0, le=0.99)] = 0.0  # share of frames that never come
+    palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
+    palm_friction: NonNegative = 0.3  # Coulomb, object on the palm
+    tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
+    joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
+    joint_damping: NonNegative = 0.02  # N·m·s/rad
+    joint_friction: NonNegative = 0.05  # N·m, Coulomb
+    compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only
+
+
+class Task(Section):
+    """What the daemon does by itself after start."""
+
+    name: Literal["none", "demo"] = "none"
+    force: Positive = 8.0
+    angle: Angle = 0.14
+
+
+class Settings(Section):
+    """All sections. ``Settings()`` is the built-in simulated hand."""
+
+    scene: Scene = Scene()
+    hand: Hand = Hand()
+    tip: Tip = Tip()
+    material: MaterialLaw = MaterialLaw()
+    table: Table = Table()
+    servos: ServoSettings = ServoSettings()
+    tactile: TactileSettings = TactileSettings()
+    estimator: EstimatorSettings = EstimatorSettings()
+    loop: Loop = Loop()
+    realtime: Realtime = Realtime()
+    stream: Stream = Stream()
+    commands: CommandSettings = CommandSettings()
+    access: Access = Access()
+    control: Control = Control()
+    safety: Safety = Safety()
+    object: ObjectSettings = ObjectSettings()
+    simulation: Simulation = Simulation()
+    task: Task = Task()
+
+    @property
+    def simulated(self) -> bool:
+        """Neither real servos nor real sensors take part."""
+        return self.servos.backend in SIMULATED and self.tactile.backend in SIMULATED

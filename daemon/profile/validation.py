@@ -1,0 +1,224 @@
+"""What each key of a profile allows and all of them together don't.
+
+One function a question, in one table with the sections it looks at; each gives lines of key, found
+and expected. A question is left out when one of its sections is wrong already.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from softfinger.daemon.profile.settings import FINGER_NAMES, GRIP_SHARE, SIMULATED, Settings
+
+_LONGEST = 60  # characters of a value that are shown
+_TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
+_ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
+
+
+def contradictions(settings: Settings, directory: Path | None, wrong: set[str]) -> list[str]:
+    """All that contradicts itself. ``wrong``: sections that must not be looked at."""
+    found: list[str] = []
+    for sections, question in _QUESTIONS:
+        if not wrong.intersection(sections):
+            found += question(settings)
+    if directory is None and not wrong.intersection(("servos", "tactile")):
+        found += _folder(settings)
+    return found
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in TOML, short enough for a line and without control characters."""
+    if isinstance(value, tuple):
+        text = "[" + ", ".join(shown(item) for item in value[:20]) + "]"
+    elif isinstance(value, dict):
+        text = "a table"
+    elif isinstance(value, bool):
+        text = str(value).lower()
+    elif isinstance(value, str):
+        text = '"' + "".join(each if each.isprintable() else "?" for each in value) + '"'
+    else:
+        text = str(value)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 2] + "…" + text[-1]
+
+
+def _fingers(settings: Settings) -> Iterator[str]:
+    fingers = settings.scene.fingers
+    if len(set(fingers)) != len(fingers):
+        yield f"scene.fingers: found {shown(fingers)}, expected each finger once"
+
+
+def _backends(settings: Settings) -> Iterator[str]:
+    servos, tactile = settings.servos.backend, settings.tactile.backend
+    both = f"servos.backend, tactile.backend: found {servos} and {tactile}"
+    if servos == tactile == "none":
+        yield f"{both}, expected at least one"
+    elif "none" not in (servos, tactile) and (servos in SIMULATED) != (tactile in SIMULATED):
+        yield f"{both}, expected both real or both simulated (none takes one out)"
+
+
+def _joints(settings: Settings) -> Iterator[str]:
+    hand = settings.hand
+    for index, finger in enumerate(FINGER_NAMES):
+        low, open_, high = hand.q_min[index], hand.open_angle[index], hand.q_max[index]
+        if not low < high:
+            yield f"hand.q_max: found {high:g} for {finger}, expected above q_min {low:g}"
+        elif not low <= open_ <= high:
+            yield f"hand.open_angle: found {open_:g} for {finger}, expected {low:g} to {high:g}"
+
+
+def _servos(settings: Settings) -> Iterator[str]:
+    servos = settings.servos
+    if servos.ids[0] == servos.ids[1] and len(settings.scene.fingers) == 2:
+        yield f"servos.ids: found {shown(servos.ids)}, expected two different ids"
+
+
+def _timing(settings: Settings) -> Iterator[str]:
+    period = 1.0 / settings.loop.rate
+    for key in ("watchdog", "fault_after"):
+        value = getattr(settings.servos, key)
+        if 0.0 < value <= 2.0 * period:
+            yield f"servos.{key}: found {value:g} s, expected above two ticks, {2.0 * period:g} s"
+
+
+def _material(settings: Settings) -> Iterator[str]:
+    material = settings.material
+    if material.law != "points":
+        return
+    if len(material.strain) != len(material.stress):
+        yield (
+            f"material.stress: found {len(material.stress)} numbers, "
+            f"expected {len(material.strain)} as in material.strain"
+        )
+        return
+    from softfinger.kinematics.contact.material import Material
+
+    try:
+        Material.from_points(material.strain, material.stress)
+    except ValueError as error:
+        yield f"material.strain, material.stress: {error}"
+
+
+def _wedge(settings: Settings) -> Iterator[str]:
+    simulation = settings.simulation
+    if simulation.object_shape != "wedge":
+        return
+    height, width = simulation.object_height, simulation.object_width
+    most = 2.0 * math.atan(width / height)
+    if abs(simulation.object_taper) >= most:
+        yield (
+            f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
+            f"{most:.3g}, at which this width and height make the faces meet"
+        )
+
+
+def _cells(settings: Settings) -> Iterator[str]:
+    tactile = settings.tactile
+    for index, cells in enumerate(tactile.dead):
+        for cell in cells:
+            if cell[0] >= tactile.rows or cell[1] >= tactile.cols:
+                yield (
+                    f"tactile.dead: found {shown(cell)} for {FINGER_NAMES[index]}, "
+                    f"expected a cell of {tactile.rows} × {tactile.cols}"
+                )
+
+
+def _recordings(settings: Settings) -> Iterator[str]:
+    if settings.tactile.backend != "replay":
+        return
+    for name in settings.scene.fingers:
+        if not settings.tactile.recording[FINGER_NAMES.index(name)]:
+            yield f'tactile.recording: found "" for {name}, expected a recording'
+
+
+def _clock(settings: Settings) -> Iterator[str]:
+    clock = settings.loop.clock
+    if clock in ("hand", "virtual") and not settings.simulated:
+        yield f'loop.clock: found {shown(clock)}, expected "auto" or "real" with hardware backends'
+
+
+def _limits(settings: Settings) -> Iterator[str]:
+    safety = settings.safety
+    if safety.frame_age_hold >= safety.frame_age_fault:
+        yield (
+            f"safety.frame_age_hold: found {safety.frame_age_hold:g}, "
+            f"expected below frame_age_fault, {safety.frame_age_fault:g}"
+        )
+
+
+def _forces(settings: Settings) -> Iterator[str]:
+    low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
+    if low >= high:
+        yield (
+            f"control.contact_force: found {low:g} N, expected below {GRIP_SHARE:g} "
+            f"safety.force_max, {high:g}"
+        )
+        return
+    wanted = [("control.force_default", settings.control.force_default)]
+    if settings.task.name != "none":
+        wanted.append(("task.force", settings.task.force))
+    for key, force in wanted:
+        if not low < force <= high:
+            yield f"{key}: found {force:g} N, expected above {low:g} to {high:g}"
+
+
+def address_fault(address: str, lacking: str) -> str:
+    """What speaks against binding a socket to ``address``; empty: nothing.
+
+    Without keys only this machine's addresses may be bound; ``lacking`` says where keys would be
+    named, and is empty where they are.
+    """
+    here = _TCP if lacking else _ANY_TCP
+    tcp = here.fullmatch(address)
+    path = address.removeprefix("ipc://")
+    local = path != address and path.isprintable() and path[:1] not in ("", "@", "*")
+    if local or (tcp and 0 < int(tcp[2]) < 65536):
+        return ""
+    hint = ""
+    if lacking and _ANY_TCP.fullmatch(address):
+        hint = f"; other addresses need {lacking}, which `softfinger keys` makes"
+    return (
+        f"found {shown(address)}, expected tcp://127.0.0.1:PORT with a port of 1 to 65535, "
+        f"or ipc://PATH{hint}"
+    )
+
+
+def _addresses(settings: Settings) -> Iterator[str]:
+    stream, commands = settings.stream.address, settings.commands.address
+    for key, address in (("stream.address", stream), ("commands.address", commands)):
+        fault = address_fault(address, "" if settings.access.keys else "access.keys")
+        if fault:
+            yield f"{key}: {fault}"
+    if stream == commands:
+        yield f"commands.address: found {shown(commands)}, expected another than stream.address"
+
+
+def _folder(settings: Settings) -> Iterator[str]:
+    ports = []
+    if settings.servos.backend == "dynamixel":
+        ports.append(("servos.port", settings.servos.port))
+    if settings.tactile.backend not in SIMULATED:
+        ports += [("tactile.port", port) for port in settings.tactile.port]
+    for key, port in ports:
+        if "{dir}" in port:
+            yield f"{key}: found {shown(port)}, expected --dir to say which folder {{dir}} is"
+
+
+_QUESTIONS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...] = (
+    (("scene",), _fingers),
+    (("servos", "tactile"), _backends),
+    (("hand",), _joints),
+    (("scene", "servos"), _servos),
+    (("servos", "loop"), _timing),
+    (("material",), _material),
+    (("simulation",), _wedge),
+    (("tactile",), _cells),
+    (("scene", "tactile"), _recordings),
+    (("servos", "tactile", "loop"), _clock),
+    (("safety",), _limits),
+    (("control", "safety", "task"), _forces),
+    (("stream", "commands", "access"), _addresses),
+)

@@ -1,0 +1,1 @@
+"""Every limit of the hand, how it is checked each tick, and the torque state it ends in."""

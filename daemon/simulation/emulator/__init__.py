@@ -1,0 +1,1 @@
+"""`softfinger emulate`: the simulated hand behind ptys, as servos and tactile boards."""

@@ -1,0 +1,339 @@
+"""The stand-in hand's process: physics in real time, behind servos and tactile boards on ptys.
+
+One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
+due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
+before it looks for bytes again. Here live that loop and its time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import socket
+import time
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from softfinger.daemon.profile.factory import make_material, make_table
+from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.simulation.emulator.control_port import ControlPort
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encoder_for
+from softfinger.daemon.simulation.emulator.fault_spec import SERVOS, Event, Faults
+from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
+from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
+from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.servo_model.bus_faults import FaultError, LineFaults
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.tactile.simulated import SimulatedTactile
+from softfinger.daemon.types import FINGERS
+
+_STEP = 0.002  # s, longest that the physics lags behind
+_ASKS = ("report", "forget", "place")  # words to the control socket that are no fault
+_STALL = 0.05  # s; a longer interruption is left out of the hand's time
+# The board that stands in where a profile names none: that of config/hil.toml.
+DEFAULT_BOARD = {
+    "backend": "flexitac",
+    "rows": 32,
+    "cols": 32,
+    "pitch": 0.0018125,
+    "pascal_per_count": 500.0,
+    "full_count": 255,
+}
+
+
+class EmulatorError(Exception):
+    """The stand-in hand can't be set up. The message says why, and what mends it."""
+
+
+class EmulatorClock:
+    """Time of the stand-in hand: real time from 0, less the interruptions of its process.
+
+    Without that a process that was stopped for a minute would have to compute that minute, and
+    would answer nobody meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._origin = self._last = time.monotonic()
+
+    def now(self) -> float:
+        """The hand's time [s]. What passed since the last call counts up to a limit."""
+        now = time.monotonic()
+        self._origin += max(now - self._last - _STALL, 0.0)
+        self._last = now
+        return now - self._origin
+
+    def wall(self) -> float:
+        """Unix time [s]."""
+        return time.time()
+
+    def sleep_until(self, t: float) -> float:
+        """Return at the hand's time ``t``: how late it woke up [s]."""
+        while (delay := t - self.now()) > 0.0:
+            time.sleep(min(delay, 0.5 * _STALL))
+        return -delay
+
+
+class Emulator:
+    """A stand-in hand on ptys, linked in ``folder``; :meth:`run` keeps it alive.
+
+    The scene of ``settings`` says what there is: a finger that is absent has no board, and servos
+    or tactile backends of ``none`` have no port.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        folder: Path,
+        *,
+        baud: int = 0,
+        latency: float = 0.0,
+        prepared: bool = True,
+        ids: tuple[int, ...] | None = None,
+        faults: Iterable[str] = (),
+        table_cache: Path | None = None,
+        undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+    ) -> None:
+        """Build it; nothing answers before :meth:`run`.
+
+        ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
+        with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
+        rate. ``ids``: others than the settings', even one for both. ``faults``: see
+        :class:`Faults`. ``table_cache``: a folder where the contact table is kept.
+        ``undisturbed``: what keeps exceptions of signal handlers out while something is made that
+        is to be taken away.
+        Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
+        """
+        self._closers: list[Callable[[], None]] = []
+        self._wake = os.pipe()
+        self._closers.append(self._close_wake)
+        self._stopping = False
+        self._undisturbed = undisturbed
+        self._watched: list[int | TactileBoard | socket.socket] | None = None
+        try:
+            self._ids = settings.servos.ids if ids is None else ids
+            self._events = Faults(faults, self._ids).events
+            with undisturbed():
+                self._take(folder)
+            self._build(with_board(settings), (baud, latency), prepared, table_cache)
+        except (FolderError, FaultError) as error:
+            self.close()
+            raise EmulatorError(str(error)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _take(self, folder: Path) -> None:
+        self._links = LinkFolder(folder)
+        self._closers.append(self._links.close)
+        self._control = ControlPort(folder, self._told)
+        self._closers.append(self._control.close)
+
+    def _build(
+        self,
+        settings: Settings,
+        pace: tuple[int, float],
+        prepared: bool,
+        table_cache: Path | None,
+    ) -> None:
+        self.clock = EmulatorClock()
+        self._simulation = settings.simulation
+        table = make_table(settings, make_material(settings.material), table_cache)
+        self.hand = SimulatedHand(settings, 0.0, table)
+        self._servos: PtyServoBus | None = None
+        if settings.servos.backend != "none":
+            with self._undisturbed():
+                self._servos = self._make_servos(settings, pace, prepared)
+                self._closers.append(self._servos.close)
+        self._boards: dict[str, TactileBoard] = {}
+        self._sources: list[SimulatedTactile] = []
+        tactile = settings.tactile
+        if tactile.backend != "none":
+            for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+                source = SimulatedTactile(settings, self.hand, self.clock, finger)
+                source.open()
+                board = TactileBoard(
+                    source,
+                    encoder_for(tactile.backend, tactile.full_count),
+                    tactile.rate,
+                    settings.simulation.tactile_delay,
+                    seed=settings.simulation.seed + finger,
+                )
+                self._sources.append(source)
+                self._boards[FINGERS[finger]] = board
+                self._closers.append(board.close)
+                with self._undisturbed():
+                    self._links.link(f"tactile-{FINGERS[finger]}", board.path)
+        self._advance_due = 0.0
+
+    def _make_servos(
+        self, settings: Settings, pace: tuple[int, float], prepared: bool
+    ) -> PtyServoBus:
+        baud, latency = pace
+        try:
+            bus = ServoBus.from_settings(
+                settings, self.hand, ids=self._ids, baud=baud, prepared=prepared
+            )
+        except ValueError as error:
+            raise EmulatorError(str(error)) from None
+        link = self._links.path / "servos"
+        return PtyServoBus(bus, link, baud=baud, latency=latency, clock=self.clock.now)
+
+    def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
+        """Answer until :meth:`stop`. ``on_ready`` is called once everything answers."""
+        ready = False
+        while not self._stopping:
+            self._turn()
+            if not ready and all(source.latest() is not None for source in self._sources):
+                ready = True
+                on_ready()
+
+    def stop(self) -> None:
+        """End :meth:`run`; may be called from a signal handler or another thread."""
+        self._stopping = True
+        with contextlib.suppress(OSError):
+            os.write(self._wake[1], b"x")
+
+    def close(self) -> None:
+        """Take the ports and their links away. Never raises."""
+        while self._closers:
+            with contextlib.suppress(OSError):
+                self._closers.pop()()
+
+    def _close_wake(self) -> None:
+        for end in self._wake:
+            os.close(end)
+
+    def _turn(self) -> None:
+        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
+        servos, boards = self._servos, self._boards.values()
+        due = min([self._advance_due, *[board.next_event() for board in boards]])
+        if servos is not None:
+            due = min(due, servos.next_event())
+        if self._watched is None:
+            self._watched = self._watch()
+        start = self.clock.now()
+        ready, _, _ = select.select(self._watched, (), (), max(due - start, 0.0))
+        t = self.clock.now()
+        if servos is not None and (servos.fileno() in ready or servos.next_event() <= t):
+            servos.service(t, start)
+        for each in ready:
+            if isinstance(each, TactileBoard):
+                each.hear()
+            elif isinstance(each, socket.socket):
+                self._control.serve([each])
+                self._watched = None
+        late = [board for board in boards if board.next_event() <= t]
+        if late:
+            self._advance(t)
+            late[0].service(t)
+        elif self._advance_due <= t:
+            self._advance(t)
+
+    def _watch(self) -> list[int | TactileBoard | socket.socket]:
+        """What bytes may come from."""
+        watched: list[int | TactileBoard | socket.socket] = [
+            self._wake[0],
+            *self._control.sockets(),
+            *[board for board in self._boards.values() if board.plugged],
+        ]
+        if self._servos is not None and self._servos.fileno() >= 0:
+            watched.append(self._servos.fileno())
+        return watched
+
+    def _advance(self, t: float) -> None:
+        while self._events and self._events[0].after <= t:
+            self._apply(self._events.pop(0), t)
+            self._watched = None
+        if self._servos is not None:
+            self._servos.bus.advance(t)
+        else:
+            self.hand.advance(t)
+        self._advance_due = t + _STEP
+
+    def tell(self, text: str) -> str:
+        """Take words from the control socket; ``ok``, or ``error: `` and why none of them counts.
+
+        A time behind a word counts from now. With ``report`` among them the answer is
+        :meth:`report` as JSON; ``forget`` lets the record begin anew; ``place`` puts the object
+        back where it was at the start, at rest.
+        """
+        words = text.split()
+        try:
+            fresh = Faults([word for word in words if word not in _ASKS], self._ids).events
+        except FaultError as error:
+            return f"error: {error}"
+        now = self.clock.now()
+        reply = json.dumps(self.report(now)) if "report" in words else "ok"
+        if "forget" in words and self._servos is not None:
+            self._servos.bus.forget(now)
+        if "place" in words:
+            self._place()
+        self._events += [event._replace(after=now + event.after) for event in fresh]
+        self._events.sort(key=lambda event: event.after)
+        self._advance_due = now  # so that what starts now does
+        return reply
+
+    def _place(self) -> None:
+        simulation = self._simulation
+        self.hand.object_pose[:] = *simulation.object_position, simulation.object_angle
+        self.hand.object_velocity[:] = 0.0
+        self.hand.refresh()
+
+    def _told(self, text: str) -> str:
+        """:meth:`tell`, with what starts now in force before the reply goes out."""
+        reply = self.tell(text)
+        self._advance(self.clock.now())
+        return reply
+
+    def report(self, t: float) -> dict[str, Any]:
+        """What was on the servos' wire, and their state; times are the hand's [s].
+
+        ``monotonic`` is time.monotonic() at ``t``, for whoever compares with a time of his own.
+        """
+        bus = self._servos.bus if self._servos is not None else None
+        servos = bus.report(t) if bus is not None else []
+        return {"t": t, "monotonic": time.monotonic(), "servos": servos}
+
+    def _apply(self, event: Event, t: float) -> None:
+        servos = self._servos
+        if event.part != SERVOS:
+            self._apply_to_board(event.part, event.what)
+        elif servos is None or isinstance(event.what, BoardFault):
+            return
+        elif event.what == "unplug":
+            servos.unplug()
+        elif event.what == "plug":
+            if servos.fileno() < 0:
+                servos.plug()
+        elif event.what == "well":
+            servos.bus.faults.rates = LineFaults()
+        else:
+            servos.bus.fault(event.what, t)
+
+    def _apply_to_board(self, side: str, what: str | BoardFault) -> None:
+        board = self._boards.get(side)
+        if board is None:
+            return
+        if isinstance(what, BoardFault):
+            board.fault(what)
+        elif what == "well":
+            board.recover()
+        elif what == "unplug":
+            self._links.unlink(f"tactile-{side}")
+            board.unplug()
+        elif not board.plugged:
+            board.plug()
+            self._links.link(f"tactile-{side}", board.path)
+
+
+def with_board(settings: Settings) -> Settings:
+    """``settings`` with the default board where its tactile backend names none of ours."""
+    if settings.tactile.backend in (*ENCODERS, "none"):
+        return settings
+    tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})
+    return settings.model_copy(update={"tactile": tactile})

@@ -1,0 +1,265 @@
+"""An emulated tactile board: the simulated sensor's frames, in a board's framing, on a pty.
+
+Framings plug in as encoders (encoders.py), pure functions from counts to bytes. The faults that a
+board may have are applied here too.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import fcntl
+import math
+import os
+import re
+import termios
+import tty
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.simulation.emulator.encoders import Encoder
+from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
+from softfinger.daemon.types import Frame
+
+_TTY_ROOM = 2048  # bytes; a tty reports at most 4095 unread ones, so more is never asked for
+_DRAIN = 4096
+_RETRY = 5e-4  # s until a frame that is late is asked for again
+_NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
+
+
+@dataclass(frozen=True, slots=True)
+class BoardFault:
+    """What goes wrong with a board from ``start`` [s] after its first frame on.
+
+    - ``torn``: with probability ``value`` a frame lacks some of its bytes, anywhere.
+    - ``noisy``: with probability ``value`` random bytes stand before a frame, and one byte of it
+      is wrong.
+    - ``silent``: it says nothing more.
+    - ``frozen``: it repeats its last frame.
+    - ``wrong-size``: it sends a grid of half the rows and half the columns.
+    - ``saturated``, ``zero``: all its cells read the greatest count, or none.
+    """
+
+    kind: str
+    value: float = 1.0
+    start: float = 0.0
+
+    KINDS = ("torn", "noisy", "silent", "frozen", "wrong-size", "saturated", "zero")
+
+    @classmethod
+    def parse(cls, text: str) -> BoardFault:
+        """``torn=0.1``, ``silent``, ``frozen@2.5``: kind, probability, seconds until it starts.
+
+        Raises:
+            FaultError: unknown kind, a probability outside 0 … 1, no such time.
+        """
+        match = re.fullmatch(r"([a-z-]+)(?:=([^@]*))?(?:@(.*))?", text.strip())
+        if match is None or match[1] not in cls.KINDS:
+            raise FaultError(
+                f"fault {text!r}: expected KIND[=PROBABILITY][@SECONDS] with {', '.join(cls.KINDS)}"
+            )
+        kind, chance, start = match[1], match[2], match[3]
+        default = "0.1" if kind in ("torn", "noisy") else "1"
+        try:
+            value = float(default if chance is None else chance)
+            after = float("0" if start is None else start)
+        except ValueError:
+            raise FaultError(f"fault {text!r}: not a number") from None
+        if not 0.0 <= value <= 1.0:
+            raise FaultError(f"fault {text!r}: a probability lies in 0 … 1")
+        if not (after >= 0.0 and math.isfinite(after)):
+            raise FaultError(f"fault {text!r}: it starts after 0 s or more")
+        return cls(kind, value, after)
+
+
+class FrameSource(Protocol):
+    """Where a board's frames come from: the simulated sensor."""
+
+    def latest(self) -> Frame | None:
+        """The newest frame that is due, or None before the first."""
+
+
+class FrameWriter:
+    """The board's end of a pty. Frames go out whole or not at all.
+
+    A pty holds some tens of kilobytes. While nobody reads, frames are dropped early, so that who
+    comes next isn't fed an old tail, as with a board whose port nobody has opened.
+    """
+
+    def __init__(self) -> None:
+        self._master, self._slave = os.openpty()
+        # The slave stays open here: else the next client to open it would meet a hung-up line.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        self.dropped = 0  # frames
+        self._rest = b""  # of a frame that the pty took only a part of
+        self._unread = array.array("i", [0])
+
+    def fileno(self) -> int:
+        """Readable when the client has written something; see :meth:`drain`."""
+        return self._master
+
+    @property
+    def waiting(self) -> bool:
+        """A part of a frame is still to be written; see :meth:`flush`."""
+        return bool(self._rest)
+
+    def send(self, frame: bytes) -> bool:
+        """Write one frame, or drop it when the client has not read those before it."""
+        if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_ROOM):
+            self.dropped += 1
+            return False
+        self._rest = frame
+        self.flush()
+        return True
+
+    def flush(self) -> bool:
+        """Write on with what is left of a frame; True when nothing is left."""
+        if self._rest:
+            with contextlib.suppress(BlockingIOError):
+                self._rest = self._rest[os.write(self._master, self._rest) :]
+        return not self._rest
+
+    def drain(self) -> bytes:
+        """What the client has written."""
+        try:
+            return os.read(self._master, _DRAIN)
+        except BlockingIOError:
+            return b""
+
+    def close(self) -> None:
+        """Close both ends; a client then reads an error."""
+        for end in (self._master, self._slave):
+            with contextlib.suppress(OSError):
+                os.close(end)
+
+    def _unread_bytes(self) -> int:
+        fcntl.ioctl(self._slave, termios.FIONREAD, self._unread)
+        return self._unread[0]
+
+
+class TactileBoard:
+    """Sends each new frame of ``source`` on a pty, in one framing, with the faults asked for.
+
+    A board that is asked for its frames sends the next one that comes after it was asked.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        encoder: Encoder,
+        rate: float,
+        delay: float,
+        faults: tuple[BoardFault, ...] = (),
+        seed: int = 1,
+    ) -> None:
+        """Frames are due at k/rate + delay [Hz, s]; ``seed`` drives the faults' chance."""
+        self._source = source
+        self._encoder = encoder
+        self._asked = not encoder.request
+        self._rate = rate
+        self._delay = delay
+        self._faults = list(faults)
+        self._random = np.random.default_rng(seed)
+        self.plug()
+        self._seq = -1
+        self._start: float | None = None
+        self._kept: NDArray[np.uint16] | None = None  # the image that a frozen board repeats
+        self._due = -math.inf
+        self.sent = 0  # frames
+
+    def plug(self) -> None:
+        """Make the port (again), at a new ``path``."""
+        self._writer = FrameWriter()
+        self.path = self._writer.path
+        self.plugged = True
+
+    def unplug(self) -> None:
+        """Take the port away; a client reads an error. The board goes on."""
+        if self.plugged:
+            self._writer.close()
+        self.plugged = False
+
+    def fault(self, fault: BoardFault) -> None:
+        """Let this go wrong from now on, whatever its start, instead of an earlier one alike."""
+        kept = [each for each in self._faults if each.kind != fault.kind]
+        self._faults = [*kept, replace(fault, start=0.0)]
+
+    def recover(self) -> None:
+        """End all faults."""
+        self._faults = []
+
+    @property
+    def dropped(self) -> int:
+        """Frames that nobody read in time."""
+        return self._writer.dropped
+
+    def fileno(self) -> int:
+        """Readable when :meth:`hear` has something to do."""
+        return self._writer.fileno()
+
+    def hear(self) -> None:
+        """Take what the client wrote: requests, where the board waits for them."""
+        written = self._writer.drain() if self.plugged else b""
+        if self._encoder.request and self._encoder.request in written:
+            self._asked = True
+
+    def next_event(self) -> float:
+        """When :meth:`service` next has something to do [s]."""
+        return self._due
+
+    def service(self, t: float) -> None:
+        """Send the newest frame if a new one is due at time t [s]."""
+        if self.plugged:
+            self._writer.flush()
+        # The instant of a due frame itself may be rounded either way.
+        self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
+        self._due += self._delay
+        frame = self._source.latest()
+        if frame is None or frame.seq == self._seq:
+            self._due = min(self._due, t + _RETRY)
+            return
+        self._seq = frame.seq
+        if self._start is None:
+            self._start = t
+        if not self._asked or not self.plugged:
+            return
+        data = self._spoil(frame, t - self._start)
+        if data:
+            self._asked = not self._encoder.request
+            self.sent += self._writer.send(data)
+
+    def close(self) -> None:
+        """Close the pty."""
+        self.unplug()
+
+    def _spoil(self, frame: Frame, age: float) -> bytes:
+        counts = frame.data
+        faults = [fault for fault in self._faults if age >= fault.start]
+        kinds = {fault.kind for fault in faults}
+        if "silent" in kinds:
+            return b""
+        if "frozen" in kinds:
+            counts = counts if self._kept is None else self._kept
+        self._kept = counts
+        if "saturated" in kinds:
+            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # framings clip it
+        elif "zero" in kinds:
+            counts = np.zeros_like(counts)
+        if "wrong-size" in kinds:
+            counts = counts[: counts.shape[0] // 2, : counts.shape[1] // 2]
+        data = self._encoder.encode(counts, frame.seq, frame.t_sample)
+        for fault in faults:
+            if fault.kind == "torn" and self._random.random() < fault.value:
+                left, right = sorted(self._random.integers(0, len(data) + 1, 2).tolist())
+                data = data[:left] + data[right:]
+            elif fault.kind == "noisy" and self._random.random() < fault.value:
+                wrong = bytearray(data)
+                wrong[self._random.integers(len(wrong))] = self._random.integers(256)
+                burst = self._random.bytes(int(self._random.integers(1, _NOISE_LENGTH + 1)))
+                data = burst + bytes(wrong)
+        return data

@@ -1,0 +1,2 @@
+"""The simulated hand's mechanics: contacts, object, joints, solver. Kernels on the plant's
+state."""

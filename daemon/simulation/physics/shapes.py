@@ -1,0 +1,84 @@
+"""The shapes of the simulated object: outline, inertia, and what friction under it needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.profile.settings import Simulation
+from softfinger.daemon.simulation.physics import layout
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One object's outline, round its centre of mass. Lengths are m."""
+
+    kind: int  # by layout's numbers
+    corners: FloatArray  # (4, 2), counter-clockwise; of a disc: those of the square round it
+    roundness: float  # radius of a disc, else 0
+    gyration: float  # radius of gyration
+    lever: float  # mean distance of its points from the centre: what spinning friction acts on
+
+    @property
+    def extent(self) -> float:
+        """The farthest point's distance from the centre."""
+        return self.roundness or float(np.hypot(*self.corners.T).max())
+
+    @property
+    def half_width(self) -> float:
+        """Half the width at the height of the centre."""
+        (left, bottom), (right, top) = self.corners.min(axis=0), self.corners.max(axis=0)
+        if self.kind != layout.POLYGON:
+            return float(0.5 * (right - left))
+        low, high = self.corners[1, 0], self.corners[2, 0]
+        return float(low + (high - low) * -bottom / (top - bottom))
+
+    def edges(self) -> FloatArray:
+        """Start, outward normal and length of the four edges, (4, layout.EDGE)."""
+        way = np.roll(self.corners, -1, axis=0) - self.corners
+        length = np.hypot(*way.T)
+        normal = np.stack((way[:, 1], -way[:, 0]), axis=1) / length[:, None]
+        return np.column_stack((self.corners, normal, length))
+
+
+def shape_of(simulation: Simulation) -> Shape:
+    """The object of the settings."""
+    if simulation.object_shape == "disc":
+        radius = simulation.object_radius
+        square = _trapezoid(radius, radius, radius)
+        return Shape(layout.DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
+    half, height = 0.5 * simulation.object_width, simulation.object_height
+    kind, leaning = layout.RECTANGLE, 0.0
+    if simulation.object_shape == "wedge":
+        kind = layout.POLYGON
+        leaning = 0.5 * height * math.tan(0.5 * simulation.object_taper)
+    elif simulation.object_shape == "none":
+        kind = layout.NO_OBJECT
+    corners = _trapezoid(half + leaning, half - leaning, 0.5 * height)
+    lever, squared = _mean_distances(corners)
+    return Shape(kind, corners, 0.0, math.sqrt(squared), lever)
+
+
+def _trapezoid(low: float, high: float, half_height: float) -> FloatArray:
+    """Corners round the centre of mass, for half widths at the bottom and at the top."""
+    centre = half_height * (high - low) / (3.0 * (low + high))
+    bottom, top = -half_height - centre, half_height - centre
+    return np.array([[-low, bottom], [low, bottom], [high, top], [-high, top]])
+
+
+def _mean_distances(corners: FloatArray) -> tuple[float, float]:
+    """Mean distance [m] and mean squared distance [m²] of a trapezoid's points from the centre."""
+    nodes, weights = np.polynomial.legendre.leggauss(32)
+    share = 0.5 * (nodes + 1.0)
+    half = corners[1, 0] + share * (corners[2, 0] - corners[1, 0])
+    y = corners[0, 1] + share * (corners[2, 1] - corners[0, 1])
+    x = half[:, None] * share
+    weight = weights[:, None] * weights * half[:, None]
+    squared = x * x + y[:, None] ** 2
+    mean = (weight * np.sqrt(squared)).sum() / weight.sum()
+    return float(mean), float((weight * squared).sum() / weight.sum())

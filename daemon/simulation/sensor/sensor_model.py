@@ -1,0 +1,202 @@
+"""The simulated pressure sensor: a contact → the counts that a board would send.
+
+Holds the forward model, the order of the sensor's imperfections round it, and their seed; what each
+of them does is in sensor_effects.py. Delay and lost frames are not here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.profile.settings import Simulation
+from softfinger.daemon.simulation.sensor import sensor_effects
+from softfinger.daemon.simulation.sensor.curved_face import render_curved
+from softfinger.daemon.simulation.sensor.sensor_effects import PLAYS, Blur
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid, render, render_scratch
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Imperfections:
+    """What is wrong with a sensor; the default is nothing.
+
+    - ``noise`` [Pa]: a cell's standard deviation from frame to frame.
+    - ``gain_spread``: standard deviation of the cells' sensitivities round 1.
+    - ``dead``: share of cells that always read 0 and that nobody is told of.
+    - ``blur`` [m]: the elastomer spreads a point's pressure, standard deviation.
+    - ``hysteresis``: a cell being unloaded reads up to this share more than when it was loaded.
+    - ``creep``, ``creep_time`` [s]: a cell's reading rises by this share under a lasting pressure.
+    - ``crosstalk``: each cell reads this share of its row's and of its column's mean too much.
+    - ``drift`` [Pa], ``drift_time`` [s]: the cells' zeros wander so far over such a time.
+
+    Raises ValueError for values out of their range.
+    """
+
+    noise: float = 0.0
+    gain_spread: float = 0.0
+    dead: float = 0.0
+    blur: float = 0.0
+    hysteresis: float = 0.0
+    creep: float = 0.0
+    creep_time: float = 10.0
+    crosstalk: float = 0.0
+    drift: float = 0.0
+    drift_time: float = 60.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{field.name} must not be negative, got {value}")
+        if self.dead > 1.0:
+            raise ValueError(f"dead must be a share of the cells, got {self.dead}")
+        for name in ("creep_time", "drift_time"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+    @classmethod
+    def of(cls, simulation: Simulation) -> Imperfections:
+        """Those of the settings."""
+        values = simulation.model_dump()
+        return cls(**{each.name: values[f"tactile_{each.name}"] for each in fields(cls)})
+
+
+class SensorModel:
+    """A pressure sensor under one simulated tip.
+
+    ``full_count`` is the largest count (255 for 8 bits), ``gain`` the tip's pressure over the
+    material's, ``dead`` the cells (row, col) that always read 0, and ``threshold`` the smallest
+    count that is sent: below it goes 0. Two models of equal arguments and calls give equal frames.
+    Raises ValueError for arguments out of their range.
+    """
+
+    def __init__(
+        self,
+        grid: SensorGrid,
+        tip: Fingertip,
+        material: Material,
+        pascal_per_count: float,
+        flaws: Imperfections | None = None,
+        *,
+        seed: int | Sequence[int] = 0,
+        full_count: int = 65535,
+        gain: float = 1.0,
+        dead: Sequence[tuple[int, int]] = (),
+        threshold: int = 0,
+    ) -> None:
+        if not 1 <= full_count <= 65535:
+            raise ValueError(f"full_count must be 1 … 65535, got {full_count}")
+        for name, value in (("pascal_per_count", pascal_per_count), ("gain", gain)):
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} must be positive, got {value}")
+        self.grid = grid
+        self._flaws = flaws = flaws or Imperfections()
+        self._per_count = pascal_per_count
+        self._law = material.law
+        self._ends = (threshold, full_count)
+        self._generator = np.random.Generator(np.random.SFC64(seed))
+        shape = grid.shape
+        spread = self._generator.standard_normal(shape)
+        sensitivity = gain * np.maximum(1.0 + flaws.gain_spread * spread, 0.0) / pascal_per_count
+        for row, col in dead:
+            sensitivity[row, col] = 0.0
+        if flaws.dead > 0.0:
+            sensitivity[self._generator.random(shape) < flaws.dead] = 0.0
+        self._sensitivity = sensitivity
+        self._blur = Blur(grid.geometry(tip), shape, flaws.blur) if flaws.blur > 0.0 else None
+        self._pressure = np.zeros(shape)
+        self._target = self._pressure if self._blur is None else self._blur.fine
+        self._geometry = grid.geometry(tip) if self._blur is None else self._blur.fine_geometry
+        self._scratch = render_scratch(SensorGrid(*self._target.shape, 1.0))
+        self._plays = np.zeros((PLAYS if flaws.hysteresis > 0.0 else 0, *shape))
+        self._before = np.zeros(shape)
+        self._crept = np.zeros(shape)
+        self._offset = np.zeros(shape)  # counts
+        self._signal = np.zeros(shape)  # counts
+        self._normals = np.zeros(shape)
+        self._lines = (np.zeros(shape[0]), np.zeros(shape[1]))
+        self._t: float | None = None
+
+    @property
+    def live(self) -> NDArray[np.bool_]:
+        """Cells that read anything, bool [rows, cols]."""
+        return self._sensitivity > 0.0
+
+    @property
+    def remembers(self) -> bool:
+        """What it reads depends on what pressed before, not on the present contact alone."""
+        return self._flaws.hysteresis > 0.0 or self._flaws.creep > 0.0
+
+    def frame(
+        self,
+        d: float,
+        tilt_x: float,
+        tilt_y: float,
+        out: NDArray[np.uint16],
+        t: float = 0.0,
+        bend: float = 0.0,
+    ) -> None:
+        """Write the next frame's counts into ``out``, uint16 [rows, cols] contiguous.
+
+        ``d`` [m] ≤ 0 is no contact; tilts [rad] as for :meth:`SensorGrid.pressure`; ``t`` [s], for
+        creep and drift, is the frame's time; ``bend`` as for :meth:`press`.
+        """
+        self.press(d, tilt_x, tilt_y, t, bend)
+        self.read(out)
+
+    def press(
+        self, d: float, tilt_x: float, tilt_y: float, t: float = 0.0, bend: float = 0.0
+    ) -> None:
+        """Let the cells feel the contact of time ``t`` without reading them.
+
+        ``bend`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face: that
+        of a cylinder whose axis is along the finger's y.
+        """
+        n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
+        flaws, pressure = self._flaws, self._pressure
+        elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
+        self._t = t
+        geometry, law, target = self._geometry, self._law, self._target
+        if bend > 0.0:
+            across = self.grid.to_sensor(1.0, 0.0)
+            render_curved(geometry, law, float(d), n_x, n_y, *across, float(bend), target)
+        else:
+            render(geometry, law, 1.0, float(d), n_x, n_y, self._scratch, target)
+        if self._blur is not None:
+            self._blur.apply(pressure)
+        if flaws.hysteresis > 0.0:
+            sensor_effects.hysteresis(pressure, flaws.hysteresis, self._plays)
+        if flaws.creep > 0.0:
+            memory = (self._before, self._crept)
+            sensor_effects.creep(pressure, flaws.creep, flaws.creep_time, elapsed, *memory)
+        if flaws.drift > 0.0:
+            self._generator.standard_normal(out=self._normals)
+            deviation = flaws.drift / self._per_count
+            sensor_effects.drift(self._offset, deviation, flaws.drift_time, elapsed, self._normals)
+
+    def read(self, out: NDArray[np.uint16]) -> None:
+        """Write the counts of what the cells feel into ``out``."""
+        flaws = self._flaws
+        np.multiply(self._pressure, self._sensitivity, out=self._signal)
+        if flaws.crosstalk > 0.0:
+            sensor_effects.crosstalk(self._signal, flaws.crosstalk, *self._lines)
+        if flaws.noise > 0.0:
+            self._generator.standard_normal(out=self._normals)
+        sensor_effects.count(
+            self._signal,
+            self._offset,
+            *self._lines,
+            self._sensitivity,
+            flaws.noise / self._per_count,
+            self._normals,
+            self._ends,
+            out,
+        )

@@ -1,0 +1,1 @@
+"""Emulated Dynamixel servos: control table, what its registers do, packets on their bus."""

@@ -1,0 +1,96 @@
+"""What an emulated servo was told since the record began: kept beside it, and read on demand.
+
+It judges nothing: whoever tests a daemon compares the record with the limits it was given. Counts
+as they came over the wire; a goal counts whether the servo took or refused it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.simulation.servo_model.servo_joint import POSITION_MODES, ServoJoint
+
+FAR = 0.05  # rad between goal and present angle at torque on that count as far
+_WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
+
+
+class WireWatch:
+    """The record of one servo."""
+
+    def __init__(self, t: float) -> None:
+        self.since = t
+        self._goals: dict[int, tuple[int, int]] = {}  # register → least and greatest, counts
+        self._refused = 0
+        self._torque_on = 0  # how often
+        self._torque_t: float | None = None
+        self._far = 0
+        self._farthest = 0.0  # rad
+        self._current = 0.0  # A, greatest goal at torque on
+        self._last = t  # when a packet was heard
+        self._quiet = 0.0  # s, longest with torque on
+        self._fired = 0
+        self._fired_t: float | None = None
+        self._off_t: float | None = None
+
+    def goal(self, address: int, value: int) -> None:
+        """A value for a register was on the wire."""
+        if address not in _WATCHED:
+            return
+        seen = self._goals.get(address)
+        if seen is None:
+            self._goals[address] = value, value
+        elif not seen[0] <= value <= seen[1]:
+            self._goals[address] = min(seen[0], value), max(seen[1], value)
+
+    def refused(self) -> None:
+        """The servo refused a write that had a goal in it."""
+        self._refused += 1
+
+    def torque_on(self, t: float, joint: ServoJoint, mode: int, goals: tuple[int, int]) -> None:
+        """Torque went on at time t with these goals (position, current) in force, in counts."""
+        position, current = goals
+        self._torque_on += 1
+        self._torque_t = self._last = t
+        self._current = max(self._current, abs(joint.goal_current(current)))
+        if mode in POSITION_MODES:
+            away = abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))
+            self._far += away > FAR
+            self._farthest = max(self._farthest, away)
+
+    def torque_off(self, t: float) -> None:
+        """Torque was switched off at time t."""
+        self._off_t = t
+
+    def heard(self, t: float, torque: bool) -> None:
+        """A packet that the servo understood went by at time t."""
+        if torque and t - self._last > self._quiet:
+            self._quiet = t - self._last
+        self._last = t
+
+    def fired(self, t: float) -> None:
+        """The bus watchdog stopped the motor."""
+        self._fired += 1
+        self._fired_t = t
+
+    def report(self, t: float, joint: ServoJoint, torque: bool) -> dict[str, Any]:
+        """The record at time t, in SI and in the joint's sense, as JSON takes it."""
+        angles = [joint.goal_angle(each) for each in self._goals.get(reg.GOAL_POSITION, ())]
+        currents = [joint.goal_current(each) for each in self._goals.get(reg.GOAL_CURRENT, ())]
+        quiet = t - self._last
+        return {
+            "goal_q": sorted(angles) or None,
+            "goal_current": sorted(currents) or None,
+            "goals_refused": self._refused,
+            "torque_on": {
+                "count": self._torque_on,
+                "t": self._torque_t,
+                "far": self._far,
+                "farthest": self._farthest,
+                "current": self._current,
+            },
+            "torque_off": self._off_t,
+            "quiet": quiet if torque else None,
+            "longest_quiet": max(self._quiet, quiet) if torque else self._quiet,
+            "watchdog_fired": {"count": self._fired, "t": self._fired_t},
+        }

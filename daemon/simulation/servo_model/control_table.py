@@ -1,0 +1,284 @@
+"""The control table of an emulated servo: its items, their access, defaults and ranges, its bytes.
+
+Holds the memory and says which write is allowed by the table alone. What a write does, and limits
+that depend on other registers, belong to :mod:`simulation.servo_model.servo`.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.simulation.servo_model import protocol
+
+_GAIN_MAX = 16_383
+_PROFILE_MAX = 32_767
+_OFFSET_MAX = 1_044_479
+_MULTI_TURN = 1_048_575
+_STARTUP_FIRMWARE = 45
+_LAYOUTS = 64  # spans whose layout is remembered
+_FORMATS = {
+    (1, False): "<B",
+    (2, False): "<H",
+    (4, False): "<I",
+    (1, True): "<b",
+    (2, True): "<h",
+    (4, True): "<i",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One register. ``low`` and ``high`` bound what may be written, by the table alone."""
+
+    address: int
+    size: int
+    writable: bool = False
+    default: int = 0
+    low: int = 0
+    high: int = 0
+    signed: bool = False
+    backed_up: bool = False  # RAM kept by a control table backup
+
+    @property
+    def saved(self) -> bool:
+        """Whether the register is EEPROM."""
+        return self.address < reg.RAM
+
+
+def _read_only(address: int, size: int, default: int = 0, signed: bool = False) -> Item:
+    return Item(address, size, default=default, signed=signed)
+
+
+def _setting(
+    address: int, size: int, default: int, low: int, high: int, *, backed_up: bool = False
+) -> Item:
+    return Item(address, size, True, default, low, high, low < 0, backed_up)
+
+
+def items_of(model: ServoModel, firmware: int) -> list[Item]:
+    """All registers of that model and firmware, by address."""
+    items = [
+        _read_only(reg.MODEL_NUMBER, 2, model.number),
+        _read_only(reg.MODEL_INFORMATION, 4),
+        _read_only(reg.FIRMWARE_VERSION, 1, firmware),
+        _setting(reg.ID, 1, 1, 0, 252),
+        _setting(reg.BAUD_RATE, 1, 1, 0, model.highest_baud),
+        _setting(reg.RETURN_DELAY_TIME, 1, 250, 0, 254),
+        _setting(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),
+        _setting(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, 16),
+        _setting(reg.SHADOW_ID, 1, 255, 0, 255),
+        _setting(reg.PROTOCOL_TYPE, 1, 2, 2, 2),
+        _setting(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
+        _setting(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
+        _setting(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),
+        _setting(reg.MAX_VOLTAGE_LIMIT, 2, model.voltage_max, model.voltage_min, model.voltage_max),
+        _setting(reg.MIN_VOLTAGE_LIMIT, 2, model.voltage_min, model.voltage_min, model.voltage_max),
+        _setting(reg.PWM_LIMIT, 2, 885, 0, 885),
+        _setting(reg.VELOCITY_LIMIT, 4, model.velocity_limit, 0, model.velocity_max),
+        _setting(reg.MAX_POSITION_LIMIT, 4, 4095, 0, 4095),
+        _setting(reg.MIN_POSITION_LIMIT, 4, 0, 0, 4095),
+        _setting(reg.SHUTDOWN, 1, model.shutdown, 0, 63),
+        _setting(reg.TORQUE_ENABLE, 1, 0, 0, 1),
+        _setting(reg.LED, 1, 0, 0, 1),
+        _setting(reg.STATUS_RETURN_LEVEL, 1, 2, 0, 2),
+        _read_only(reg.REGISTERED_INSTRUCTION, 1),
+        _read_only(reg.HARDWARE_ERROR_STATUS, 1),
+        _gain(reg.VELOCITY_I_GAIN, model.velocity_gains[0]),
+        _gain(reg.VELOCITY_P_GAIN, model.velocity_gains[1]),
+        _gain(reg.POSITION_D_GAIN, model.position_gains[0]),
+        _gain(reg.POSITION_I_GAIN, model.position_gains[1]),
+        _gain(reg.POSITION_P_GAIN, model.position_gains[2]),
+        _gain(reg.FEEDFORWARD_2ND_GAIN, 0),
+        _gain(reg.FEEDFORWARD_1ST_GAIN, 0),
+        _setting(reg.BUS_WATCHDOG, 1, 0, 0, reg.WATCHDOG_MAX),
+        _setting(reg.GOAL_PWM, 2, 885, -885, 885),
+        _setting(reg.GOAL_VELOCITY, 4, 0, -model.velocity_max, model.velocity_max),
+        _setting(reg.PROFILE_ACCELERATION, 4, 0, 0, _PROFILE_MAX, backed_up=True),
+        _setting(reg.PROFILE_VELOCITY, 4, 0, 0, _PROFILE_MAX, backed_up=True),
+        _setting(reg.GOAL_POSITION, 4, 0, -_MULTI_TURN, _MULTI_TURN),
+        _read_only(reg.REALTIME_TICK, 2),
+        _read_only(reg.MOVING, 1),
+        _read_only(reg.MOVING_STATUS, 1),
+        _read_only(reg.PRESENT_PWM, 2, signed=True),
+        _read_only(reg.PRESENT_CURRENT, 2, signed=True),
+        _read_only(reg.PRESENT_VELOCITY, 4, signed=True),
+        _read_only(reg.PRESENT_POSITION, 4, signed=True),
+        _read_only(reg.VELOCITY_TRAJECTORY, 4, signed=True),
+        _read_only(reg.POSITION_TRAJECTORY, 4, signed=True),
+        _read_only(reg.PRESENT_INPUT_VOLTAGE, 2),
+        _read_only(reg.PRESENT_TEMPERATURE, 1),
+    ]
+    if model.senses_current:
+        limit = model.current_limit
+        items.append(_setting(reg.CURRENT_LIMIT, 2, limit, 0, limit))
+        items.append(_setting(reg.GOAL_CURRENT, 2, limit, -limit, limit))
+    if model.pwm_slope is not None:
+        items.append(_setting(reg.PWM_SLOPE, 1, model.pwm_slope, 1, 255))
+    if firmware >= _STARTUP_FIRMWARE:
+        items.append(_setting(reg.STARTUP_CONFIGURATION, 1, 0, 0, 3))
+        items.append(_read_only(reg.BACKUP_READY, 1))
+    highest = model.highest_address(firmware)
+    for address, data, entries in model.indirect_blocks(firmware):
+        for i in range(entries):
+            items.append(_setting(address + 2 * i, 2, data + i, reg.RAM, highest, backed_up=True))
+            items.append(_setting(data + i, 1, 0, 0, 255))
+    return sorted(items, key=lambda item: item.address)
+
+
+def _gain(address: int, default: int) -> Item:
+    return _setting(address, 2, default, 0, _GAIN_MAX, backed_up=True)
+
+
+class ControlTable:
+    """The registers' bytes, with access by value and by the span of a packet.
+
+    Addresses between the items read as 0. ``memory`` may be written directly by the servo.
+    """
+
+    def __init__(self, model: ServoModel, firmware: int) -> None:
+        self.items = items_of(model, firmware)
+        self.size = model.highest_address(firmware) + 1
+        self.memory = bytearray(self.size)
+        self.at = {item.address: item for item in self.items}
+        self._start: list[int | None] = [None] * self.size  # byte → its item's first address
+        for item in self.items:
+            self._start[item.address : item.address + item.size] = [item.address] * item.size
+        self._indirect = {
+            data + i: address + 2 * i
+            for address, data, entries in model.indirect_blocks(firmware)
+            for i in range(entries)
+        }
+        self._first_indirect = min(self._indirect)
+        self._unpack = {
+            item.address: struct.Struct(_FORMATS[item.size, item.signed]).unpack_from
+            for item in self.items
+        }
+        self._pack = {
+            item.address: struct.Struct(_FORMATS[item.size, item.signed]).pack_into
+            for item in self.items
+        }
+        self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int, int]]]] = {}
+        self.reset()
+
+    def reset(self, keep: tuple[int, ...] = ()) -> None:
+        """Factory defaults everywhere but in the items at the addresses ``keep``."""
+        for item in self.items:
+            if item.address not in keep:
+                self.set(item.address, item.default)
+
+    def reset_ram(self, keep_backed_up: bool = False) -> None:
+        """RAM back to its defaults, as after a power-up."""
+        for item in self.items:
+            if not item.saved and not (keep_backed_up and item.backed_up):
+                self.set(item.address, item.default)
+
+    def get(self, address: int) -> int:
+        """Value of the item at that address."""
+        value: int = self._unpack[address](self.memory, address)[0]
+        return value
+
+    def put(self, item: Item, value: int) -> None:
+        """Store a value that lies in the item's range."""
+        self._pack[item.address](self.memory, item.address, value)
+        if item.backed_up:
+            self._layouts.clear()
+
+    def set(self, address: int, value: int) -> None:
+        """Store a value, access rights aside; too great a value keeps its low bytes."""
+        item = self.at[address]
+        mask = (1 << 8 * item.size) - 1
+        self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
+        if item.backed_up:  # indirect addresses are among these
+            self._layouts.clear()
+
+    def holds(self, address: int, length: int) -> bool:
+        """Whether the span lies inside the table."""
+        return length > 0 and address + length <= self.size
+
+    def resolve(self, address: int) -> int:
+        """Where a byte really is: indirect data stands for the register its address names."""
+        pointer = self._indirect.get(address)
+        if pointer is None:
+            return address
+        return self.memory[pointer] | self.memory[pointer + 1] << 8
+
+    def read(self, address: int, length: int) -> bytes:
+        """The bytes of a span inside the table, indirect data resolved."""
+        end = address + length
+        if end <= self._first_indirect:
+            return bytes(self.memory[address:end])
+        memory, resolve = self.memory, self.resolve
+        return bytes(memory[resolve(i)] for i in range(address, end))
+
+    def reads(self, address: int, length: int, first: int, last: int) -> bool:
+        """Whether reading the span shows any byte of ``first`` … ``last``."""
+        end = address + length
+        if address <= last and end > first:
+            return True
+        if end <= self._first_indirect:
+            return False
+        return any(first <= self.resolve(i) <= last for i in range(address, end))
+
+    def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
+        """What a write would do by the table alone: (error, the items with their new values).
+
+        Every item must be written whole; one that is cut gives DATA_LENGTH, a read-only or
+        undefined byte ACCESS, a value out of the item's own range DATA_RANGE. With an error
+        nothing is to be written, the items before the bad one neither.
+        """
+        error, layout = self._layout(address, len(data))
+        if error:
+            return error, []
+        plan: list[tuple[Item, int]] = []
+        for item, begin, _ in layout:
+            (value,) = self._unpack[item.address](data, begin)
+            if not item.low <= value <= item.high:
+                return protocol.DATA_RANGE, []
+            plan.append((item, value))
+        return protocol.OK, plan
+
+    def values(self, address: int, data: bytes) -> dict[int, int]:
+        """What a write has for each register that it holds whole, allowed or not."""
+        places = [self.resolve(i) for i in range(address, min(address + len(data), self.size))]
+        found = {}
+        for i, place in enumerate(places):
+            item = self.at.get(place)
+            if item is not None and places[i : i + item.size] == list(
+                range(place, place + item.size)
+            ):
+                raw = data[i : i + item.size]
+                found[place] = int.from_bytes(raw, "little", signed=item.signed)
+        return found
+
+    def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
+        """Which items a span writes, with their places in its data, or the error it makes."""
+        known = self._layouts.get((address, length))
+        if known is None:
+            known = self._lay_out(address, length)
+            if len(self._layouts) < _LAYOUTS:
+                self._layouts[address, length] = known
+        return known
+
+    def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
+        if length == 0:
+            return protocol.DATA_LENGTH, []
+        if address + length > self.size:
+            return protocol.ACCESS, []
+        places = [self.resolve(i) for i in range(address, address + length)]
+        layout: list[tuple[Item, int, int]] = []
+        i = 0
+        while i < length:
+            start = self._start[places[i]]
+            if start is None:
+                return protocol.ACCESS, []
+            item = self.at[start]
+            if not item.writable or places[i] != start:
+                return protocol.ACCESS, []
+            if places[i : i + item.size] != list(range(start, start + item.size)):
+                return protocol.DATA_LENGTH, []
+            layout.append((item, i, i + item.size))
+            i += item.size
+        return protocol.OK, layout

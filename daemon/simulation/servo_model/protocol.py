@@ -1,0 +1,186 @@
+"""Dynamixel Protocol 2.0 framing as a servo does it: CRC, byte stuffing, packets and their parser.
+
+Bytes in, bytes out; no port and no control table. It shares no code with the SDK nor with our own
+packet handler, so that a test of one against the other means something.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from softfinger.daemon.servos.crc import crc16
+
+HEADER: Final = b"\xff\xff\xfd"
+BROADCAST: Final = 0xFE
+
+PING: Final = 0x01
+READ: Final = 0x02
+WRITE: Final = 0x03
+REG_WRITE: Final = 0x04
+ACTION: Final = 0x05
+FACTORY_RESET: Final = 0x06
+REBOOT: Final = 0x08
+CLEAR: Final = 0x10
+BACKUP: Final = 0x20
+STATUS: Final = 0x55
+SYNC_READ: Final = 0x82
+SYNC_WRITE: Final = 0x83
+FAST_SYNC_READ: Final = 0x8A
+BULK_READ: Final = 0x92
+BULK_WRITE: Final = 0x93
+FAST_BULK_READ: Final = 0x9A
+
+# Error numbers of a status packet; bit 7 beside them tells of a hardware error.
+OK: Final = 0x00
+RESULT_FAIL: Final = 0x01
+INSTRUCTION_ERROR: Final = 0x02
+CRC_ERROR: Final = 0x03
+DATA_RANGE: Final = 0x04
+DATA_LENGTH: Final = 0x05
+DATA_LIMIT: Final = 0x06
+ACCESS: Final = 0x07
+ALERT: Final = 0x80
+
+MAX_LENGTH: Final = 1024  # longest packet a servo takes; a longer length field is noise
+_PREFIX: Final = HEADER + b"\x00"
+_STUFFED: Final = HEADER + b"\xfd"
+_ASKED_AGAIN: Final = frozenset((READ, SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ))
+_KNOWN: Final = 32  # requests remembered
+
+
+def stuff(body: bytes) -> bytes:
+    """``body`` (instruction and parameters) with an FD after each FF FF FD."""
+    return body.replace(HEADER, _STUFFED)
+
+
+def unstuff(body: bytes) -> bytes:
+    """The inverse of :func:`stuff`."""
+    return body.replace(_STUFFED, HEADER)
+
+
+def frame(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """A whole packet on the wire: header, stuffed body, length that counts the stuffing, CRC."""
+    body = bytes((instruction,)) + parameters
+    if HEADER in body:
+        body = stuff(body)
+    length = len(body) + 2
+    packet = _PREFIX + bytes((packet_id, length & 0xFF, length >> 8)) + body
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+def status(packet_id: int, error: int, data: bytes = b"") -> bytes:
+    """A status packet."""
+    return frame(packet_id, STATUS, bytes((error,)) + data)
+
+
+def fast_head(length: int) -> bytes:
+    """How the one reply to a fast group read begins."""
+    return _PREFIX + bytes((BROADCAST, length & 0xFF, length >> 8 & 0xFF, STATUS))
+
+
+class Packet(NamedTuple):
+    """One packet taken off the wire. ``valid`` is False when only its CRC was wrong."""
+
+    id: int
+    instruction: int
+    parameters: bytes
+    valid: bool
+    size: int  # bytes it took on the wire
+
+
+class Parser:
+    """Packets out of a byte stream, as a servo finds them.
+
+    A header inside a packet (FF FF FD not followed by FD, where stuffing is due) throws away the
+    packet begun before it, as does silence of more than ``gap`` seconds within a packet; so a
+    frame that was sent unstuffed is never obeyed.
+    """
+
+    def __init__(self, gap: float = 0.0015) -> None:
+        self.gap = gap
+        self.dropped = 0  # bytes that belonged to no packet
+        self._buffer = bytearray()
+        self._known: dict[bytes, list[Packet]] = {}
+        self._last = 0.0
+
+    def feed(self, data: bytes, t: float) -> list[Packet]:
+        """The packets that ``data``, arriving at time t [s], completes."""
+        buffer = self._buffer
+        if buffer and t - self._last > self.gap:
+            self.dropped += len(buffer)
+            buffer.clear()
+        self._last = t
+        if not buffer:
+            known = self._known.get(data)
+            if known is not None:
+                return known
+        whole = not buffer
+        buffer += data
+        packets: list[Packet] = []
+        while (packet := self._next()) is not None:
+            packets.append(packet)
+        if whole and len(packets) == 1 and packets[0].size == len(data):
+            self._remember(data, packets)
+        return packets
+
+    def _remember(self, data: bytes, packets: list[Packet]) -> None:
+        """A client asks the same thing tick after tick."""
+        if packets[0].instruction in _ASKED_AGAIN and len(self._known) < _KNOWN:
+            self._known[data] = packets
+
+    def reset(self) -> None:
+        """Forget a packet begun."""
+        self._buffer.clear()
+
+    def _drop(self, count: int) -> None:
+        self.dropped += count
+        del self._buffer[:count]
+
+    def _next(self) -> Packet | None:
+        buffer = self._buffer
+        while buffer:
+            start = buffer.find(_PREFIX)
+            if start < 0:
+                # Keep what may be the beginning of a header.
+                keep = next((n for n in (3, 2, 1) if buffer.endswith(_PREFIX[:n])), 0)
+                if len(buffer) > keep:
+                    self._drop(len(buffer) - keep)
+                return None
+            if start:
+                self._drop(start)
+            if len(buffer) < 7:
+                return None
+            packet_id = buffer[4]
+            length = buffer[5] | buffer[6] << 8
+            if packet_id in (0xFD, 0xFF) or not 3 <= length <= MAX_LENGTH - 7:
+                self._drop(len(HEADER))
+                continue
+            end = 7 + length
+            intruder = self._header_within(min(end - 2, len(buffer)))
+            if intruder >= 0:
+                self._drop(intruder)
+                continue
+            if len(buffer) < end:
+                return None
+            raw = bytes(buffer[:end])
+            del buffer[:end]
+            valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
+            body = raw[7:-2]
+            if _STUFFED in body:
+                body = unstuff(body)
+            return Packet(packet_id, body[0], body[1:], valid, end)
+        return None
+
+    def _header_within(self, end: int) -> int:
+        """Where an unstuffed FF FF FD stands in the body so far received, or -1."""
+        buffer = self._buffer
+        at = buffer.find(HEADER, 7, end)
+        while at >= 0:
+            after = at + len(HEADER)
+            if after >= end:
+                # The deciding byte is not here yet, or the body ends with a lone FF FF FD.
+                return at if after < len(buffer) else -1
+            if buffer[after] != 0xFD:
+                return at
+            at = buffer.find(HEADER, after, end)
+        return -1

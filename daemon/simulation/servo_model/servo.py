@@ -1,0 +1,425 @@
+"""One emulated Dynamixel X servo: what its registers mean, over a joint of a plant.
+
+Holds the behaviour behind the control table: torque, operating modes, limits, profiles, bus
+watchdog, hardware errors and shutdown, reboot, backup. Packets are the bus's affair
+(:mod:`simulation.servo_model.servo_bus`). Choices of our own, where the manuals say nothing: a
+write that breaks any rule changes nothing at all; torque on after a shutdown is refused with
+RESULT_FAIL.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.simulation.physics.joint_plant import JointPlant
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.bus_recorder import WireWatch
+from softfinger.daemon.simulation.servo_model.control_table import ControlTable, Item
+from softfinger.daemon.simulation.servo_model.servo_health import SENSE, ServoHealth
+from softfinger.daemon.simulation.servo_model.servo_joint import STEP, ServoJoint
+from softfinger.daemon.simulation.servo_model.servo_rules import refusal, shut_down
+from softfinger.daemon.simulation.servo_model.table_backup import TableBackup
+
+REBOOT_TIME = 0.34  # s without an answer
+JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
+# Registers whose writing does more than change them.
+_EFFECTIVE = frozenset(
+    (
+        reg.TORQUE_ENABLE,
+        reg.OPERATING_MODE,
+        reg.GOAL_POSITION,
+        reg.GOAL_VELOCITY,
+        reg.BUS_WATCHDOG,
+    )
+)
+_MOTION_END = reg.PRESENT_POSITION + 4
+_CLEAR_FIRMWARE = 42
+_BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
+_CLEAR_KEY = b"\x01DXL\x22"
+_BACKUP_KEY = b"CTRL"
+
+
+class EmulatedServo:
+    """A servo on joint ``joint`` of ``plant``, factory-new unless ``prepared``.
+
+    ``prepared`` brings it up as the backend wants it: in operating mode ``mode`` where the model
+    has it, and with no return delay. What ``health`` has may be set from outside; ``silent`` makes
+    it deaf and dumb, with ``frozen`` what it measures stands still, its time included, and with
+    ``refuses`` it answers every reading with an error.
+    """
+
+    def __init__(
+        self,
+        model: ServoModel,
+        servo_id: int,
+        plant: JointPlant,
+        joint: int,
+        scale: JointScale,
+        *,
+        firmware: int | None = None,
+        prepared: bool = False,
+        mode: int = reg.CURRENT_BASED_POSITION_MODE,
+        baud_index: int = 1,
+        t: float = 0.0,
+    ) -> None:
+        self.model = model
+        self.firmware = model.firmware if firmware is None else firmware
+        self.fast_reads = model.fast_read(self.firmware)  # answers fast sync and fast bulk read
+        self.table = ControlTable(model, self.firmware)
+        self.silent = self.frozen = self.refuses = False
+        self.health = ServoHealth(model)
+        self._joint = ServoJoint(model, self.table, plant, joint, scale)
+        self.watch = WireWatch(t)
+        self._registered: tuple[int, bytes] | None = None
+        self._backup = TableBackup(self.table)
+        self._watched = 0.0  # time of the last packet the watchdog knows of
+        self._booted = t
+        self._boot_at = -math.inf  # a reboot ends then
+        self._next_step = math.inf
+        self._next_sense = t
+        self.table.set(reg.ID, servo_id)
+        self.table.set(reg.BAUD_RATE, baud_index)
+        if prepared:
+            self.table.set(reg.RETURN_DELAY_TIME, 0)
+            if mode in model.modes:
+                self.table.set(reg.OPERATING_MODE, mode)
+        self._start(t)
+
+    # --- state that the bus asks for -------------------------------------------------------
+
+    @property
+    def id(self) -> int:
+        """The ID it answers to."""
+        return self.table.memory[reg.ID]
+
+    @property
+    def shadow_id(self) -> int:
+        """The second ID it obeys without answering; above 252 it has none."""
+        return self.table.memory[reg.SHADOW_ID]
+
+    @property
+    def baud(self) -> int:
+        """The rate it listens at."""
+        return reg.BAUD_RATES[self.table.memory[reg.BAUD_RATE]]
+
+    @property
+    def return_delay(self) -> float:
+        """Seconds between an instruction and its reply."""
+        return self.table.memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
+
+    @property
+    def status_return_level(self) -> int:
+        """0 answers pings only, 1 reads too, 2 everything."""
+        return self.table.memory[reg.STATUS_RETURN_LEVEL]
+
+    @property
+    def alert(self) -> int:
+        """The alert bit of its status packets."""
+        return protocol.ALERT if self.table.memory[reg.HARDWARE_ERROR_STATUS] else 0
+
+    @property
+    def torque_on(self) -> bool:
+        """Whether the motor is driven."""
+        return bool(self.table.memory[reg.TORQUE_ENABLE])
+
+    @property
+    def mode(self) -> int:
+        """The operating mode."""
+        return self.table.memory[reg.OPERATING_MODE]
+
+    def awake(self, t: float) -> bool:
+        """Whether it hears and answers at time t: neither silent nor rebooting."""
+        return not self.silent and t >= self._boot_at
+
+    # --- time ------------------------------------------------------------------------------
+
+    def heard(self, t: float) -> None:
+        """An instruction packet went by: the bus watchdog starts anew."""
+        self._watched = t
+        self.watch.heard(t, self.torque_on)
+
+    def next_event(self) -> float:
+        """When :meth:`act` next has something to do [s]."""
+        due = min(self._next_step, self._next_sense)
+        if self._boot_at > -math.inf:
+            return min(due, self._boot_at)
+        ticks = self.table.memory[reg.BUS_WATCHDOG]
+        if 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on:
+            due = min(due, self._watched + ticks * reg.WATCHDOG_UNIT)
+        return due
+
+    def act(self, t: float) -> None:
+        """Do what is due at time t; the plant must have been advanced to it."""
+        if self._boot_at > -math.inf:
+            if t < self._boot_at:
+                self._next_sense = max(self._next_sense, self._boot_at)
+                return
+            self._boot_at = -math.inf
+            self._start(t)
+        ticks = self.table.memory[reg.BUS_WATCHDOG]
+        armed = 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on
+        if armed and t >= self._watched + ticks * reg.WATCHDOG_UNIT:
+            self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
+            self.watch.fired(t)
+            self._stop()
+        if t >= self._next_step:
+            if self.torque_on and self._joint.moves_by_itself():
+                self._next_step = t + STEP
+                self._joint.follow()
+            else:
+                self._next_step = math.inf
+        if t >= self._next_sense:
+            self._next_sense = t + SENSE
+            self._sense()
+
+    # --- instructions ----------------------------------------------------------------------
+
+    def read(self, address: int, length: int, t: float) -> bytes | None:
+        """The bytes of a span, or None when it does not lie inside the table."""
+        table = self.table
+        if not table.holds(address, length) or self.refuses:
+            return None
+        if self.frozen:
+            return table.read(address, length)
+        if address >= reg.PRESENT_CURRENT and address + length <= _MOTION_END:
+            self._joint.refresh_motion()
+        elif table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
+            self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
+        return table.read(address, length)
+
+    def write(self, address: int, data: bytes, t: float) -> int:
+        """Write a span; the error number, 0 when all of it was done."""
+        error, plan = self._checked(address, data)
+        if error:
+            return error
+        limp = not self.torque_on
+        for item, value in plan:
+            self.table.put(item, value)
+        for item, value in plan:
+            if item.address in _EFFECTIVE:
+                self._effect(item.address, value, t)
+        if self.torque_on and self._joint.moves_by_itself():
+            self._next_step = min(self._next_step, t + STEP)
+        if limp and self.torque_on:
+            self._note_torque(t)
+        elif not limp and not self.torque_on:
+            self.watch.torque_off(t)
+        self._joint.drive()
+        return protocol.OK
+
+    def register(self, address: int, data: bytes) -> int:
+        """Keep a write for :meth:`action`."""
+        error, _ = self._checked(address, data)
+        if error == protocol.OK:
+            self._registered = (address, data)
+            self.table.set(reg.REGISTERED_INSTRUCTION, 1)
+        return error
+
+    def action(self, t: float) -> int:
+        """Do the write that was kept."""
+        if self._registered is None:
+            return protocol.INSTRUCTION_ERROR
+        address, data = self._registered
+        self._registered = None
+        self.table.set(reg.REGISTERED_INSTRUCTION, 0)
+        return self.write(address, data, t)
+
+    def reboot(self, t: float) -> None:
+        """Torque off, silence for REBOOT_TIME, then RAM as after power-up."""
+        self.table.set(reg.TORQUE_ENABLE, 0)
+        self._joint.drive()
+        self._next_step = math.inf
+        self._boot_at = t + REBOOT_TIME
+        self._next_sense = self._boot_at
+
+    def factory_reset(self, option: int, t: float) -> int:
+        """Factory defaults (0xFF all, 1 keeps the ID, 2 the baud rate too), then a reboot."""
+        keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option)
+        if keep is None:
+            return protocol.DATA_RANGE
+        self.table.set(reg.TORQUE_ENABLE, 0)
+        self.table.reset(keep)
+        self.reboot(t)
+        return protocol.OK
+
+    def clear(self, parameters: bytes, t: float) -> int:
+        """Bring the position back into one turn; fails while the shaft moves."""
+        if self.firmware < _CLEAR_FIRMWARE:
+            return protocol.INSTRUCTION_ERROR
+        if parameters != _CLEAR_KEY:
+            return protocol.DATA_RANGE
+        self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
+        if self.table.memory[reg.MOVING]:
+            return protocol.RESULT_FAIL
+        shift = self._joint.forget_turns()
+        self.table.set(reg.GOAL_POSITION, self.table.get(reg.GOAL_POSITION) - shift)
+        self._joint.profile.hold(self._joint.profile.position - shift)
+        self._joint.drive()
+        return protocol.OK
+
+    def backup(self, parameters: bytes, t: float) -> int:
+        """Store the control table (1), or restore its EEPROM and reboot (2)."""
+        if self.firmware < _BACKUP_FIRMWARE[self.model.small]:
+            return protocol.INSTRUCTION_ERROR
+        if len(parameters) != 5 or parameters[1:] != _BACKUP_KEY or parameters[0] not in (1, 2):
+            return protocol.DATA_RANGE
+        if self.torque_on:
+            return protocol.RESULT_FAIL
+        if parameters[0] == 1:
+            self._backup.store()
+            return protocol.OK
+        if not self._backup.held:
+            return protocol.RESULT_FAIL
+        self._backup.restore(saved=True)
+        self.reboot(t)
+        return protocol.OK
+
+    def fail(self, bit: int) -> None:
+        """A hardware error: told by the alert bit, and a shutdown if the mask has its bit."""
+        status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
+        self.table.set(reg.HARDWARE_ERROR_STATUS, status)
+        if shut_down(self.table) and self.torque_on:
+            self.table.set(reg.TORQUE_ENABLE, 0)
+            self._joint.drive()
+
+    def forget(self, t: float) -> None:
+        """Begin the record anew."""
+        self.watch = WireWatch(t)
+
+    def report(self, t: float) -> dict[str, Any]:
+        """Its state, and what it was told since the record began."""
+        ticks = self.table.memory[reg.BUS_WATCHDOG]
+        return {
+            "id": self.id,
+            "torque": self.torque_on,
+            "mode": self.mode,
+            "hardware_error": self.table.memory[reg.HARDWARE_ERROR_STATUS],
+            "watchdog": ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else None,
+            "stopped_by_watchdog": ticks == reg.WATCHDOG_ERROR,
+            "q": self._joint.goal_angle(self._joint.position()),
+            **self.watch.report(t, self._joint, self.torque_on),
+        }
+
+    def stick(self) -> None:
+        """Its encoder and its current's sensor stand still from now on: angle kept, the rest 0."""
+        self._joint.stuck = self._joint.encoder()
+
+    def jump(self) -> None:
+        """Its encoder's zero jumps, as by a magnet that slips."""
+        self._joint.shift += JUMP
+
+    def recover(self) -> None:
+        """Cool down, bring the supply back and measure well again.
+
+        A latched hardware error stays until a reboot.
+        """
+        self.health.recover()
+        self.frozen = self.refuses = False
+        self._joint.stuck, self._joint.shift = None, 0
+
+    # --- rules of writing ------------------------------------------------------------------
+
+    def _checked(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
+        error, plan = self.table.plan(address, data)
+        for item, value in plan:
+            self.watch.goal(item.address, value)
+            error = error or refusal(self.table, self.model, item, value)
+        if error:
+            self._note_refused(address, data)
+            return error, []
+        return protocol.OK, plan
+
+    def _note_refused(self, address: int, data: bytes) -> None:
+        """Goals that were on the wire though the table would not have them."""
+        values = self.table.values(address, data)
+        if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
+            self.watch.refused()
+        for each, value in values.items():
+            self.watch.goal(each, value)
+
+    def _note_torque(self, t: float) -> None:
+        current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
+        goals = self.table.get(reg.GOAL_POSITION), current
+        self.watch.torque_on(t, self._joint, self.mode, goals)
+
+    def _effect(self, address: int, value: int, t: float) -> None:
+        if address == reg.TORQUE_ENABLE:
+            if self.mode == reg.POSITION_MODE and value:
+                self._joint.forget_turns()
+            self._joint.hold()
+            self._watched = t
+            if value:
+                self._joint.aim()
+        elif address == reg.OPERATING_MODE:
+            self._reset_mode()
+        elif address in (reg.GOAL_POSITION, reg.GOAL_VELOCITY) and self.torque_on:
+            self._joint.aim()
+        elif address == reg.BUS_WATCHDOG:
+            self._watched = t
+
+    def _reset_mode(self) -> None:
+        table = self.table
+        for item in table.items:
+            if reg.VELOCITY_I_GAIN <= item.address <= reg.FEEDFORWARD_1ST_GAIN:
+                table.set(item.address, item.default)
+        table.set(reg.PROFILE_ACCELERATION, 0)
+        table.set(reg.PROFILE_VELOCITY, 0)
+        if self.mode == reg.POSITION_MODE:
+            self._joint.forget_turns()
+        self._reset_goals()
+
+    def _reset_goals(self) -> None:
+        table = self.table
+        table.set(reg.GOAL_PWM, table.get(reg.PWM_LIMIT))
+        table.set(reg.GOAL_VELOCITY, 0)
+        if self.model.senses_current:
+            table.set(reg.GOAL_CURRENT, table.get(reg.CURRENT_LIMIT))
+        table.set(reg.GOAL_POSITION, self._joint.position())
+
+    def _start(self, t: float) -> None:
+        """Power-up, or the end of a reboot."""
+        table = self.table
+        known = reg.STARTUP_CONFIGURATION in table.at
+        startup = table.memory[reg.STARTUP_CONFIGURATION] if known else 0
+        table.reset_ram()
+        if self._backup.held:
+            if startup & 2:
+                self._backup.restore(saved=False)
+            self._backup.tell()
+        self._registered = None
+        self.health.restart()
+        self._booted = self._watched = t
+        self._joint.forget_turns()
+        self._reset_goals()
+        self._joint.hold()
+        self._next_step = math.inf
+        self._next_sense = t + SENSE
+        if startup & 1:
+            table.set(reg.TORQUE_ENABLE, 1)
+        self._joint.drive()
+
+    # --- what happens by itself ------------------------------------------------------------
+
+    def _stop(self) -> None:
+        """The bus watchdog's stop: stand where the shaft is, with torque still on."""
+        table = self.table
+        if self.mode == reg.CURRENT_MODE:
+            table.set(reg.GOAL_CURRENT, 0)
+        elif self.mode == reg.PWM_MODE:
+            table.set(reg.GOAL_PWM, 0)
+        table.set(reg.GOAL_VELOCITY, 0)
+        table.set(reg.PROFILE_ACCELERATION, 0)
+        table.set(reg.PROFILE_VELOCITY, 0)
+        table.set(reg.GOAL_POSITION, self._joint.position())
+        self._joint.hold()
+        self._joint.drive()
+
+    def _sense(self) -> None:
+        current = self._joint.current
+        pressed = self.torque_on and current >= 0.99 * self._joint.current_limit
+        for bit in self.health.sense(self.table, current, pressed):
+            self.fail(bit)

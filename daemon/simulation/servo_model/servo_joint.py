@@ -1,0 +1,217 @@
+"""The mechanical side of an emulated servo: between its registers and a joint of the plant.
+
+Maps counts to angles (turns, homing offset, drive direction), follows the profile, tells the plant
+what each operating mode means, and writes the present values into the control table.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.simulation.physics.joint_plant import JointPlant
+from softfinger.daemon.simulation.servo_model.control_table import ControlTable
+from softfinger.daemon.simulation.servo_model.trajectory import Profile
+
+STEP = 0.001  # s: trajectories, velocity and PWM modes
+POSITION_MODES = (
+    reg.POSITION_MODE,
+    reg.EXTENDED_POSITION_MODE,
+    reg.CURRENT_BASED_POSITION_MODE,
+)
+_PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s a count
+_PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
+_ARRIVED = 20  # counts from the goal that count as there
+_PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
+_MOTION = struct.Struct("<hii")  # registers 126 … 135
+_U32 = struct.Struct("<I").unpack_from
+_I32 = struct.Struct("<i").unpack_from
+_I16 = struct.Struct("<h").unpack_from
+
+
+class ServoJoint:
+    """Joint ``joint`` of ``plant`` as the servo with this control table sees it."""
+
+    def __init__(
+        self,
+        model: ServoModel,
+        table: ControlTable,
+        plant: JointPlant,
+        joint: int,
+        scale: JointScale,
+    ) -> None:
+        self.profile = Profile()
+        self._model = model
+        self._table = table
+        self._plant = plant
+        self._joint = joint
+        self._scale = scale
+        self.stuck: int | None = None  # where the encoder stands still [counts]
+        self.shift = 0  # counts that it tells too many
+        self._turns = 0  # whole turns that the position has forgotten
+        self._load = scale.direction / model.stall_current  # share of stall current, counts' sign
+        self._speed = scale.direction * reg.VELOCITY_UNIT / scale.velocity / model.no_load_speed
+
+    @property
+    def sign(self) -> int:
+        """-1 in reverse drive mode."""
+        return -1 if self._table.memory[reg.DRIVE_MODE] & 1 else 1
+
+    @property
+    def current(self) -> float:
+        """Magnitude of the motor current [A]."""
+        return abs(float(self._plant.current[self._joint]))
+
+    @property
+    def current_limit(self) -> float:
+        """The greatest current that the registers allow [A]."""
+        if not self._model.senses_current:
+            return self._model.stall_current
+        return self._table.get(reg.CURRENT_LIMIT) * self._model.current_unit
+
+    # --- position ----------------------------------------------------------------------------
+
+    def encoder(self) -> int:
+        """What the encoder tells, in counts of all turns."""
+        if self.stuck is not None:
+            return self.stuck
+        return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
+
+    def forget_turns(self) -> int:
+        """Bring the position into one turn; by how many counts it fell."""
+        before = self._turns
+        self._turns = self.encoder() // reg.COUNTS_PER_TURN
+        return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
+
+    def position(self) -> int:
+        """Present position in counts, as register 132 tells it."""
+        within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
+        memory = self._table.memory
+        if memory[reg.DRIVE_MODE] & 1:
+            within = -within
+        return within + int(_I32(memory, reg.HOMING_OFFSET)[0])
+
+    def _angle(self, position: float) -> float:
+        within = self.sign * (position - _I32(self._table.memory, reg.HOMING_OFFSET)[0])
+        return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
+
+    def goal_angle(self, counts: int) -> float:
+        """Joint angle [rad] that a goal position means."""
+        return self._angle(counts)
+
+    def goal_current(self, counts: int) -> float:
+        """Current [A] that a goal current means, positive closing; in a bound its sign is void."""
+        return self._scale.amperes(self.sign * counts)
+
+    # --- trajectory --------------------------------------------------------------------------
+
+    def hold(self) -> None:
+        """End the trajectory where the shaft is."""
+        self.profile.hold(self.position())
+
+    def aim(self) -> None:
+        """Start the trajectory to the goal position as the profile registers ask."""
+        table, profile = self._table, self.profile
+        if table.memory[reg.OPERATING_MODE] not in POSITION_MODES:
+            return
+        target = float(_I32(table.memory, reg.GOAL_POSITION)[0])
+        speed = _U32(table.memory, reg.PROFILE_VELOCITY)[0]
+        acceleration = _U32(table.memory, reg.PROFILE_ACCELERATION)[0]
+        if not speed and not acceleration:
+            profile.hold(target)
+        elif table.memory[reg.DRIVE_MODE] & 4:
+            profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
+        else:
+            profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
+
+    def moves_by_itself(self) -> bool:
+        """Whether :meth:`follow` has work while torque is on."""
+        mode = self._table.memory[reg.OPERATING_MODE]
+        if mode in POSITION_MODES:
+            return self.profile.busy
+        return mode in (reg.VELOCITY_MODE, reg.PWM_MODE)
+
+    def follow(self) -> None:
+        """One STEP of whatever moves by itself."""
+        mode = self._table.memory[reg.OPERATING_MODE]
+        if mode in POSITION_MODES:
+            self.profile.step(STEP)
+        elif mode == reg.VELOCITY_MODE:
+            self.profile.velocity = self._table.get(reg.GOAL_VELOCITY) * _PER_VELOCITY
+            self.profile.position += self.profile.velocity * STEP
+        self.drive()
+
+    # --- plant -------------------------------------------------------------------------------
+
+    def drive(self) -> None:
+        """Tell the plant what the registers say."""
+        table, joint = self._table, self._joint
+        mode = table.memory[reg.OPERATING_MODE]
+        if not table.memory[reg.TORQUE_ENABLE]:
+            self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
+        elif mode == reg.CURRENT_BASED_POSITION_MODE:
+            bound = abs(_I16(table.memory, reg.GOAL_CURRENT)[0]) * self._model.current_unit
+            goal = self._angle(self.profile.position)
+            self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
+        elif mode == reg.CURRENT_MODE:
+            current = self._scale.amperes(self.sign * table.get(reg.GOAL_CURRENT))
+            self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
+        elif mode == reg.PWM_MODE:
+            self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, self._pwm_current())
+        else:
+            goal = self._angle(self.profile.position)
+            self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
+
+    def _pwm_current(self) -> float:
+        """Current [A] under goal PWM: supply less back-EMF, over the resistance."""
+        duty = self.sign * self._scale.direction * self._table.get(reg.GOAL_PWM) / 885.0
+        speed = float(self._plant.dq[self._joint]) * self._scale.direction * self._speed
+        return self._model.stall_current * (duty - speed)
+
+    def _motion(self) -> tuple[int, int, int]:
+        """Registers 126, 128 and 132: current (or load), velocity, position."""
+        if self.stuck is not None:
+            return 0, 0, self.position()
+        plant, joint, scale = self._plant, self._joint, self._scale
+        sign = self.sign
+        ampere = plant.current.item(joint)
+        if self._model.senses_current:
+            current = sign * scale.current_counts(ampere)
+        else:  # the register is present load, 0.1 %
+            current = round(sign * 1000.0 * self._load * ampere)
+        velocity = sign * scale.velocity_counts(plant.dq.item(joint))
+        return max(-32768, min(32767, current)), velocity, self.position()
+
+    def refresh_motion(self) -> None:
+        """Bring registers 126 … 135 up to date, which is all that most reads ask for."""
+        _MOTION.pack_into(self._table.memory, reg.PRESENT_CURRENT, *self._motion())
+
+    def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
+        """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
+        profile, memory = self.profile, self._table.memory
+        current, velocity, position = self._motion()
+        pwm = 0
+        if memory[reg.TORQUE_ENABLE]:
+            ampere, rate = self._plant.current.item(self._joint), self._plant.dq.item(self._joint)
+            duty = self._load * ampere + self._speed * rate
+            pwm = max(-885, min(885, round(self.sign * 885.0 * duty)))
+        busy = profile.busy
+        arrived = not busy and abs(profile.target - position) <= _ARRIVED
+        _PRESENT.pack_into(
+            memory,
+            reg.REALTIME_TICK,
+            int(seconds * 1000.0 + 1e-6) & 0x7FFF,
+            abs(velocity) > _U32(memory, reg.MOVING_THRESHOLD)[0],
+            arrived | busy << 1,
+            pwm,
+            current,
+            velocity,
+            position,
+            round(profile.velocity / _PER_VELOCITY),
+            round(profile.position),
+            max(0, round(voltage / reg.VOLTAGE_UNIT)),
+            max(0, min(255, round(temperature))),
+        )

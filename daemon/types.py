@@ -1,0 +1,131 @@
+"""The plain records that the pipeline's stages hand to each other, and nothing else.
+
+Per-finger lists have length 2, left finger first; a finger that the scene lacks stays 0 and is
+flagged by ``valid``. Plain floats, since the tick takes them one by one. SI units. Positive joint
+angle closes. ``t`` is the clock's time in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FINGERS = ("left", "right")
+
+
+def _pair() -> list[float]:
+    return [0.0, 0.0]
+
+
+@dataclass(slots=True)
+class Reading:
+    """What the servos said. Filled in place by ``Servos.read``."""
+
+    seq: int = 0
+    t: float = -math.inf  # when the last good one was taken
+    valid: bool = False
+    q: list[float] = field(default_factory=_pair)  # joint angle [rad]
+    dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
+    current: list[float] = field(default_factory=_pair)  # motor current [A], positive closes
+    alert: int = 0  # bit i: servo of finger i reports a hardware error
+    lost: int = 0  # bit i: it holds none of the goals that were sent to it lately
+    frozen: int = 0  # bit i: its own clock stands still, and so does what it measures
+    hardware: list[int] = field(default_factory=lambda: [0, 0])  # its error bits, 0 if not known
+    temperature: list[float] = field(default_factory=_pair)  # [°C], 0 while not known
+    voltage: list[float] = field(default_factory=_pair)  # of the supply [V], likewise
+
+
+@dataclass(slots=True)
+class Frame:
+    """One tactile frame. ``data`` is never written after it was handed over."""
+
+    seq: int
+    t_sample: float  # when the board scanned it (middle of the scan, best estimate) [s]
+    t_arrival: float  # when it was complete here [s]
+    valid: bool
+    data: NDArray[np.uint16]  # counts [rows, cols]
+
+
+@dataclass(slots=True)
+class Contact:
+    """What one fingertip feels: the newest frame's estimate, carried on by the joints."""
+
+    seq: int = 0  # of the frame
+    t: float = 0.0  # when that frame was sampled [s]
+    t_arrival: float = 0.0  # and when it was complete here [s]
+    t_sound: float = 0.0  # arrival of the last frame whose estimate was sound [s]
+    valid: bool = False  # a frame has come, its estimate is sound and it is not too old
+    contact: bool = False  # something touches the tip
+    d: float = 0.0  # maximum displacement [m]
+    theta: float = 0.0  # the object's angle in the tip's frame, in the hand's plane [rad]
+    tilt_y: float = 0.0  # and across it [rad]
+    d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
+    theta_std: float = 0.0
+    gain: float = 1.0  # measured pressure over modelled pressure
+    misfit: bool = False  # the frame is no contact of the model's: d and theta may be biased
+    force: float = 0.0  # F(d, θ) [N]
+    energy: float = 0.0  # U(d, θ) [J]
+    inside: bool = True  # (d, θ) lies inside the model's domain
+
+
+@dataclass(slots=True)
+class ObjectPose:
+    """The object's angle [rad] and width [m], from the two contacts."""
+
+    valid: bool = False
+    angle: float = 0.0
+    width: float = 0.0
+
+
+@dataclass(slots=True)
+class Goal:
+    """What the servos shall do. Filled in place by the control law, bounded by safety."""
+
+    seq: int = 0
+    t: float = 0.0
+    valid: bool = False
+    q: list[float] = field(default_factory=_pair)  # goal angle [rad]
+    current: list[float] = field(default_factory=_pair)  # bound on the current's magnitude [A]
+    force: float = math.nan  # mean force of the tips that the grip goes to [N], NaN without a grip
+    angle: float = math.nan  # the object's angle that the grip keeps [rad], NaN where it keeps none
+
+
+@dataclass(slots=True)
+class Timing:
+    """What the loop knows about its own ticks, in this machine's time [s]."""
+
+    tick_s: float = 0.0  # from this tick's start to the last one's
+    compute_s: float = 0.0  # work of the last tick
+    wake_late_s: float = 0.0  # this tick's start after its deadline
+    overruns: int = 0  # ticks whose work outlasted the period
+    late_in_row: int = 0  # the last of them, without one in time between; 0 where time waits
+    behind_s: float = 0.0  # how long a simulated hand has waited for this machine since the start
+    busy_s: float = 0.0  # how long this machine has just kept the loop from a tick, or 0
+
+
+def _contacts() -> list[Contact]:
+    return [Contact(), Contact()]
+
+
+@dataclass(slots=True)
+class State:
+    """All of the above for one tick: what is published."""
+
+    seq: int = 0
+    t: float = 0.0
+    wall: float = 0.0  # Unix time [s]
+    mode: str = "disarmed"
+    fault: str = ""
+    fault_name: str = ""  # the row of `safety.limits` it stands in
+    torque: bool = False  # on, or not confirmed to be off
+    torque_off: bool = False  # the servos confirmed at this tick that it is off
+    read_error: str = ""  # what the servos' bus failed with at this tick, reading and writing
+    write_error: str = ""
+    reading: Reading = field(default_factory=Reading)
+    contacts: list[Contact] = field(default_factory=_contacts)
+    object: ObjectPose = field(default_factory=ObjectPose)
+    goal: Goal = field(default_factory=Goal)
+    timing: Timing = field(default_factory=Timing)

@@ -1,0 +1,140 @@
+"""The loop's side of commands: takes requests from the gateway, and has them carried out.
+
+It lives in the loop's own thread: it is asked once a tick, costs one look when nobody speaks, and
+needs no lock. A ``stop`` goes first; what came before one is refused, wherever it waits (see
+`gateway.admission`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import msgpack
+
+from softfinger.daemon.gateway.link import Ask, Link
+
+Handler = Callable[[dict[str, Any]], dict[str, Any]]
+
+PASSED = "came while the daemon stood still or was starting, or before a stop; send it again"
+
+_BEGUN_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
+_A_TICK = 2  # commands carried out at one, a stop not counted
+_VALUES = (str, int, float)  # and bool, which is an int
+
+
+class Refused(Exception):
+    """A command that is not carried out. The message is what the client is told."""
+
+
+class Local(Protocol):
+    """Where a stop comes from past the gateway: `wire.local_stop.LocalStop`."""
+
+    def fileno(self) -> int:
+        """The descriptor at which it comes."""
+
+    def take(self) -> bool:
+        """Whether a stop has come."""
+
+    def answer(self, reply: bytes) -> None:
+        """Answer all who asked."""
+
+
+class CommandServer:
+    """Answers requests that come over a link, and a stop that comes past it."""
+
+    def __init__(self, link: Link, local: Local | None = None) -> None:
+        self._link = link
+        self._local = local
+        self._stopped: bytes | None = None  # the local answer, until what comes next is heard
+        self._answer_by = 0.0
+        if local is not None:
+            link.watch(local.fileno())
+
+    @property
+    def refused_by_pace(self) -> int:
+        """Requests refused because too many came."""
+        return self._link.refused
+
+    @property
+    def notices(self) -> deque[str]:
+        """What is to be told of the gateway."""
+        return self._link.notices
+
+    def serve(self, handler: Handler) -> None:
+        """Have ``handler`` carry out what is due at this tick.
+
+        It raises Refused with the reason.
+        """
+        link = self._link
+        link.look()
+        if self._local is not None and (link.called or self._stopped is not None):
+            self._serve_local(self._local, handler)
+        if not link.asked:
+            return
+        for ask in [ask for ask in link.asked if ask.stop]:
+            link.asked.remove(ask)
+            link.begin_epoch()
+            self._answer(ask, handler)
+        for _ in range(_A_TICK):
+            while link.asked and link.asked[0].epoch != link.epoch:
+                link.reply(link.asked.popleft().number, _refusal(PASSED))
+            if not link.asked:
+                return
+            self._answer(link.asked.popleft(), handler)
+
+    def begin_epoch(self) -> None:
+        """What has arrived until now is refused: a stop, or the loop could not act."""
+        self._link.begin_epoch()
+
+    def _serve_local(self, local: Local, handler: Handler) -> None:
+        self._link.called = False
+        if local.take():
+            self._link.begin_epoch()
+            self._stopped = _carry_out({"command": "stop"}, handler)
+            self._answer_by = time.monotonic() + _BEGUN_WITHIN
+        if self._stopped is not None and (
+            self._link.begun == self._link.epoch or time.monotonic() > self._answer_by
+        ):
+            local.answer(self._stopped)
+            self._stopped = None
+
+    def _answer(self, ask: Ask, handler: Handler) -> None:
+        self._link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
+
+
+def _carry_out(request: dict[str, Any], handler: Handler) -> bytes:
+    """The packed reply."""
+    try:
+        reply: bytes = msgpack.packb({"ok": True, **handler(request)})
+    except Refused as refusal:
+        return _refusal(str(refusal))
+    return reply
+
+
+def _refusal(error: str) -> bytes:
+    packed: bytes = msgpack.packb({"ok": False, "error": error})
+    return packed
+
+
+def decode(payload: bytes) -> dict[str, Any]:
+    """Unpack a command, a map of plain numbers and texts with a text under ``command``.
+
+    Raises Refused for all else.
+    """
+    try:
+        request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
+    except Exception as error:  # msgpack raises many kinds, ValueError and its own among them
+        raise Refused(f"not msgpack: {error}") from None
+    if not isinstance(request, dict):
+        raise Refused(f"expected a map, found {type(request).__name__}")
+    if not isinstance(request.get("command"), str):
+        raise Refused('expected a text under "command"')
+    if not all(isinstance(key, str) for key in request):
+        raise Refused("expected texts as keys")
+    # Nothing nested: what comes from outside is told to subscribers as it came.
+    if not all(value is None or isinstance(value, _VALUES) for value in request.values()):
+        raise Refused("expected numbers and texts as values")
+    return request

@@ -1,0 +1,348 @@
+"""The lookup kernel of contact tables, and the layout of the array that it reads.
+
+What is tabulated is the ratio of each quantity to its closed form for the modulus at zero strain:
+smooth, near 1, finite at d → 0, and exact for a constant modulus. The coordinates make it analytic
+up to the edges of the domain: the height h = (a − d)/a, in pieces that divide each octave evenly,
+and y = u/h with u = √(1 − ρ²/(a² cos² θ)), which is 1 at θ = 0, 0 at the limit, even in θ, and the
+peak strain is 1 − u. Towards h = 0 the ratios are A + B log h with smooth A and B; below the lowest
+octave both are tabulated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
+from softfinger.kinematics.compiled.simd import SIZES, Pointer, address, polynomials
+from softfinger.kinematics.contact.closed_form import theta_limit
+
+FloatArray = NDArray[np.float64]
+Ratios: TypeAlias = tuple[float, float, float, float, float]
+Six: TypeAlias = tuple[float, float, float, float, float, float, bool]
+
+HALF_PI = math.pi / 2
+_NEAR = 0.25 * math.pi
+
+# Header of a table's array, by index.
+FORMAT, FORM, RADIUS, MODULUS, INVERSE_RADIUS, CORNER = 0, 1, 2, 3, 4, 5
+TOLERANCE, MAX_ERROR, WORST_D, WORST_THETA = 6, 7, 8, 9
+START = 16  # of the coefficients: a whole number of cache lines
+
+VERSION = 2.0
+
+OCTAVES = 3  # of h above the corner
+LOWEST = 0.5**OCTAVES  # h where the corner begins
+
+# The corner h → 0, the same for all forms: its pieces over y, and the shape of A and of B in each.
+CORNER_PIECES = 2
+CORNER_SHAPE = 8
+
+
+class Form(NamedTuple):
+    """One representation: the shape of its local polynomials in h and y, and their pieces."""
+
+    name: str
+    bits: int  # 2^bits pieces an octave of h
+    y_pieces: int
+
+
+# Forms by number, as the header has it; the number is also that of the shape. The slabs span all of
+# y, so that where their coefficients stand depends on d alone: they are read while θ's cosine is
+# being computed. Their names tell the degrees in h and in y.
+FORMS = (
+    Form("closed", 0, 0),
+    Form("bilinear", 3, 16),
+    Form("bicubic", 2, 8),
+    Form("quintic", 2, 4),
+    Form("slab 4-10", 3, 1),
+    Form("slab 6-14", 3, 1),
+    Form("slab 8-19", 3, 1),
+    Form("slab 9-25", 3, 1),
+)
+CLOSED = 0
+# The cubes and quintics have to wait for y, and cost more than a slab that errs less.
+CHEAPEST_FIRST = (0, 1, 4, 5, 6, 7)
+
+_BLOCK = 256  # points that `lookups` takes at once, so that they stay in the first cache
+_MANTISSA = 52
+_FRACTION = (1 << _MANTISSA) - 1
+_ONE = 1023 << _MANTISSA  # the bits of 1.0
+_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above LOWEST
+
+
+@inlined_kernel
+def _near_sine_cosine(theta: float) -> tuple[float, float]:
+    """sin θ and cos θ to an ulp for |θ| ≤ π/4; inlined, unlike the C library's."""
+    z = theta * theta
+    z2 = z * z
+    z4 = z2 * z2
+    p = (-0.16666666666666666 + z * 0.00833333333333095) + z2 * (
+        -0.00019841269836759774 + z * 2.755731610309567e-06
+    )
+    p += z4 * (-2.505113194542731e-08 + z * 1.5918135792566938e-10)
+    q = (0.041666666666666664 - z * 0.0013888888888887398) + z2 * (
+        2.4801587298766353e-05 - z * 2.755731727203115e-07
+    )
+    q += z4 * (2.087614632409855e-09 - z * 1.1382636028190913e-11)
+    half = 0.5 * z
+    most = 1.0 - half
+    return theta + theta * z * p, most + (((1.0 - most) - half) + z2 * q)
+
+
+@inlined_kernel
+def _sine_cosine(theta: float) -> tuple[float, float]:
+    """sin θ and cos θ to an ulp, both relative, for |θ| ≤ π/2."""
+    size = abs(theta)
+    far = size > _NEAR
+    # π/2 − |θ| keeps its digits near π/2, and so does the cosine.
+    sine, cosine = _near_sine_cosine((HALF_PI - size) + 6.123233995736766e-17 if far else size)
+    if far:
+        sine, cosine = cosine, sine
+    return math.copysign(sine, theta), cosine
+
+
+@inlined_kernel
+def _piece(h: float, bits: int) -> tuple[int, float]:
+    """Number of the piece of h in (LOWEST, 1], and h's place in it from −1 to 1.
+
+    The float's own bits tell: its exponent the octave, its mantissa the piece and the place. A
+    piece has its upper end, not its lower one.
+    """
+    number = int(np.float64(h).view(np.int64)) - _FIRST
+    fraction = ((number << bits) & _FRACTION) | _ONE
+    return number >> (_MANTISSA - bits), 2.0 * float(np.int64(fraction).view(np.float64)) - 3.0
+
+
+@inlined_kernel
+def _from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
+    """The five ratios by one of the forms that span y. Shapes and strides are literals."""
+    i, x = _piece(h, 3)
+    y = 2.0 * y - 1.0
+    if form == 5:
+        ratios: Ratios = polynomials(p, START + i * SIZES[5], 5, x, y)
+    elif form == 6:
+        ratios = polynomials(p, START + i * SIZES[6], 6, x, y)
+    elif form == 4:
+        ratios = polynomials(p, START + i * SIZES[4], 4, x, y)
+    else:
+        ratios = polynomials(p, START + i * SIZES[7], 7, x, y)
+    return ratios
+
+
+@inner_kernel
+def _from_square(p: Pointer, form: int, h: float, y: float) -> Ratios:
+    """The five ratios by one of the forms in pieces of h and y."""
+    if form == 1:
+        i, x = _piece(h, 3)
+        j, y = _share(y, 16)
+        ratios: Ratios = polynomials(p, START + (16 * i + j) * SIZES[1], 1, x, y)
+    elif form == 2:
+        i, x = _piece(h, 2)
+        j, y = _share(y, 8)
+        ratios = polynomials(p, START + (8 * i + j) * SIZES[2], 2, x, y)
+    else:
+        i, x = _piece(h, 2)
+        j, y = _share(y, 4)
+        ratios = polynomials(p, START + (4 * i + j) * SIZES[3], 3, x, y)
+    return ratios
+
+
+@inlined_kernel
+def _share(y: float, count: int) -> tuple[int, float]:
+    """Which of ``count`` equal parts of [0, 1] has y, and y's place in it from −1 to 1."""
+    y *= count
+    j = min(int(y), count - 1)
+    return j, 2.0 * (y - j) - 1.0
+
+
+@inner_kernel
+def _from_corner(p: Pointer, h: float, y: float) -> Ratios:
+    """The five ratios A + B log h below the lowest octave."""
+    j, y = _share(y, CORNER_PIECES)
+    x = (2.0 / LOWEST) * h - 1.0
+    at = int(p[CORNER]) + 2 * j * SIZES[CORNER_SHAPE]
+    a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 8, x, y)
+    b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 8, x, y)
+    # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
+    scale = math.log(max(h, 1e-300))
+    return (
+        a_f + scale * b_f,
+        a_u + scale * b_u,
+        a_fd + scale * b_fd,
+        a_ft + scale * b_ft,
+        a_ut + scale * b_ut,
+    )
+
+
+@inlined_kernel
+def _ratios(
+    p: Pointer, form: int, h: float, s: float, c: float, gap: float
+) -> tuple[float, Ratios]:
+    """1/cos θ and the five ratios; gap = cos² θ u² = h² − sin² θ."""
+    if h > LOWEST:
+        both = 1.0 / (c * h)
+        inverse = both * h
+        y = math.sqrt(gap) * both
+        if form > 3:
+            return inverse, _from_slab(p, form, h, y)
+        return inverse, _from_square(p, form, h, y)
+    inverse = 1.0 / c
+    s = abs(s)
+    y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
+    return inverse, _from_corner(p, h, y)
+
+
+@inlined_kernel
+def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: bool) -> Six:
+    """What :func:`lookup` gives, in the domain."""
+    form = int(p[FORM])
+    if form == CLOSED:
+        inverse = 1.0 / c
+        slope = s * inverse
+        push = math.pi * p[MODULUS] * d * inverse
+        force = push * d
+        energy = force * inverse * d * (1.0 / 3.0)
+        force_d = 2.0 * push
+        return (
+            force,
+            energy,
+            force_d,
+            force * slope,
+            force * inverse,
+            2.0 * energy * slope,
+            inside,
+        )
+    inverse, (r_f, r_u, r_fd, r_ft, r_ut) = _ratios(p, form, h, s, c, gap)
+    slope = s * inverse
+    push = math.pi * p[MODULUS] * d * inverse
+    force = push * d
+    energy = force * inverse * d * (1.0 / 3.0)
+    return (
+        force * r_f,
+        energy * r_u,
+        2.0 * push * r_fd,
+        force * slope * r_ft,
+        force * r_f * inverse,
+        2.0 * energy * slope * r_ut,
+        inside,
+    )
+
+
+@inner_kernel
+def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, float, float, bool]:
+    """d, h, sin θ, cos θ, gap and ``inside`` at any d > 0 and θ, clamped to the domain."""
+    radius = p[RADIUS]
+    inside = d <= radius
+    d = min(d, radius)
+    h = (radius - d) * p[INVERSE_RADIUS]
+    if abs(theta) <= HALF_PI:
+        s, c = _sine_cosine(theta)
+        gap = c * c - d * p[INVERSE_RADIUS] * (1.0 + h)
+        if gap >= 0.0:
+            return d, h, s, c, gap, inside
+    limit = theta_limit(radius, d)
+    # At the limit itself, rounding may have led here.
+    inside = inside and abs(theta) <= limit
+    s, c = _sine_cosine(min(max(theta, -limit), limit))
+    return d, h, s, c, 0.0, inside
+
+
+@inlined_kernel
+def lookup_at(p: Pointer, d: float, theta: float) -> Six:
+    """:func:`lookup` in the table whose :func:`~compiled.simd.address` is ``p``.
+
+    For kernels that call often: an array argument costs a reference count at each call.
+    """
+    h = (p[RADIUS] - d) * p[INVERSE_RADIUS]
+    rho2 = d * p[INVERSE_RADIUS] * (1.0 + h)
+    s, c = _near_sine_cosine(theta)
+    gap = c * c - rho2
+    inside = True
+    if not (d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= _NEAR):
+        if math.isnan(d) or math.isnan(theta):
+            nan = math.nan
+            return nan, nan, nan, nan, nan, nan, False
+        if d <= 0.0:
+            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
+        d, h, s, c, gap, inside = _slowly(p, d, theta)
+    return _at(p, d, h, s, c, gap, inside)
+
+
+@kernel
+def lookup(data: FloatArray, d: float, theta: float) -> Six:
+    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
+
+    Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
+    gives NaN out.
+    """
+    return lookup_at(address(data), d, theta)
+
+
+@inlined_kernel
+def _coordinates(p: Pointer, d: FloatArray, theta: FloatArray, work: FloatArray) -> None:
+    """y, h, 1/cos θ and tan θ of a block into ``work`` [4 * _BLOCK].
+
+    y is NaN outside the domain and in the corner, where :func:`lookup` has to be asked.
+    """
+    for i in range(d.shape[0]):
+        h = (p[RADIUS] - d[i]) * p[INVERSE_RADIUS]
+        rho2 = d[i] * p[INVERSE_RADIUS] * (1.0 + h)
+        s, c = _sine_cosine(theta[i])
+        gap = c * c - rho2
+        both = 1.0 / (c * h)
+        # No branch, which would keep the loop out of SIMD lanes.
+        usual = (d[i] > 0.0) & (gap >= 0.0) & (h > LOWEST) & (abs(theta[i]) <= HALF_PI)
+        work[i] = math.sqrt(max(gap, 0.0)) * both if usual else math.nan
+        work[i + _BLOCK] = h
+        work[i + 2 * _BLOCK] = both * h
+        work[i + 3 * _BLOCK] = s * both * h
+
+
+@kernel
+def lookups(
+    data: FloatArray,
+    d: FloatArray,
+    theta: FloatArray,
+    out: FloatArray,
+    inside: NDArray[np.bool_],
+) -> None:
+    """:func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
+
+    In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
+    """
+    p = address(data)
+    form = int(p[FORM])
+    push = math.pi * p[MODULUS]
+    work = np.empty(4 * _BLOCK)
+    for start in range(0, d.shape[0], _BLOCK):
+        stop = min(start + _BLOCK, d.shape[0])
+        _coordinates(p, d[start:stop], theta[start:stop], work)
+        for k in range(start, stop):
+            y = work[k - start]
+            if math.isnan(y):
+                out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
+                    lookup_at(p, d[k], theta[k])
+                )
+                continue
+            r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0
+            if form > 3:
+                r_f, r_u, r_fd, r_ft, r_ut = _from_slab(p, form, work[k - start + _BLOCK], y)
+            elif form != CLOSED:
+                r_f, r_u, r_fd, r_ft, r_ut = _from_square(p, form, work[k - start + _BLOCK], y)
+            inverse = work[k - start + 2 * _BLOCK]
+            slope = work[k - start + 3 * _BLOCK]
+            force_d = 2.0 * push * d[k] * inverse
+            force = 0.5 * force_d * d[k]
+            energy_d = force * inverse
+            energy = energy_d * d[k] * (1.0 / 3.0)
+            out[0, k] = force * r_f
+            out[1, k] = energy * r_u
+            out[2, k] = force_d * r_fd
+            out[3, k] = force * slope * r_ft
+            out[4, k] = energy_d * r_f
+            out[5, k] = 2.0 * energy * slope * r_ut
+            inside[k] = True

@@ -1,0 +1,295 @@
+"""Stress-strain laws of the tip's material, and nothing of its shape.
+
+A law σ(ε) is one polynomial on strain ε ∈ [0, 1] with σ(0) = 0 and a positive slope everywhere, so
+it is smooth and monotone, and every integral over it converges fast. Kernels see it as tables of
+polynomial pieces; where the degree is high the same polynomial is expanded about several points,
+since monomials of high degree lose digits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.contact.closed_form import flatten
+
+FloatArray = NDArray[np.float64]
+
+# Slopes of the measured stress-strain curve of the polyurethane tip [Pa] by strain; the paper also
+# gives the greatest slope met, beyond 100 %: 0.304 MPa.
+TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
+TABLE_I_MAXIMUM = 0.304e6
+
+_PIECE_DEGREE = 8  # up to here one expansion about 0 keeps all digits
+_PIECES = 8
+
+
+@inner_kernel
+def stress_at(law: FloatArray, strain: float) -> float:
+    """σ(ε) [Pa] from ``law`` [pieces, order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
+    if strain <= 0.0:
+        return 0.0
+    pieces, order = law.shape
+    if not strain < 1.0:
+        # Value and slope at the end of the last piece, u = 1 there.
+        value: float = 0.0
+        slope: float = 0.0
+        for j in range(order):
+            value += law[pieces - 1, j]
+            slope += j * law[pieces - 1, j]
+        more: float = pieces * (strain - 1.0)
+        return value + more * slope
+    u = strain * pieces
+    k = int(u)
+    u -= k
+    result: float = law[k, order - 1]
+    for j in range(order - 2, -1, -1):
+        result = result * u + law[k, j]
+    return result
+
+
+@inner_kernel
+def energy_density_at(energy_law: FloatArray, strain: float) -> float:
+    """w(ε) = ∫₀^ε σ [J/m³] from ``energy_law``; 0 for ε ≤ 0, beyond ε = 1 as σ is continued."""
+    if strain <= 0.0:
+        return 0.0
+    pieces, order = energy_law.shape
+    if not strain < 1.0:
+        value: float = 0.0
+        slope: float = 0.0
+        curve: float = 0.0
+        for j in range(order):
+            value += energy_law[pieces - 1, j]
+            slope += j * energy_law[pieces - 1, j]
+            curve += j * (j - 1) * energy_law[pieces - 1, j]
+        more: float = pieces * (strain - 1.0)
+        return value + more * (slope + 0.5 * more * curve)
+    u = strain * pieces
+    k = int(u)
+    u -= k
+    result: float = energy_law[k, order - 1]
+    for j in range(order - 2, -1, -1):
+        result = result * u + energy_law[k, j]
+    return result
+
+
+@kernel
+def _stresses(law: FloatArray, strain: FloatArray, out: FloatArray) -> None:
+    for i in range(strain.shape[0]):
+        out[i] = stress_at(law, strain[i])
+
+
+@kernel
+def _energy_densities(energy_law: FloatArray, strain: FloatArray, out: FloatArray) -> None:
+    for i in range(strain.shape[0]):
+        out[i] = energy_density_at(energy_law, strain[i])
+
+
+class MaterialError(ValueError):
+    """The data make no usable stress-strain law. The message says what is wrong and where."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """A stress-strain law σ(ε) = Σ c_j ε^j, c_0 = 0. Made by the class methods.
+
+    ``coefficients`` are c_1, c_2, … [Pa], exact. Equal coefficients make equal materials.
+    """
+
+    coefficients: tuple[Fraction, ...]
+    name: str = field(default="polynomial", compare=False)
+    fit_error: float = field(default=0.0, compare=False)  # largest misfit of given points [Pa]
+    law: FloatArray = field(init=False, repr=False, compare=False)
+    energy_law: FloatArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        c = tuple(Fraction(value) for value in self.coefficients)
+        while len(c) > 1 and c[-1] == 0:
+            c = c[:-1]
+        if not c or c[0] <= 0:
+            raise MaterialError("the law needs a positive modulus at zero strain")
+        object.__setattr__(self, "coefficients", c)
+        stress = (Fraction(0), *c)
+        object.__setattr__(self, "law", self._expand(stress))
+        object.__setattr__(self, "energy_law", self._expand(_integral(stress)))
+        slope = np.polynomial.polynomial.polyval(
+            np.linspace(0.0, 1.0, 513), [float(j * value) for j, value in enumerate(c, 1)]
+        )
+        if not np.all(slope > 0.0):
+            worst = int(np.argmin(slope))
+            raise MaterialError(
+                f"stress must rise with strain everywhere; its slope is {slope[worst]:.4g} Pa at "
+                f"strain {worst / 512:.3f}"
+            )
+
+    @classmethod
+    def constant(cls, modulus: float) -> Material:
+        """Hooke's law of modulus E [Pa]. Raises MaterialError unless E is positive and finite."""
+        value = float(modulus)
+        if not (value > 0.0 and math.isfinite(value)):
+            raise MaterialError(f"the modulus must be positive and finite, not {modulus!r}")
+        return cls((Fraction(value),), name="constant")
+
+    @classmethod
+    def table_i(cls) -> Material:
+        """The measured polyurethane of the paper's Table I, as a smooth law.
+
+        The paper's numbers are slopes of the stress-strain curve ('Young's modulus, which
+        corresponds to the slope'), so they are taken as the tangent modulus dσ/dε: 0.135 MPa (the
+        least) at zero strain, 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at 20 … 100 %. The greatest,
+        0.304 MPa, lies beyond 100 %. Through them goes the polynomial of least degree that starts
+        with zero slope, as its least value must; it never falls on [0, 1].
+        """
+        nodes = [Fraction(i, 5) for i in range(6)]
+        values = [Fraction(value) for value in TABLE_I_MODULUS]
+        rows = [[node**j for j in range(7)] for node in nodes]
+        rows.append([Fraction(int(j == 1)) for j in range(7)])
+        modulus = _solve(rows, [*values, Fraction(0)])
+        return cls(tuple(_integral(modulus)[1:]), name="table_i")
+
+    @classmethod
+    def paper(cls) -> Material:
+        """The constant modulus that the paper works with: the greatest of its Table I."""
+        return cls.constant(TABLE_I_MAXIMUM)
+
+    @classmethod
+    def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
+        """A smooth monotone law near measured points of strain (a ratio) and stress [Pa].
+
+        The origin belongs to every curve and need not be given. Points beyond strain 1 are not
+        used; short of it the curve goes on with its last slope. ``fit_error`` tells how far the law
+        runs from the points. Raises MaterialError, with everything that is wrong, for points that
+        are too few, not finite, not rising, start off zero, or that no such law comes near to.
+        """
+        from softfinger.kinematics.contact.material_fit import fit_law
+
+        coefficients, misfit = fit_law(strain, stress)
+        return cls(tuple(coefficients), name="points", fit_error=misfit)
+
+    @classmethod
+    def from_csv(cls, text: str, branch: str = "load") -> Material:
+        """A law from CSV text with the columns strain, stress [Pa] and optionally branch.
+
+        The third column says ``load`` or ``unload``; ``branch`` chooses one. Unloading points may
+        fall in strain, as they are measured. A header line and lines that start with # are skipped.
+        Raises MaterialError naming the line that can't be read, and as :meth:`from_points` does.
+        """
+        strain, stress = parse_points(text, branch)
+        return cls.from_points(strain, stress)
+
+    @property
+    def reference_modulus(self) -> float:
+        """E₀ = dσ/dε at zero strain [Pa]."""
+        return float(self.coefficients[0])
+
+    @property
+    def is_linear(self) -> bool:
+        """True for Hooke's law, where the closed forms are exact."""
+        return len(self.coefficients) == 1
+
+    @property
+    def degree(self) -> int:
+        """Degree of the polynomial σ(ε)."""
+        return len(self.coefficients)
+
+    def stress(self, strain: ArrayLike) -> FloatArray:
+        """σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, continued linearly beyond 1, NaN for NaN."""
+        shape, (flat,) = flatten(strain)
+        out = np.empty_like(flat)
+        _stresses(self.law, flat, out)
+        return out.reshape(shape)
+
+    def energy_density(self, strain: ArrayLike) -> FloatArray:
+        """w(ε) = ∫₀^ε σ [J/m³], shape of ``strain``; 0 for ε ≤ 0, NaN for NaN."""
+        shape, (flat,) = flatten(strain)
+        out = np.empty_like(flat)
+        _energy_densities(self.energy_law, flat, out)
+        return out.reshape(shape)
+
+    def expansions(self) -> FloatArray:
+        """What the quadrature needs of the law over E₀: float64 [7, pieces, order].
+
+        With S = σ/ε, W = 2w/ε², T = dσ/dε, each 1 at ε = 0, and X_1 = (X − X(0))/ε,
+        X_2 = (X_1 − X_1(0))/ε: the rows are S_1, W_1, T_1, S_2, S_2′, T_2, T_2′. They are
+        polynomials, so nothing cancels at small strain.
+        """
+        unit = [value / self.coefficients[0] for value in self.coefficients]
+        secant = unit[1:] or [Fraction(0)]
+        work = [2 * value / (j + 2) for j, value in enumerate(unit[1:], 1)] or [Fraction(0)]
+        tangent = [value * j for j, value in enumerate(unit[1:], 2)] or [Fraction(0)]
+        rows: list[Sequence[Fraction]] = [secant, work, tangent]
+        for first in (secant, tangent):
+            second = first[1:] or [Fraction(0)]
+            rows.append(second)
+            rows.append([value * j for j, value in enumerate(second)][1:] or [Fraction(0)])
+        order = max(len(row) for row in rows)
+        return np.stack([self._expand([*row, *[Fraction(0)] * (order - len(row))]) for row in rows])
+
+    def _expand(self, polynomial: Sequence[Fraction]) -> FloatArray:
+        """Expand a polynomial in ε about the pieces' starts, in u = ε·pieces − k; exactly."""
+        pieces = 1 if self.degree <= _PIECE_DEGREE else _PIECES
+        table = np.empty((pieces, len(polynomial)))
+        for k in range(pieces):
+            shifted = _shift(polynomial, Fraction(k, pieces))
+            table[k] = [float(value / pieces**j) for j, value in enumerate(shifted)]
+        return table
+
+
+def parse_points(text: str, branch: str = "load") -> tuple[list[float], list[float]]:
+    """Strain and stress [Pa] of one branch of a CSV text; see Material.from_csv."""
+    if branch not in ("load", "unload"):
+        raise MaterialError(f"the branch is load or unload, not {branch!r}")
+    points = []
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = [cell.strip() for cell in line.split(",")]
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if number == 1 and cells[0].lower().startswith("strain"):
+            continue
+        phase = cells[2].lower() if len(cells) > 2 and cells[2] else "load"
+        try:
+            point = float(cells[0]), float(cells[1])
+        except (ValueError, IndexError):
+            raise MaterialError(f"line {number} holds no strain and stress: {line!r}") from None
+        if phase not in ("load", "unload"):
+            raise MaterialError(f"line {number}: the branch is load or unload, not {cells[2]!r}")
+        if phase == branch:
+            points.append(point)
+    if len(points) > 1 and points[0][0] > points[-1][0] and branch == "unload":
+        points.reverse()
+    return [x for x, _ in points], [y for _, y in points]
+
+
+def _integral(polynomial: Sequence[Fraction]) -> list[Fraction]:
+    return [Fraction(0), *(value / (j + 1) for j, value in enumerate(polynomial))]
+
+
+def _shift(polynomial: Sequence[Fraction], start: Fraction) -> list[Fraction]:
+    """Coefficients of p(start + x) in x, by repeated synthetic division."""
+    work = list(polynomial)
+    for first in range(len(work)):
+        for j in range(len(work) - 2, first - 1, -1):
+            work[j] += start * work[j + 1]
+    return work
+
+
+def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
+    """Solve a small linear system exactly by Gauss-Jordan elimination."""
+    size = len(right)
+    system = [[*row, value] for row, value in zip(rows, right, strict=True)]
+    for i in range(size):
+        pivot = next(k for k in range(i, size) if system[k][i] != 0)
+        system[i], system[pivot] = system[pivot], system[i]
+        system[i] = [value / system[i][i] for value in system[i]]
+        for k in range(size):
+            if k != i and system[k][i] != 0:
+                factor = system[k][i]
+                system[k] = [x - factor * y for x, y in zip(system[k], system[i], strict=True)]
+    return [row[size] for row in system]

@@ -1,0 +1,185 @@
+"""From measured points to smooth monotone stress-strain laws, and to a modulus.
+
+The tangent modulus is a Bernstein polynomial on [0, 1] with positive coefficients, which makes it
+positive everywhere; the coefficients come from least squares under that bound.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.contact.material import MaterialError
+
+FloatArray = NDArray[np.float64]
+
+MIN_POINTS = 4
+_DEGREES = range(11)  # of the modulus
+_GOOD = 1e-9  # of the greatest stress: a misfit that is none
+_NEAR = 1.5  # times the least misfit of any degree is near enough for a lower one
+_BAD = 0.05  # of the greatest stress: a misfit that no law is made of
+_FLOOR = 1e-3  # least modulus over the mean one
+_BEYOND = 0.1  # weight of the points that only continue the curve
+_SMOOTHING = 1e-7  # weight of the modulus's second differences, against wiggles between points
+
+
+def check_points(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """The points up to strain 1, without the origin. Raises MaterialError with all errors."""
+    x = np.asarray(strain, dtype=np.float64)
+    y = np.asarray(stress, dtype=np.float64)
+    if x.ndim != 1 or x.shape != y.shape:
+        raise MaterialError(
+            f"strain and stress must be two lists of one length, not {x.shape} and {y.shape}"
+        )
+    wrong = []
+    bad = np.flatnonzero(~(np.isfinite(x) & np.isfinite(y)))
+    if bad.size:
+        raise MaterialError(f"point {bad[0] + 1} is not a number: ({x[bad[0]]}, {y[bad[0]]})")
+    if x.size < MIN_POINTS:
+        wrong.append(f"too few points: {x.size}, at least {MIN_POINTS} are needed")
+    if x.size and x[0] < 0.0:
+        wrong.append(f"strain starts below zero, at {x[0]:.6g}; compression counts as positive")
+    for i in np.flatnonzero(np.diff(x) <= 0.0)[:3]:
+        wrong.append(f"strain must rise: point {i + 2} has {x[i + 1]:.6g} after {x[i]:.6g}")
+    for i in np.flatnonzero(np.diff(y) <= 0.0)[:3]:
+        wrong.append(
+            f"not monotone: stress must rise, but point {i + 2} has {y[i + 1]:.6g} Pa after "
+            f"{y[i]:.6g} Pa"
+        )
+    top = float(np.max(np.abs(y))) if y.size else 0.0
+    if x.size and abs(x[0]) <= 1e-9 and abs(y[0]) > 1e-3 * top:
+        wrong.append(f"the curve starts off zero: {y[0]:.6g} Pa at zero strain; tare it first")
+    elif x.size and x[0] > 1e-9 and y[0] <= 0.0:
+        wrong.append(f"the curve starts off zero: {y[0]:.6g} Pa at strain {x[0]:.6g}")
+    if not wrong and x[-1] > 2.0:
+        wrong.append(f"strain reaches {x[-1]:.6g}; it is a ratio, not per cent")
+    if wrong:
+        raise MaterialError("the stress-strain points can't be used: " + "; ".join(wrong))
+    used = (x > 1e-9) & (x <= 1.0)
+    if used.sum() < MIN_POINTS - 1:
+        raise MaterialError(
+            f"too few points between strain 0 and 1: {used.sum()}, at least {MIN_POINTS - 1}"
+        )
+    return x[used], y[used]
+
+
+def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float]:
+    """Coefficients c_1, c_2, … of σ(ε) [Pa] and the largest misfit of the points [Pa].
+
+    The lowest degree is taken that comes about as near to the points as any. Beyond the last point
+    the law goes on about straight.
+    """
+    x, y = check_points(strain, stress)
+    top = float(y[-1])
+    points, values = _continued(x, y / top)
+    weights = np.where(np.arange(points.size) < x.size, 1.0, _BEYOND)
+    tried: list[tuple[float, FloatArray]] = []
+    for degree in _DEGREES:
+        if degree <= max(2 * x.size, 3):
+            modulus = _positive_modulus(points, values, weights, degree)
+            misfit = float(np.max(np.abs(_integrals(x, degree) @ modulus - y / top)))
+            tried.append((misfit, modulus))
+    enough = _NEAR * min(misfit for misfit, _ in tried) + _GOOD
+    misfit, modulus = next(one for one in tried if one[0] <= enough)
+    if misfit > _BAD:
+        raise MaterialError(
+            f"no smooth monotone law comes near the points: the best misses one by "
+            f"{misfit * top:.4g} Pa of {top:.4g} Pa"
+        )
+    rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
+    return [value / (j + 1) for j, value in enumerate(rising)], misfit * top
+
+
+def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike) -> float:
+    """The constant modulus E [Pa] that best explains forces [N] measured in compression.
+
+    Least squares on F = πE d²/cos θ over d [m], θ [rad]. Raises MaterialError when nothing can be
+    told from the data.
+    """
+    depth, tilt, measured = np.broadcast_arrays(
+        *(np.asarray(value, dtype=np.float64) for value in (d, theta, force))
+    )
+    basis = math.pi * depth**2 / np.cos(tilt)
+    weight = float(np.sum(basis**2))
+    if not (math.isfinite(weight) and weight > 0.0 and np.all(np.isfinite(measured))):
+        raise MaterialError("the compression data must be finite and reach some displacement")
+    modulus = float(np.sum(basis * measured)) / weight
+    if not modulus > 0.0:
+        raise MaterialError(f"the compression data give a modulus of {modulus:.4g} Pa")
+    return modulus
+
+
+def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The points, and more up to strain 1 along the slope that they end with."""
+    if x[-1] > 0.95:
+        return x, y
+    # The end of a parabola through the last third, kept near the slope of the last quarter.
+    last = max(3, x.size // 3)
+    back = x[-last:] - x[-1]
+    slope = float(np.polyfit(back, y[-last:], 2)[1])
+    start = float(np.interp(0.75 * x[-1], [0.0, *x], [0.0, *y]))
+    mean = (float(y[-1]) - start) / (0.25 * float(x[-1]))
+    slope = min(max(slope, 0.5 * mean), 2.0 * mean)
+    more = np.linspace(x[-1], 1.0, 2 + int(8 * (1.0 - x[-1])))[1:]
+    return np.concatenate([x, more]), np.concatenate([y, y[-1] + slope * (more - x[-1])])
+
+
+def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
+    """Bernstein coefficients ≥ _FLOOR of the modulus whose integral runs nearest to the points."""
+    matrix = _integrals(x, degree) * weights[:, None]
+    smooth = np.zeros((max(degree - 1, 0), degree + 1))
+    for i in range(degree - 1):
+        smooth[i, i : i + 3] = 1.0, -2.0, 1.0
+    rows = np.concatenate([matrix, _SMOOTHING * smooth])
+    right = np.concatenate([y * weights, np.zeros(len(smooth))])
+    floor = _FLOOR * float(y[-1] / x[-1])
+    return floor + nonnegative(rows, right - rows @ np.full(degree + 1, floor))
+
+
+def _integrals(x: FloatArray, degree: int) -> FloatArray:
+    """∫₀^x of each Bernstein polynomial, [len(x), degree + 1]."""
+    n = degree + 1
+    above = np.stack([math.comb(n, j) * x**j * (1.0 - x) ** (n - j) for j in range(n + 1)], axis=1)
+    sums = np.cumsum(above[:, ::-1], axis=1)[:, ::-1]
+    return np.asarray(sums[:, 1:] / n)
+
+
+def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
+    """Exact change from Bernstein coefficients to those of rising powers."""
+    n = len(bernstein) - 1
+    out = []
+    for j in range(n + 1):
+        total = sum(
+            ((-1) ** (j - k) * math.comb(j, k) * bernstein[k] for k in range(j + 1)), Fraction(0)
+        )
+        out.append(math.comb(n, j) * total)
+    return out
+
+
+def nonnegative(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Least squares under x ≥ 0 by the active-set method of Lawson and Hanson."""
+    count = matrix.shape[1]
+    x = np.zeros(count)
+    free = np.zeros(count, dtype=np.bool_)
+    tolerance = 1e-13 * float(np.abs(matrix.T @ right).max(initial=1e-300))
+    for _ in range(10 * count):
+        gradient = matrix.T @ (right - matrix @ x)
+        gradient[free] = -np.inf
+        if free.all() or gradient.max() <= tolerance:
+            break
+        free[int(np.argmax(gradient))] = True
+        while True:
+            trial = np.zeros(count)
+            trial[free] = np.linalg.lstsq(matrix[:, free], right, rcond=None)[0]
+            low = free & (trial <= 0.0)
+            if not low.any():
+                x = trial
+                break
+            step = float(np.min(x[low] / (x[low] - trial[low])))
+            x = x + step * (trial - x)
+            x[low & (x <= 1e-15)] = 0.0
+            free &= x > 0.0
+    return x

@@ -1,0 +1,197 @@
+"""Contact tables: force, energy and their partials by lookup, to a proven tolerance.
+
+Holds the table as an object and as bytes. A table is one flat float64 array, header and
+coefficients, which is the kernel's argument and the bytes' content alike. How one is built and
+certified is in `table_build`, the lookup itself and the array's layout in `lookup`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.contact.closed_form import Fingertip, flatten
+from softfinger.kinematics.contact.lookup import (
+    FORM,
+    FORMS,
+    MAX_ERROR,
+    RADIUS,
+    TOLERANCE,
+    VERSION,
+    WORST_D,
+    WORST_THETA,
+    Form,
+    lookup,
+    lookups,
+)
+from softfinger.kinematics.contact.material import Material
+
+__all__ = ["Certificate", "Contact", "ContactTable", "TableError", "lookup", "lookups"]
+
+FloatArray = NDArray[np.float64]
+
+
+class TableError(Exception):
+    """A table can't be built to the tolerance, or a file holds no sound table of this kind."""
+
+
+class Contact(NamedTuple):
+    """What a table returns; arrays of the broadcast shape of d and θ, NumPy numbers for floats."""
+
+    force: FloatArray  # F [N]
+    energy: FloatArray  # U [J]
+    force_d: FloatArray  # ∂F/∂d [N/m]
+    force_theta: FloatArray  # ∂F/∂θ [N/rad]
+    energy_d: FloatArray  # ∂U/∂d = F/cos θ [N], the push along the face's normal
+    energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
+    inside: NDArray[np.bool_]  # False where d or θ was clamped to the domain
+    max_error: float  # the certificate: largest relative error of any of the six
+
+
+class Certificate(NamedTuple):
+    """How a table was proven: its largest relative error over all outputs, and where it was."""
+
+    max_error: float
+    d: float  # [m]
+    theta: float  # [rad]
+
+
+# For numbers, which the fields' types do not name; a call's overhead counts there.
+_contact: Any = Contact
+
+_MAGIC = b"SFTIPTAB"
+_CHECK = 32  # bytes of a SHA-256
+_SOURCES = (
+    "closed_form.py",
+    "lookup.py",
+    "material.py",
+    "material_fit.py",
+    "quadrature.py",
+    "table_build.py",
+    "../compiled/simd.py",
+)
+
+
+class ContactTable:
+    """Force, energy and first partials of one tip of one material, by lookup.
+
+    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the certificate's
+    largest relative error of any output. The domain is 0 < d ≤ a and
+    |θ| ≤ asin((a − d)/a).
+    """
+
+    def __init__(self, data: FloatArray) -> None:
+        self.data = data
+        self.max_error = float(data[MAX_ERROR])
+
+    @classmethod
+    def build(
+        cls,
+        tip: Fingertip,
+        material: Material,
+        tolerance: float = 1e-9,
+        form: str | None = None,
+    ) -> ContactTable:
+        """Build and certify the cheapest table that meets ``tolerance``, relative, on all outputs.
+
+        ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
+
+        ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
+        with the best that was reached, when the tolerance can't be met within 256 KiB.
+        """
+        # Imported here: a table that is loaded needs none of the quadrature.
+        from softfinger.kinematics.contact.table_build import build
+
+        return cls(build(tip, material, tolerance, form))
+
+    def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
+        """The table with its key and checksum, for :meth:`from_bytes` to read again."""
+        key = table_key(tip, material, self.tolerance)
+        body = key + struct.pack("<Q", self.data.size) + self.data.astype("<f8").tobytes()
+        return _MAGIC + hashlib.sha256(body).digest() + body
+
+    @classmethod
+    def from_bytes(
+        cls, content: bytes, tip: Fingertip, material: Material, tolerance: float = 1e-9
+    ) -> ContactTable:
+        """The table of this tip, material and tolerance that this version made ``content`` of.
+
+        Raises TableError when it is damaged, belongs to another table or is none.
+        """
+        start = len(_MAGIC) + _CHECK
+        body = content[start:]
+        if content[: len(_MAGIC)] != _MAGIC:
+            raise TableError("it holds no contact table")
+        if hashlib.sha256(body).digest() != content[len(_MAGIC) : start]:
+            raise TableError("it is damaged: its checksum does not match")
+        if body[:_CHECK] != table_key(tip, material, tolerance):
+            raise TableError("it belongs to another tip, material, tolerance or version")
+        (size,) = struct.unpack_from("<Q", body, _CHECK)
+        data = aligned(size)
+        data[:] = np.frombuffer(body, dtype="<f8", offset=_CHECK + 8, count=size)
+        return cls(data)
+
+    @property
+    def tolerance(self) -> float:
+        """The tolerance it was built to."""
+        return float(self.data[TOLERANCE])
+
+    @property
+    def certificate(self) -> Certificate:
+        """Largest relative error found, and at what d and θ."""
+        return Certificate(*(float(self.data[i]) for i in (MAX_ERROR, WORST_D, WORST_THETA)))
+
+    @property
+    def form(self) -> Form:
+        """Its representation."""
+        return FORMS[int(self.data[FORM])]
+
+    @property
+    def tip(self) -> Fingertip:
+        """The tip that it was built for."""
+        return Fingertip(float(self.data[RADIUS]))
+
+    def __call__(self, d: ArrayLike, theta: ArrayLike) -> Contact:
+        """Look up at displacement d [m] and tilt θ [rad]; they broadcast.
+
+        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged.
+        """
+        if type(d) is float and type(theta) is float:
+            *six, inside = lookup(self.data, d, theta)
+            numbers = map(np.float64, six)
+            return cast(Contact, _contact(*numbers, np.bool_(inside), self.max_error))
+        shape, (depth, tilt) = flatten(d, theta)
+        out = np.empty((6, depth.size))
+        within = np.empty(depth.size, dtype=np.bool_)
+        lookups(self.data, depth, tilt, out, within)
+        f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
+        return Contact(f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error)
+
+
+def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:
+    """What a saved table is for: SHA-256 of tip, material, tolerance and the code's version."""
+    law = [str(value) for value in material.coefficients]
+    text = repr((VERSION, _sources(), tip.radius.hex(), law, float(tolerance).hex()))
+    return hashlib.sha256(text.encode()).digest()
+
+
+@cache
+def _sources() -> str:
+    """SHA-256 of the modules that decide what is in a table."""
+    here, state = Path(__file__).parent, hashlib.sha256()
+    for name in _SOURCES:
+        state.update(here.joinpath(name).read_bytes())
+    return state.hexdigest()
+
+
+def aligned(size: int) -> FloatArray:
+    """Zeros, float64 [size], starting at a cache line so that vector loads do not straddle two."""
+    room = np.zeros(size + 8)
+    skip = (-room.ctypes.data % 64) // 8
+    return room[skip : skip + size]

@@ -1,0 +1,146 @@
+"""A grid's cells by their middles: those that may be touched, and sums over them, as kernels.
+
+The planes here lie flat, cell after cell, so that a sum over many cells is one loop in SIMD lanes
+without a start and an end for each row; which cells count is decided cell by cell, by a comparison
+that the lanes make for free. Kernels take addresses, see :data:`compiled.simd.address`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel
+from softfinger.kinematics.compiled.simd import Pointer
+from softfinger.kinematics.estimation.footprint import FloatArray, Geometry, IntArray
+
+# Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's middle, or
+# over its nearest corner where the middle lies beyond the rim, and −∞ for a cell that is dead or
+# out of reach; the middle's x and y.
+HEIGHT, X, Y = range(3)
+PLANES = 3
+
+# What goes with them, int64: the flat range of the rows in reach, and the number of cells in reach.
+FIRST, LAST, NUMBER = range(3)
+BOUNDS = 3
+
+
+def cell_middles(
+    geometry: Geometry, live: NDArray[np.bool_], reach: float
+) -> tuple[FloatArray, IntArray]:
+    """The planes and bounds of a grid whose ``live`` cells [rows, cols] are marked.
+
+    A cell is in reach when the disc of radius ``reach`` [m] round the tip's centre touches it.
+    """
+    a, x_first, y_first, pitch_x, pitch_y = geometry
+    rows, cols = live.shape
+    x, y = np.meshgrid(
+        x_first + pitch_x * (np.arange(cols) + 0.5), y_first + pitch_y * (np.arange(rows) + 0.5)
+    )
+    nearest_x = np.maximum(np.abs(x) - 0.5 * pitch_x, 0.0)
+    nearest_y = np.maximum(np.abs(y) - 0.5 * pitch_y, 0.0)
+    touched = nearest_x**2 + nearest_y**2 < reach * reach
+    near = np.maximum(a * a - nearest_x**2 - nearest_y**2, 0.0)
+    inside = a * a - x * x - y * y
+    height = np.sqrt(np.where(inside > 0.0, inside, near))
+    planes = np.stack([np.where(touched & live, height, -math.inf), x, y]).reshape(PLANES, -1)
+    reached = np.flatnonzero(touched.any(axis=1))
+    first, last = (int(reached[0]), int(reached[-1]) + 1) if len(reached) else (0, 0)
+    bounds = np.array([first * cols, last * cols, np.count_nonzero(touched & live)], np.int64)
+    return planes, bounds
+
+
+@fast_inner_kernel
+def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[float, float, float]:
+    """Σ p, which tells what is no number, Σ p² and the largest p, at least 0, of first..last."""
+    total = 0.0
+    energy = 0.0
+    peak = np.int64(0)
+    for k in range(first, last):
+        value = frame[k]
+        value = value if height[k] >= 0.0 else 0.0
+        total += value
+        energy += value * value
+        # Numbers that are not negative rank as their bits do, and those have no NaN.
+        bits = np.float64(value).view(np.int64)
+        peak = bits if bits > peak else peak
+    return total, energy, np.int64(peak).view(np.float64)
+
+
+@fast_inner_kernel
+def sums_above(
+    frame: Pointer, middles: Pointer, size: int, first: int, last: int, level: float
+) -> tuple[float, float, float, float]:
+    """Σ p, Σ p x, Σ p y and the number of the cells in first..last with p above ``level``."""
+    total = sum_x = sum_y = number = 0.0
+    for k in range(first, last):
+        value = frame[k]
+        counts = (middles[k] >= 0.0) & (value > level)
+        value = value if counts else 0.0
+        total += value
+        sum_x += value * middles[size + k]
+        sum_y += value * middles[2 * size + k]
+        number += 1.0 if counts else 0.0
+    return total, sum_x, sum_y, number
+
+
+@fast_inner_kernel
+def sums_inside(
+    frame: Pointer,
+    middles: Pointer,
+    size: int,
+    first: int,
+    last: int,
+    u: float,
+    v: float,
+    w: float,
+) -> tuple[float, float, float, float, float]:
+    """Σ p, Σ p x, Σ p y, Σ p (x² + y²) and the number of cells whose middle the face has pressed.
+
+    ``size`` is that of a plane; (u, v, w) is the face, see footprint.py.
+    """
+    total = sum_x = sum_y = square = number = 0.0
+    for k in range(first, last):
+        x = middles[size + k]
+        y = middles[2 * size + k]
+        inside = middles[k] > u - v * x - w * y
+        value = frame[k]
+        value = value if inside else 0.0
+        along_x = value * x
+        along_y = value * y
+        total += value
+        sum_x += along_x
+        sum_y += along_y
+        square += along_x * x + along_y * y
+        number += 1.0 if inside else 0.0
+    return total, sum_x, sum_y, square, number
+
+
+@fast_inner_kernel
+def _any_of_64(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
+    found = False
+    for k in range(start, start + 64):
+        found |= (frame[k] >= level) & (height[k] >= 0.0)
+    return found
+
+
+@fast_inner_kernel
+def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
+    found = False
+    for k in range(start, start + 8):
+        found |= (frame[k] >= level) & (height[k] >= 0.0)
+    return found
+
+
+@fast_inner_kernel
+def next_above(frame: Pointer, height: Pointer, start: int, last: int, level: float) -> int:
+    """The first cell in start..last that reads ``level`` or more; ``last`` if there is none."""
+    while start + 64 <= last and not _any_of_64(frame, height, start, level):
+        start += 64
+    while start + 8 <= last and not _any_of_8(frame, height, start, level):
+        start += 8
+    while start < last and not (frame[start] >= level and height[start] >= 0.0):
+        start += 1
+    return start

@@ -1,0 +1,256 @@
+"""Normal equations of the pressure grid's likelihood, as kernels.
+
+The model of a cell is ``γ · mean(σ(ε)) = γ A (σ(ε̄) + ½ σ''(ε̄) V)``, with A the cell's share in the
+footprint, ε̄ and V the strain's mean and variance over that share; it is exact for a constant
+modulus, and to the strain's third moment for any other law. The strain is linear in (u, v, w) (see
+footprint.py), so its means are sums of fixed means of g, x g, y g for whole cells; cut cells are
+integrated (cut_cells.py). The outline adds no derivative of its own, as σ is 0 there.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inlined_kernel, inner_kernel
+from softfinger.kinematics.estimation.cut_cells import (
+    ALONG_X,
+    ALONG_Y,
+    PLAIN,
+    READING,
+    SHARE,
+    VARIANCE,
+    WEIGHT,
+)
+from softfinger.kinematics.estimation.footprint import FloatArray
+
+SUMS = 17
+
+# What `press` makes of the first planes of the packed cells.
+STRESS, BY_U, BY_V, BY_W = SHARE, PLAIN, ALONG_X, ALONG_Y
+Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+
+# A cell that can't read below its floor (0, or the smallest count sent) reads more than the
+# pressure on average, by E[max(z + e, 0)] − z standard deviations at a pressure of z above it,
+# e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this polynomial, within 3e-4. E[max(e − z, 0)] is
+# the same number. Cells more than CLIP_BELOW below the floor tell next to nothing.
+CLIP_END = 3.5
+CLIP_BELOW = 2.0
+CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
+LAW_PIECES = 128
+POLYNOMIAL = 8
+
+
+def fit_law(law: FloatArray) -> FloatArray:
+    """Any material's law in one of two forms, float64 [n, 4].
+
+    A law of one polynomial of at most POLYNOMIAL terms has n = 2: its coefficients in ε, the lowest
+    first. Any other becomes LAW_PIECES cubics by value and slope at the pieces' ends, within 1e-9
+    of a smooth law: row k holds the coefficients of t = ε·pieces − k.
+    """
+    pieces, order = law.shape
+    if pieces == 1 and order <= POLYNOMIAL:
+        polynomial = np.zeros(POLYNOMIAL)
+        polynomial[:order] = law[0]
+        return polynomial.reshape(2, 4)
+    strain = np.linspace(0.0, 1.0, LAW_PIECES + 1)
+    index = np.minimum((strain * pieces).astype(int), pieces - 1)
+    t = strain * pieces - index
+    value = np.zeros_like(strain)
+    slope = np.zeros_like(strain)
+    for j in range(order - 1, -1, -1):
+        slope = slope * t + value
+        value = value * t + law[index, j]
+    slope *= pieces / LAW_PIECES
+    table = np.zeros((LAW_PIECES + 1, 4))
+    table[:, 0] = value
+    table[:, 1] = slope
+    rise = np.diff(value)
+    table[:-1, 2] = 3.0 * rise - 2.0 * slope[:-1] - slope[1:]
+    table[:-1, 3] = slope[:-1] + slope[1:] - 2.0 * rise
+    return table
+
+
+@inner_kernel
+def is_bent(law: FloatArray) -> bool:
+    """Whether a law as :func:`fit_law` gives it is curved, so that the strain's variance counts."""
+    if law.shape[0] != 2:
+        return True
+    bent = False
+    for k in range(2, POLYNOMIAL):
+        bent |= law[k // 4, k % 4] != 0.0
+    return bent
+
+
+@fast_inner_kernel
+def footprint_energy(packed: FloatArray, count: int) -> tuple[float, float]:
+    """Σ W p² [Pa²] and Σ W over the packed cells."""
+    energy = 0.0
+    number = 0.0
+    for k in range(count):
+        weight = packed[WEIGHT, k]
+        energy += weight * packed[READING, k] * packed[READING, k]
+        number += weight
+    return energy, number
+
+
+@inlined_kernel
+def _polynomial(c: Eight, strain: float) -> tuple[float, float, float]:
+    """A polynomial, its slope and half its second derivative."""
+    value, slope, half = c[7], 0.0, 0.0
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[6]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[5]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[4]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[3]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[2]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[1]
+    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[0]
+    return value, slope, half
+
+
+@inlined_kernel
+def _compared(
+    stress: float,
+    gain: float,
+    reading: float,
+    saturation: float,
+    floor: float,
+    clip: float,
+    clipped: bool,
+) -> tuple[float, float, float]:
+    """(reading − model, the model's response to pressure, 1 for a cell that counts)."""
+    model = gain * stress
+    residual = max(reading, floor) - model
+    response = 1.0
+    least = floor
+    if clipped:
+        # As much below the floor as above it, a cell reads as much more than the larger of both.
+        depth = (model - floor) * (1.0 / clip)
+        z = min(abs(depth), CLIP_END)
+        above = 1.0 - z * (1.0 / CLIP_END)
+        base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
+        rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
+        rise = above * (above * rise - (2.0 / CLIP_END) * base)
+        residual = max(reading, floor) - max(model, floor) - clip * above * above * base
+        response = 1.0 + rise if depth >= 0.0 else -rise
+        least = floor - CLIP_BELOW * clip
+    counts = ((reading < saturation) | (model < saturation)) & (model >= least)
+    return residual, response, 1.0 if counts else 0.0
+
+
+@fast_inner_kernel
+def press(packed: FloatArray, count: int, u: float, v: float, w: float, law: FloatArray) -> None:
+    """Put the material into the packed cells, in place.
+
+    STRESS takes the mean stress over each cell, BY_U, BY_V and BY_W its derivatives by −u, v and w:
+    σ' times the means of g, x g and y g.
+    """
+    # It doesn't change within the loop, of which the compiler makes two.
+    polynomial = law.shape[0] == 2
+    c = (law[0, 0], law[0, 1], law[0, 2], law[0, 3], law[1, 0], law[1, 1], law[1, 2], law[1, 3])
+    for k in range(count):
+        # Arrays are read here alone: a function that took one would keep the loop out of lanes.
+        share = packed[SHARE, k]
+        g = packed[PLAIN, k]
+        g_x = packed[ALONG_X, k]
+        g_y = packed[ALONG_Y, k]
+        strain = min(max(1.0 - (u * g - v * g_x - w * g_y), 0.0), 1.0)
+        if polynomial:
+            stress, slope, half = _polynomial(c, strain)
+        else:
+            t = strain * LAW_PIECES
+            piece = np.int32(t)
+            t -= piece
+            c1 = law[piece, 1]
+            c2 = law[piece, 2]
+            c3 = law[piece, 3]
+            stress = law[piece, 0] + t * (c1 + t * (c2 + t * c3))
+            slope = (c1 + t * (2.0 * c2 + t * 3.0 * c3)) * LAW_PIECES
+            half = (c2 + 3.0 * t * c3) * (LAW_PIECES * LAW_PIECES)
+        # From a strain of 1 on the stress stays, and what varies there doesn't show.
+        half = half if strain < 1.0 else 0.0
+        stress = share * (stress + half * packed[VARIANCE, k])
+        slope *= share
+        packed[STRESS, k] = stress
+        packed[BY_U, k] = slope * g
+        packed[BY_V, k] = slope * g_x
+        packed[BY_W, k] = slope * g_y
+
+
+@fast_inner_kernel
+def accumulate(
+    packed: FloatArray,
+    count: int,
+    gain: float,
+    saturation: float,
+    floor: float,
+    clip: float,
+    sums: FloatArray,
+) -> None:
+    """Sums for one Gauss-Newton step over the pressed cells, into ``sums`` [17].
+
+    Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
+    factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
+    sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
+    below its end. No reading is less than ``floor`` [Pa], below which a board sends 0; −inf for
+    none. ``clip`` > 0 is the noise [Pa] of cells that end there; without it a cell that the model
+    puts below the floor doesn't count.
+    """
+    clipped = clip > 0.0
+    s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
+    r0 = r1 = r2 = r3 = rr = yy = ww = 0.0
+    for k in range(count):
+        stress = packed[STRESS, k]
+        a1 = packed[BY_U, k]
+        a2 = packed[BY_V, k]
+        a3 = packed[BY_W, k]
+        reading = packed[READING, k]
+        residual, response, counts = _compared(
+            stress, gain, reading, saturation, floor, clip, clipped
+        )
+        squares = packed[WEIGHT, k] * reading * reading
+        weight = packed[WEIGHT, k] * counts
+        if clipped:
+            stress *= response
+            a1 *= response
+            a2 *= response
+            a3 *= response
+        w0 = weight * stress
+        w1 = weight * a1
+        w2 = weight * a2
+        w3 = weight * a3
+        s00 += w0 * stress
+        s01 += w0 * a1
+        s02 += w0 * a2
+        s03 += w0 * a3
+        s11 += w1 * a1
+        s12 += w1 * a2
+        s13 += w1 * a3
+        s22 += w2 * a2
+        s23 += w2 * a3
+        s33 += w3 * a3
+        r0 += w0 * residual
+        r1 += w1 * residual
+        r2 += w2 * residual
+        r3 += w3 * residual
+        rr += weight * residual * residual
+        yy += squares
+        ww += weight
+    sums[0] = s00
+    sums[1] = s01
+    sums[2] = s02
+    sums[3] = s03
+    sums[4] = s11
+    sums[5] = s12
+    sums[6] = s13
+    sums[7] = s22
+    sums[8] = s23
+    sums[9] = s33
+    sums[10] = r0
+    sums[11] = r1
+    sums[12] = r2
+    sums[13] = r3
+    sums[14] = rr
+    sums[15] = yy
+    sums[16] = ww

@@ -1,0 +1,149 @@
+"""An object held by two rotational fingers: how joint motions move it, and what holds it.
+
+Pure kernels on the coordinates and signs of :mod:`hand.geometry`; the tips stick and roll. No
+forces from outside but the fingers' own. The object's faces may lean towards each other by a taper
+α, above 0 where the object is wider at the palm: the left tip's θ is then φ + q1 − α/2, the right
+one's φ − q2 + α/2, with φ the angle of the faces' bisector.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.contact.table import lookup
+from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
+
+_SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
+
+
+@kernel
+def total_tilt(tilt_x: float, tilt_y: float) -> float:
+    """Angle between the object's normal and the tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
+    return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
+
+
+@inner_kernel
+def held_motion(
+    q1: float,
+    q2: float,
+    d1: float,
+    d2: float,
+    angle: float,
+    taper: float,
+    half_separation: float,
+    length: float,
+    offset: float,
+    radius: float,
+) -> tuple[float, float, float, float, float, float, float]:
+    """(arm1, arm2, turn1, turn2, slide, width, across) of a held object.
+
+    Rolling without slip, both tips pressed deeper alike, gives with the tips' velocities v_i by q_i
+
+        φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t/cos(α/2)
+        ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇
+        arm_i = ±v_i·n/cos(α/2) − tan(α/2) (a − d_i)
+        slide = (O1 − O2)·t/cos(α/2) + tan(α/2) (d1 − d2)
+
+    with n, t of the bisector's ``angle`` φ and α the ``taper`` [rad]; the object goes out along t
+    as tips roll and come nearer to each other. Between parallel faces arm [m] is the lever of the
+    normal force about the pivot, and in the symmetric grasp turn1 + turn2 is
+    2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m],
+    ``width`` the distance of the contacts along n, W cos(α/2).
+    """
+    nx = math.cos(angle)
+    ny = math.sin(angle)
+    lean = math.tan(0.5 * taper)
+    longer = math.sqrt(1.0 + lean * lean)
+    x1, y1 = tip_position(q1, 1.0, half_separation, length, offset)
+    x2, y2 = tip_position(q2, -1.0, half_separation, length, offset)
+    vx1, vy1 = tip_velocity(q1, 1.0, length, offset)
+    vx2, vy2 = tip_velocity(q2, -1.0, length, offset)
+    across = d1 + d2 - 2.0 * radius + longer * ((x2 - x1) * nx + (y2 - y1) * ny)
+    bounded = max(across, 0.1 * radius)
+    return (
+        longer * (vx1 * nx + vy1 * ny) - lean * (radius - d1),
+        -longer * (vx2 * nx + vy2 * ny) - lean * (radius - d2),
+        (radius - d1 - longer * (vy1 * nx - vx1 * ny)) / bounded,
+        (radius - d2 - longer * (vy2 * nx - vx2 * ny)) / bounded,
+        longer * ((y1 - y2) * nx - (x1 - x2) * ny) + lean * (d1 - d2),
+        across / longer,
+        across,
+    )
+
+
+@inner_kernel
+def sheared_gradient(
+    contact: tuple[float, float, float, float, float, float, bool],
+    d: float,
+    theta: float,
+    tangential: float,
+) -> tuple[float, float]:
+    """(∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N]; ``contact`` as looked up."""
+    force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
+    sine = math.sin(theta)
+    cosine = math.cos(theta)
+    # T = F (sin θ + 2 cos θ d_t/d), solved for d_t/d
+    bend = 0.5 * (tangential / force - sine) / cosine
+    shear = bend * d
+    stretch = shear * (sine + cosine * bend)
+    return (
+        energy_d + force_d * stretch - force * cosine * bend * bend,
+        energy_theta + force_theta * stretch + force * shear * (cosine - sine * bend),
+    )
+
+
+@inner_kernel
+def holding_levers(
+    data1: NDArray[float64],
+    data2: NDArray[float64],
+    d1: float,
+    d2: float,
+    theta1: float,
+    theta2: float,
+    taper: float,
+    motion: tuple[float, float, float, float, float, float, float],
+) -> tuple[float, float, float, float, float]:
+    """(τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
+
+    The torques are the energy's gradient along the rolling increments, ``motion`` as
+    :func:`held_motion` gives it,
+
+        τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
+
+    and the object's balance gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2 for the mean T of both tips'
+    shear forces: T ∓ N tan(α/2), left first, with α the ``taper`` [rad], since faces that lean
+    press the object out. F is the mean of both tips' forces, so that the levers τ/F [m] don't
+    depend on a modulus that both tips share; N is that of the normal forces N1 and N2 [N], which
+    differ where the object rubs on something. ``data1`` and ``data2`` are the tables' data. All
+    zero without two contacts.
+    """
+    if not (d1 > 0.0 and d2 > 0.0):
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    arm1, arm2, turn1, turn2, slide, _, across = motion
+    contact1 = lookup(data1, d1, theta1)
+    contact2 = lookup(data2, d2, theta2)
+    tangential = normal = normal1 = normal2 = turning1 = turning2 = 0.0
+    tangent1 = math.tan(theta1)
+    tangent2 = math.tan(theta2)
+    lean = math.tan(0.5 * taper)
+    for _ in range(_SHEAR_STEPS):
+        out = lean * normal
+        by_d1, turning1 = sheared_gradient(contact1, d1, theta1, tangential - out)
+        by_d2, turning2 = sheared_gradient(contact2, d2, theta2, tangential + out)
+        normal1 = by_d1 - (tangential - out) * tangent1
+        normal2 = by_d2 - (tangential + out) * tangent2
+        normal = 0.5 * (normal1 + normal2)
+        tangential = (normal * slide + turning1 + turning2) / across
+    force = 0.5 * (contact1[0] + contact2[0])
+    moment = tangential * across
+    return (
+        (normal * arm1 + turning1 + moment * turn1) / force,
+        (normal * arm2 - turning2 - moment * turn2) / force,
+        tangential,
+        normal1,
+        normal2,
+    )

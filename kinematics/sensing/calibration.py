@@ -1,0 +1,372 @@
+"""The mathematics of calibrating a pressure sensor under a soft tip. No files, no sensors.
+
+In the order in which it is done: tare (what the cells read unloaded), equilibration (what makes
+the cells alike), curve (alike readings → pressure), centre (where the tip stands on the sensor and
+how that is turned), modulus (the tip's own law). Each returns its result with the residuals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["power", "cubic"]
+
+DEAD = 0.2  # of the median response: cells below are dead
+_EXPONENTS = (0.3, 3.0)
+_RESTLESS = 8.0  # times the usual noise
+_FEW_CELLS = 4  # may be faulty
+_BINS = 24  # of strain
+_LEAST_TILT = math.radians(3.0)  # tilts that differ by less tell no direction
+_UPRIGHT = math.radians(0.5)
+
+
+class CalibrationError(ValueError):
+    """The data don't determine what is asked for. The message says what is missing or wrong."""
+
+
+@dataclass(frozen=True)
+class Tare:
+    """``zero``: mean count unloaded; ``noise``: standard deviation; both float64 [rows, cols]."""
+
+    zero: FloatArray
+    noise: FloatArray
+
+
+def tare(frames: ArrayLike) -> Tare:
+    """The zero of each cell from unloaded frames [n, rows, cols].
+
+    Raises CalibrationError when some cells vary far more than most: something presses meanwhile.
+    """
+    stack = _stack(frames, "tare")
+    if len(stack) < 2:
+        raise CalibrationError("tare: one frame is too few, expected at least two")
+    noise = stack.std(axis=0, ddof=1)
+    restless = np.count_nonzero(noise > _RESTLESS * max(float(np.median(noise)), 0.5))
+    if restless >= _FEW_CELLS:
+        raise CalibrationError(f"tare: {restless} cells don't rest; does something touch the tip?")
+    return Tare(stack.mean(axis=0), noise)
+
+
+@dataclass(frozen=True)
+class Equilibration:
+    """``gain`` float64 [rows, cols] makes all cells read alike, 0 for dead ones.
+
+    ``spread`` is the cells' relative rms round the mean before, ``residual`` after.
+    """
+
+    gain: FloatArray
+    spread: float
+    residual: float
+
+
+def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
+    """Gains from frames [n, rows, cols] under each of several uniform pressures.
+
+    Least squares of each cell's readings against the mean of all live ones. Cells that respond by
+    less than a fifth of the median are dead. Raises CalibrationError when nothing presses.
+    """
+    if not loads:
+        raise CalibrationError("equilibrate: no uniform pressure was given")
+    readings = np.stack([_stack(load, "equilibrate").mean(axis=0) - zero for load in loads])
+    response = readings.sum(axis=0)
+    typical = float(np.median(response))
+    if not typical > 0.0:
+        raise CalibrationError("equilibrate: most cells read nothing above their zero")
+    live = response > DEAD * typical
+    target = np.array([reading[live].mean() for reading in readings])
+    if (target <= 0.0).any():
+        raise CalibrationError("equilibrate: a pressure reads nothing above the zero")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = np.tensordot(target, readings, 1) / (readings**2).sum(axis=0)
+    gain = np.where(live, gain, 0.0)
+    relative = target[:, None]
+    before = readings[:, live] / relative - 1.0
+    after = readings[:, live] * gain[live] / relative - 1.0
+    return Equilibration(gain, _rms(before), _rms(after))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """``coefficients`` (exponent, c_1, c_2, c_3) as for `sensing.counts.to_pressure`.
+
+    ``errors`` [n]: relative error of each known force; ``residual`` their rms.
+    """
+
+    kind: Kind
+    coefficients: tuple[float, float, float, float]
+    errors: FloatArray
+    residual: float
+
+
+def fit_curve(kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float) -> Curve:
+    """The curve whose pressure over all cells makes the known forces.
+
+    ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
+    the contact (see :func:`cleared`); ``force`` [n] N; ``area`` of a cell [m²]; ``full`` the
+    largest x there is, up to which a cubic has to rise. Least squares of the relative errors.
+    Raises CalibrationError for too few forces or a curve that falls.
+    """
+    x = _stack(readings, "curve")
+    x = x.reshape(len(x), -1)
+    known = np.asarray(force, np.float64)
+    if known.shape != (len(x),) or not (np.isfinite(known).all() and (known > 0.0).all()):
+        raise CalibrationError("curve: each load needs its force, above 0")
+    need = 2 if kind == "power" else 3
+    if len(np.unique(known)) < need:
+        raise CalibrationError(f"curve: a {kind} needs at least {need} different forces")
+    if (x.max(axis=1) <= 0.0).any():
+        raise CalibrationError("curve: a load reads nothing above the zero")
+    if kind == "power":
+        coefficients, errors = _power(x, known, area, full)
+    else:
+        coefficients, errors = _cubic(x, known, area, full)
+    return Curve(kind, coefficients, errors, _rms(errors))
+
+
+def _cubic(
+    x: FloatArray, force: FloatArray, area: float, full: float
+) -> tuple[tuple[float, float, float, float], FloatArray]:
+    u = x / full
+    rows = np.stack([(u**j).sum(axis=1) * area / force for j in (1, 2, 3)], axis=1)
+    c, _, rank, _ = np.linalg.lstsq(rows, np.ones(len(force)), rcond=1e-10)
+    if rank < 3:
+        raise CalibrationError("curve: the loads are too alike for a cubic; try a power")
+    at = np.linspace(0.0, 1.0, 201)
+    if (c[0] + 2 * c[1] * at + 3 * c[2] * at**2 <= 0.0).any():
+        raise CalibrationError("curve: the cubic through these loads falls; try a power")
+    scaled = (1.0, float(c[0] / full), float(c[1] / full**2), float(c[2] / full**3))
+    return scaled, rows @ c - 1.0
+
+
+def _power(
+    x: FloatArray, force: FloatArray, area: float, full: float
+) -> tuple[tuple[float, float, float, float], FloatArray]:
+    u = x / full
+
+    def fit(exponent: float) -> tuple[float, FloatArray]:
+        row = np.where(u > 0.0, u, 0.0) ** exponent
+        ratio = row.sum(axis=1) * area / force
+        factor = float(ratio.sum() / (ratio @ ratio))
+        return factor, factor * ratio - 1.0
+
+    def cost(exponent: float) -> float:
+        errors = fit(exponent)[1]
+        return float(errors @ errors)
+
+    # The best of a coarse grid, then golden section round it.
+    grid = np.linspace(*_EXPONENTS, 28)
+    best = int(np.argmin([cost(float(b)) for b in grid]))
+    low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
+    golden = 0.5 * (math.sqrt(5.0) - 1.0)
+    for _ in range(40):
+        left, right = high - golden * (high - low), low + golden * (high - low)
+        low, high = (low, right) if cost(left) < cost(right) else (left, high)
+    exponent = 0.5 * (low + high)
+    if not _EXPONENTS[0] + 0.02 < exponent < _EXPONENTS[1] - 0.02:
+        raise CalibrationError(f"curve: these loads want an exponent beyond {_EXPONENTS}")
+    factor, errors = fit(exponent)
+    return (exponent, factor / full**exponent, 0.0, 0.0), errors
+
+
+def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
+    """Readings [rows, cols], means of so many frames, with those within 4 σ of zero put to 0.
+
+    Clipped noise has a positive mean, which over all the cells would weigh as much as a contact.
+    """
+    level = 4.0 * noise / math.sqrt(frames)
+    return np.where(readings > level, readings, 0.0)
+
+
+@dataclass(frozen=True)
+class Centre:
+    """The tip's centre in the sensor's axes (x, y) [m], and the sensor's rotation [rad].
+
+    ``rotation`` is None where no press was tilted. ``scale`` is the centroid's measured travel over
+    the model's, 1 for a true tip; ``residual`` the rms distance [m].
+    """
+
+    centre: tuple[float, float]
+    rotation: float | None
+    scale: float
+    residual: float
+
+
+def fit_centre(
+    frames: ArrayLike,
+    theta: ArrayLike,
+    tip: Fingertip,
+    material: Material,
+    grid: SensorGrid,
+    noise: float,
+    live: NDArray[np.bool_] | None = None,
+) -> Centre:
+    """Centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
+
+    ``frames`` [n, rows, cols] Pa. The pressure's centroid stands at centre + (a − d/3)·n, so both
+    follow linearly from the estimated centroids; the estimate's own centre is brought along.
+    Raises CalibrationError when a frame shows no contact, and for tilts that are all alike but not
+    upright.
+    """
+    stack = _stack(frames, "centre")
+    s = np.sin(np.asarray(theta, np.float64))
+    if s.shape != (len(stack),):
+        raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
+    tilted = float(np.ptp(s)) > math.sin(_LEAST_TILT)
+    if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT):
+        raise CalibrationError(
+            f"centre: the tilts differ by less than {math.degrees(_LEAST_TILT):g}°, so that tilt "
+            "can't be told from place; press upright alone, or upright and tilted further"
+        )
+    centre, rotation, scale, residual = grid.centre, None, 1.0, 0.0
+    for _ in range(4):
+        at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)
+        estimator = ContactEstimator(tip, material, at, noise, free_gain=True, live=live)
+        points, arms = np.empty((len(s), 2)), np.empty(len(s))
+        for k, frame in enumerate(stack):
+            estimate = estimator(frame)
+            if not (estimate.contact and estimate.valid):
+                raise CalibrationError(f"centre: press {k + 1} is no clean contact")
+            arms[k] = tip.radius - estimate.d / 3.0
+            normal = math.sin(estimate.tilt_x), math.sin(estimate.tilt_y)
+            points[k] = np.array(centre) + arms[k] * np.array(normal)
+        rows = np.ones((len(s), 1))
+        if tilted:
+            rows = np.stack([np.ones(len(s)), arms * s], axis=1)
+        solution = np.linalg.lstsq(rows, points, rcond=None)[0]
+        centre = float(solution[0, 0]), float(solution[0, 1])
+        residual = math.sqrt(2.0) * _rms(rows @ solution - points)
+        if tilted:
+            # The finger's x axis in the sensor's: (cos, −sin) of the rotation.
+            rotation = math.atan2(-solution[1, 1], solution[1, 0])
+            scale = math.hypot(*solution[1])
+    return Centre(centre, rotation, scale, residual)
+
+
+@dataclass(frozen=True)
+class Modulus:
+    """E [Pa] of F = πE(d − d₀)²/cos θ; ``offset`` d₀ [m]; ``errors`` [n] relative, of the force."""
+
+    modulus: float
+    offset: float
+    errors: FloatArray
+    residual: float
+
+
+def fit_modulus(
+    d: ArrayLike, theta: ArrayLike, force: ArrayLike, free_offset: bool = True
+) -> Modulus:
+    """A constant modulus from a compression run: √(F cos θ/π) is a line in d of slope √E.
+
+    ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. ``free_offset``: the run's own
+    zero of d is fitted too. Raises CalibrationError for too few points.
+    """
+    depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
+    if not depth.shape == tilt.shape == load.shape:
+        raise CalibrationError("modulus: each frame needs its d and its force")
+    used = (depth > 0.0) & (load > 0.0)
+    if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
+        raise CalibrationError("modulus: expected at least three frames of different d, pressed")
+    depth, tilt, load = depth[used], tilt[used], load[used]
+    root = np.sqrt(load * np.cos(tilt) / math.pi)
+    rows = np.stack([depth, np.ones(len(depth))], axis=1) if free_offset else depth[:, None]
+    solution = np.linalg.lstsq(rows, root, rcond=None)[0]
+    if not solution[0] > 0.0:
+        raise CalibrationError("modulus: the force does not rise with d")
+    fitted = rows @ solution
+    offset = -float(solution[1] / solution[0]) if free_offset else 0.0
+    errors = (fitted / root) ** 2 - 1.0
+    return Modulus(float(solution[0]) ** 2, offset, errors, _rms(errors))
+
+
+@dataclass(frozen=True)
+class Law:
+    """Measured points of σ(ε): strain [m], stress [m] Pa; ``residual``: rms of the cells [Pa]."""
+
+    strain: FloatArray
+    stress: FloatArray
+    material: Material
+    residual: float
+
+
+def fit_law(
+    frames: ArrayLike,
+    d: ArrayLike,
+    theta: ArrayLike,
+    tip: Fingertip,
+    grid: SensorGrid,
+    used: NDArray[np.bool_] | None = None,
+) -> Law:
+    """σ(ε) from a compression run: each cell under the tip is a measured point of it.
+
+    ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
+    out cells that don't tell, dead or saturated ones. A cell's strain is the model's, averaged over
+    it; points are the means over narrow bands of strain, bands that noise has put out of order
+    taken together. Raises CalibrationError when the points make no law.
+    """
+    stack = _stack(frames, "modulus")
+    unit = Material.constant(1.0)
+    strains, stresses = [], []
+    told = np.ones(stack.shape, np.bool_) if used is None else used
+    for frame, tells, depth, tilt in zip(
+        stack, told, np.asarray(d, np.float64), np.asarray(theta, np.float64), strict=True
+    ):
+        if depth <= 0.0:
+            continue
+        if depth > tip.radius:
+            raise CalibrationError(f"modulus: d = {depth:g} m is more than the tip's radius")
+        strain = grid.pressure(tip, unit, float(depth), float(tilt))
+        inside = tells & (strain > 0.0)
+        strains.append(strain[inside])
+        stresses.append(frame[inside])
+    if not strains:
+        raise CalibrationError("modulus: no frame with d above 0")
+    strain, stress = np.concatenate(strains), np.concatenate(stresses)
+    if not strain.size:
+        raise CalibrationError("modulus: no cell under the tip tells its pressure")
+    edges = np.linspace(0.0, float(strain.max()) * (1 + 1e-12), _BINS + 1)
+    place = np.digitize(strain, edges) - 1
+    filled = np.flatnonzero(np.bincount(place, minlength=_BINS) >= 3)
+    means = _rising([(strain[place == k], stress[place == k]) for k in filled])
+    try:
+        material = Material.from_points(means[:, 0], means[:, 1])
+    except (ValueError, IndexError) as error:
+        raise CalibrationError(f"modulus: the run makes no stress-strain law: {error}") from None
+    residual = _rms(material.stress(strain) - stress)
+    return Law(means[:, 0], means[:, 1], material, residual)
+
+
+def _rising(bands: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """(mean strain, mean stress) of each band, neighbours whose stress falls pooled, [k, 2]."""
+    pooled: list[list[float]] = []  # count, sum of strain, sum of stress
+    for strain, stress in bands:
+        pooled.append([float(len(strain)), float(strain.sum()), float(stress.sum())])
+        while len(pooled) > 1 and pooled[-1][2] * pooled[-2][0] <= pooled[-2][2] * pooled[-1][0]:
+            last = pooled.pop()
+            pooled[-1] = [a + b for a, b in zip(pooled[-1], last, strict=True)]
+    sums = np.array(pooled).reshape(-1, 3)
+    return np.asarray(sums[:, 1:] / sums[:, :1])
+
+
+def _stack(frames: ArrayLike, step: str) -> FloatArray:
+    stack = np.asarray(frames, np.float64)
+    if stack.ndim != 3 or not len(stack):
+        raise CalibrationError(f"{step}: expected frames [n, rows, cols], got {stack.shape}")
+    if not np.isfinite(stack).all():
+        raise CalibrationError(f"{step}: readings that are not finite")
+    return stack
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0

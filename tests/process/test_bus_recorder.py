@@ -1,0 +1,152 @@
+"""The record of what was on the servos' wire, by the bus itself and through the control socket."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+
+import pytest
+
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.simulation.emulator.emulator import Emulator
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, frame
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.tools.cli import main
+from tests.harness.servos import RADIAN
+
+UNIT = by_name("XM430-W350").current_unit
+
+
+class Hand:
+    """The settings' servos: left closes with rising counts, right with falling ones."""
+
+    def __init__(self) -> None:
+        self.t = 10.0
+        self.plant = FreeJoints(2, self.t)
+        self.bus = ServoBus.from_settings(Settings(), self.plant, t=self.t)
+
+    def later(self, seconds: float) -> None:
+        self.t += seconds
+        self.bus.advance(self.t)
+
+    def write(self, servo: int, address: int, form: str, *values: int) -> int:
+        """The error of the reply."""
+        data = struct.pack("<H" + form, address, *values)
+        return self.bus.feed(frame(servo, protocol.WRITE, data), self.t)[8]
+
+    def report(self, servo: int) -> dict:
+        return next(each for each in self.bus.report(self.t) if each["id"] == servo)
+
+
+def test_extremes_of_goals_refused_ones_too() -> None:
+    hand = Hand()
+    assert hand.report(1)["goal_q"] is None
+    assert hand.report(1)["goal_current"] is None
+    for current, counts in ((100, 2048), (50, 2148), (70, 1998)):
+        assert hand.write(1, reg.GOAL_CURRENT, "h", current) == 0
+        assert hand.write(1, reg.GOAL_POSITION, "i", counts) == 0
+    left = hand.report(1)
+    assert left["goal_current"] == pytest.approx([50 * UNIT, 100 * UNIT])
+    assert left["goal_q"] == pytest.approx([-50 * RADIAN, 100 * RADIAN])
+    assert left["goals_refused"] == 0
+    assert hand.report(2)["goal_q"] is None
+    # Beyond the model's range, beyond the configured limit, and with torque stopped.
+    assert hand.write(1, reg.GOAL_CURRENT, "h", 5000) == protocol.DATA_RANGE
+    assert hand.report(1)["goal_current"][1] == pytest.approx(5000 * UNIT)
+    hand.write(1, reg.CURRENT_LIMIT, "H", 200)
+    assert hand.write(1, reg.GOAL_CURRENT, "h", -300) == protocol.DATA_LIMIT
+    assert hand.report(1)["goal_current"][0] == pytest.approx(-300 * UNIT)
+    assert hand.report(1)["goals_refused"] == 2
+    hand.bus.forget(hand.t)
+    assert hand.report(1)["goal_current"] is None
+    assert hand.report(1)["goals_refused"] == 0
+
+
+def test_goals_through_group_writes_and_indirect_addresses() -> None:
+    hand = Hand()
+    places = (reg.GOAL_CURRENT, reg.GOAL_CURRENT + 1, *range(116, 120))
+    for servo in (1, 2):
+        assert hand.write(servo, reg.INDIRECT_ADDRESS, "6H", *places) == 0
+    goal = struct.pack("<hi", 10, 2048 + 30)
+    data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
+    hand.bus.feed(frame(BROADCAST, protocol.SYNC_WRITE, data), hand.t)
+    assert hand.report(1)["goal_q"] == pytest.approx([30 * RADIAN] * 2)
+    assert hand.report(2)["goal_q"] == pytest.approx([-30 * RADIAN] * 2)  # the right one's sense
+    assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
+    # A registered write is on the wire before its action.
+    kept = struct.pack("<Hi", reg.GOAL_POSITION, 2048 + 90)
+    hand.bus.feed(frame(1, protocol.REG_WRITE, kept), hand.t)
+    assert hand.report(1)["goal_q"][1] == pytest.approx(90 * RADIAN)
+
+
+def test_torque_on_far_from_the_goal() -> None:
+    hand = Hand()
+    hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
+    hand.write(1, reg.GOAL_CURRENT, "h", 20)
+    hand.write(1, reg.TORQUE_ENABLE, "B", 1)
+    hand.write(1, reg.TORQUE_ENABLE, "B", 1)  # it was on
+    on = hand.report(1)["torque_on"]
+    assert hand.report(1)["torque"]
+    assert (on["count"], on["far"], on["t"]) == (1, 0, hand.t)
+    assert on["farthest"] == pytest.approx(10 * RADIAN)
+    assert on["current"] == pytest.approx(20 * UNIT)
+    hand.write(1, reg.TORQUE_ENABLE, "B", 0)
+    hand.write(1, reg.GOAL_POSITION, "i", 2048 + 500)
+    hand.write(1, reg.TORQUE_ENABLE, "B", 1)
+    on = hand.report(1)["torque_on"]
+    assert (on["count"], on["far"]) == (2, 1)
+    assert on["farthest"] == pytest.approx(500 * RADIAN, rel=0.1)
+    assert hand.report(2)["torque_on"]["count"] == 0
+
+
+def test_silence_and_the_watchdog() -> None:
+    hand = Hand()
+    hand.later(3.0)
+    assert hand.report(1)["quiet"] is None
+    assert hand.report(1)["longest_quiet"] == 0.0
+    hand.write(1, reg.TORQUE_ENABLE, "B", 1)
+    hand.write(1, reg.BUS_WATCHDOG, "B", 5)
+    hand.later(0.04)
+    hand.bus.feed(frame(2, protocol.PING), hand.t)
+    hand.later(0.03)
+    state = hand.report(1)
+    assert state["quiet"] == pytest.approx(0.03)
+    assert state["longest_quiet"] == pytest.approx(0.04)
+    assert state["watchdog"] == pytest.approx(0.1)
+    assert state["watchdog_fired"] == {"count": 0, "t": None}
+    fires = hand.t + 0.07
+    hand.later(0.5)
+    state = hand.report(1)
+    assert state["stopped_by_watchdog"]
+    assert state["watchdog"] is None
+    assert state["watchdog_fired"]["count"] == 1
+    assert state["watchdog_fired"]["t"] == pytest.approx(fires)
+    assert state["longest_quiet"] == pytest.approx(0.53)
+
+
+def test_a_report_through_the_control_socket(tmp_path, capsys) -> None:
+    emulator = Emulator(Settings.model_validate({"tactile": {"backend": "none"}}), tmp_path)
+    ready = threading.Event()
+    runner = threading.Thread(target=emulator.run, args=(ready.set,), daemon=True)
+    runner.start()
+    try:
+        assert ready.wait(200)
+        send = ["emulate", "--dir", str(tmp_path), "--send"]
+        assert main([*send, "undervoltage=2 report forget"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert [each["id"] for each in told["servos"]] == [1, 2]
+        assert told["servos"][0]["torque"] is False
+        assert told["monotonic"] > told["t"] > 0.0
+        assert main([*send, "report wrong"]) == 1
+        assert "'wrong'" in capsys.readouterr().err
+        assert main([*send, "forget"]) == 0
+        assert capsys.readouterr().out == ""
+    finally:
+        emulator.stop()
+        runner.join()
+        emulator.close()

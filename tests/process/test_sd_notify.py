@@ -1,0 +1,302 @@
+"""The daemon as a service: signs of life on a real socket, unit, rules, logs, closed streams."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import select
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from softfinger.daemon.loop.sd_notify import Service
+from softfinger.tools.processes.event_log import EventLog
+from tests.harness.daemon_process import SOFTFINGER, ask, softfinger
+from tests.harness.descendants import ending
+
+
+class Manager:
+    """The other end of NOTIFY_SOCKET."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "notify"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(self.path))
+        self._socket.settimeout(200.0)
+
+    def next(self) -> bytes:
+        return self._socket.recv(4096)
+
+    def quiet_for(self, seconds: float) -> bool:
+        return not select.select([self._socket], [], [], seconds)[0]
+
+    def drain(self) -> None:
+        while not self.quiet_for(0.0):
+            self.next()
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[Manager]:
+    manager = Manager(tmp_path)
+    yield manager
+    manager.close()
+
+
+# --- signs of life ----------------------------------------------------------------------------
+
+
+def test_ready_comes_first_and_signs_of_life_four_times_in_the_watchdogs_time(
+    manager: Manager,
+) -> None:
+    service = Service(str(manager.path), watchdog=2.0)
+    for tick in range(1000):  # 2 s
+        service.alive(tick * 0.002)
+    service.stopping()
+    told = [manager.next() for _ in range(5)]
+    assert told == [b"READY=1\nWATCHDOG=1", *[b"WATCHDOG=1"] * 3, b"STOPPING=1"]
+    assert manager.quiet_for(0.0)
+    service.close()
+
+
+def test_a_manager_that_is_gone_or_does_not_read_holds_nothing_up(manager: Manager) -> None:
+    service = Service(str(manager.path), watchdog=0.004)
+    for tick in range(5000):  # far more than the socket holds
+        service.alive(tick * 0.002)
+    manager.close()
+    service.alive(1e6)
+    service.close()
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({}, False),
+        ({"NOTIFY_SOCKET": ""}, False),
+        ({"NOTIFY_SOCKET": "relative"}, False),
+        ({"NOTIFY_SOCKET": "/run/x", "WATCHDOG_USEC": "junk"}, True),
+        ({"NOTIFY_SOCKET": "@abstract"}, True),
+    ],
+)
+def test_the_environment_says_whether_it_is_a_service(
+    environment: dict[str, str], expected: bool
+) -> None:
+    service = Service.of_environment(environment)
+    assert (service is not None) is expected
+    if service is not None:
+        service.alive(0.0)
+        service.close()
+
+
+def test_an_abstract_socket_and_anothers_watchdog(tmp_path: Path) -> None:
+    name = f"softfinger-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" + name)
+        service = Service.of_environment(
+            {"NOTIFY_SOCKET": f"@{name}", "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
+        )
+        assert service is not None
+        for t in range(10):
+            service.alive(float(t))
+        assert manager.recv(100) == b"READY=1\nWATCHDOG=1"
+        assert not select.select([manager], [], [], 0.0)[0], "another process is watched"
+        service.close()
+
+
+def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
+    manager: Manager, profile: Callable[..., Path], addresses: tuple[str, str], tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    process = subprocess.Popen(
+        [
+            *(*SOFTFINGER, "run", "--config", str(profile('task.name = "demo"\n')), "--no-task"),
+            *("--log", "json", "--log-file", str(log)),
+        ],
+        env=os.environ | {"NOTIFY_SOCKET": str(manager.path), "WATCHDOG_USEC": "400000"},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with ending(process):
+        assert manager.next() == b"READY=1\nWATCHDOG=1"
+        status = ask(addresses[1], "status")
+        assert (status["mode"], status["torque"]) == ("disarmed", False), "ready, and no task"
+        for _ in range(5):
+            assert manager.next() == b"WATCHDOG=1"
+        process.send_signal(signal.SIGSTOP)
+        manager.drain()
+        assert manager.quiet_for(0.5), "a loop that stands still feeds no watchdog"
+        process.send_signal(signal.SIGCONT)
+        assert manager.next() == b"WATCHDOG=1"
+        process.terminate()
+        told = b""
+        while told != b"STOPPING=1":
+            told = manager.next()
+        assert process.wait(timeout=60) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == "", "all of it went into the file"
+    records = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    assert all(set(record) == {"timestamp", "level", "kind", "text"} for record in records)
+    texts = [record["text"] for record in records]
+    assert "running, disarmed" in texts
+    assert "ended, torque off" in texts
+    times = [record["timestamp"] for record in records]
+    assert times == sorted(times)
+
+
+# --- the unit and the rules -------------------------------------------------------------------
+
+
+def unit_sections(text: str) -> dict[str, dict[str, list[str]]]:
+    """A unit file, strictly: sections, keys of letters, no continuation, nothing else."""
+    sections: dict[str, dict[str, list[str]]] = {}
+    for line in text.splitlines():
+        if not line or line.startswith("#"):
+            continue
+        head = re.fullmatch(r"\[(Unit|Service|Install)\]", line)
+        if head:
+            assert head[1] not in sections
+            current = sections[head[1]] = {}
+            continue
+        pair = re.fullmatch(r"([A-Z][A-Za-z]+)=(\S.*)", line)
+        assert pair, line
+        current.setdefault(pair[1], []).append(pair[2])
+    return sections
+
+
+def test_the_unit_says_what_a_control_daemon_needs(tmp_path: Path) -> None:
+    config = tmp_path / "my hand 100%.toml"
+    config.write_text("", encoding="utf-8")
+    done = softfinger("install-service", "--print", "--config", str(config), "--user", "root")
+    assert done.returncode == 0, done.stderr
+    sections = unit_sections(done.stdout)
+    service = sections["Service"]
+    assert service["Type"] == ["notify"]
+    assert service["User"] == ["root"]
+    assert int(service["LimitRTPRIO"][0]) >= 80
+    assert service["LimitMEMLOCK"] == ["infinity"]
+    assert int(service["WatchdogSec"][0]) > 0
+    assert service["Restart"] == ["on-failure"]
+    assert service["RestartPreventExitStatus"] == ["2"]
+    assert "/dev/cpu_dma_latency rw" in service["DeviceAllow"]
+    words = shlex.split(service["ExecStart"][0].replace("%%", "%"))
+    assert words[0] == sys.executable
+    assert words[-4:] == ["run", "--no-task", "--config", str(config)], "comes back disarmed"
+    # What it starts is there: the same words show the help.
+    shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=60, check=False)
+    assert shown.returncode == 0
+    analyze = shutil.which("systemd-analyze")
+    if analyze is not None:
+        unit = tmp_path / "softfinger.service"
+        unit.write_text(done.stdout, encoding="utf-8")
+        verified = subprocess.run(
+            [analyze, "verify", str(unit)], capture_output=True, text=True, timeout=60, check=False
+        )
+        assert (verified.returncode, verified.stderr) == (0, "")
+
+
+_MATCH = re.compile(
+    r'(ACTION|KERNEL|SUBSYSTEM|DRIVER|ATTRS?\{\w+\}|ENV\{\w+\})(==|!=)"[^"\n]+"'
+    r'|(GROUP|MODE|SYMLINK|TAG|ATTR\{\w+\}|ENV\{\w+\})(=|\+=|:=)"[^"\n]+"'
+)
+
+
+def test_the_rules_are_keys_operators_and_quoted_values() -> None:
+    done = softfinger("install-service", "--udev", "--name", "softfinger/left=A50285BI")
+    assert done.returncode == 0
+    rules = [line for line in done.stdout.splitlines() if line and not line.startswith("#")]
+    assert len(rules) == 4
+    for rule in rules:
+        assert all(_MATCH.fullmatch(part) for part in rule.split(", ")), rule
+    assert any('ATTR{latency_timer}="1"' in rule for rule in rules)
+    assert 'ATTRS{serial}=="A50285BI", SYMLINK+="softfinger/left"' in rules[-1]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--udev", "--name", 'x"=1'),
+        ("--udev", "--name", "../etc=1"),
+        ("--user", "nobody-of-that-name"),
+        ("--config", "/absent.toml"),
+        ("--to", "/absent"),
+    ],
+)
+def test_what_can_not_be_installed_is_told(words: tuple[str, ...]) -> None:
+    done = softfinger("install-service", *words)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith("install-service: ")
+    assert "Traceback" not in done.stderr
+
+
+def test_it_writes_where_it_is_asked_to_and_over_nothing(tmp_path: Path) -> None:
+    done = softfinger("install-service", "--to", str(tmp_path))
+    path = tmp_path / "softfinger.service"
+    assert done.stdout.strip() == str(path)
+    path.write_text("mine", encoding="utf-8")
+    again = softfinger("install-service", "--to", str(tmp_path))
+    assert again.returncode == 1
+    assert "is there already; --force" in again.stderr
+    assert path.read_text(encoding="utf-8") == "mine"
+    assert softfinger("install-service", "--to", str(tmp_path), "--force").returncode == 0
+    assert "[Service]" in path.read_text(encoding="utf-8")
+
+
+# --- logs -------------------------------------------------------------------------------------
+
+
+def test_plain_lines_and_json_lines_say_the_same(tmp_path: Path) -> None:
+    import logging
+
+    for form in ("plain", "json"):
+        log = EventLog(form, tmp_path / form)
+        log.take_over_logging()
+        handler = logging.getLogger().handlers[-1]
+        log.line("warning", "servos.temperature", 'left "servo"\nat 61 °C')
+        log.plain("softfinger: ended", "error")
+        logging.getLogger("softfinger.daemon.servos.dynamixel").error("port %s is gone", "x")
+        log.close()
+        logging.getLogger().removeHandler(handler)
+    plain = (tmp_path / "plain").read_text(encoding="utf-8").splitlines()
+    assert plain[0] == 'warning servos.temperature left "servo"'
+    assert plain[2:] == ["softfinger: ended", "error   dynamixel port x is gone"]
+    lines = (tmp_path / "json").read_text(encoding="utf-8").splitlines()
+    told = [json.loads(line) for line in lines]
+    assert [(each["level"], each["kind"], each["text"]) for each in told] == [
+        ("warning", "servos.temperature", 'left "servo"\nat 61 °C'),
+        ("error", "", "softfinger: ended"),
+        ("error", "dynamixel", "port x is gone"),
+    ]
+
+
+def test_a_log_file_that_can_not_be_opened_is_told(profile: Callable[..., Path]) -> None:
+    done = softfinger("run", "--config", str(profile()), "--log-file", "/absent/log")
+    assert done.returncode == 2
+    assert "--log-file /absent/log: No such file or directory" in done.stderr
+
+
+def test_the_daemon_runs_with_every_standard_stream_closed(profile: Callable[..., Path]) -> None:
+    command = shlex.join(
+        [*SOFTFINGER, "run", "--monitor", "--duration", "0.5", "--config", str(profile())]
+    )
+    done = subprocess.run(
+        ["sh", "-c", f"exec {command} >&-"],
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    silent = subprocess.run(["sh", "-c", f"exec {command} <&- >&- 2>&-"], timeout=200, check=False)
+    assert silent.returncode == 0

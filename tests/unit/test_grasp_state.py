@@ -1,0 +1,185 @@
+"""How a held object answers the joints, against the quasi-static path of `hand.grasp`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from softfinger import ContactTable, Fingertip, Material
+from softfinger.kinematics.contact.table import lookup
+from softfinger.kinematics.hand.geometry import HandGeometry
+from softfinger.kinematics.hand.grasp import Grasp, GraspState
+from softfinger.kinematics.hand.grasp_state import (
+    held_motion,
+    holding_levers,
+    sheared_gradient,
+    total_tilt,
+)
+from tests.harness.called import called
+
+# Inner kernels, made callable.
+holding_levers = called(holding_levers)
+sheared_gradient = called(sheared_gradient)
+held_motion = called(held_motion)
+
+HAND = HandGeometry(finger_offset=0.003)
+LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)
+WIDTH = 0.040
+
+
+@pytest.fixture(scope="module", params=["constant", "table_i"])
+def grasp(request: pytest.FixtureRequest) -> Grasp:
+    material = Material.constant(0.304e6) if request.param == "constant" else Material.table_i()
+    return Grasp(HAND, ContactTable.build(Fingertip(0.020), material), WIDTH)
+
+
+def motion_of(state: GraspState) -> tuple[float, ...]:
+    c = HAND.contacts(state.q, state.pose, WIDTH)
+    return held_motion(*state.q, *c.d, state.pose[2], 0.0, *LENGTHS)
+
+
+@pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
+def test_levers_are_the_torques_that_balance_the_grasp(grasp: Grasp, delta: float) -> None:
+    state = grasp.symmetric(0.0035)
+    if delta:
+        state = grasp.steer(state, delta)
+    c = HAND.contacts(state.q, state.pose, WIDTH)
+    data = grasp.table.data
+    lever1, lever2, *rest = holding_levers(data, data, *c.d, *c.theta, 0.0, motion_of(state))
+    forces = grasp.forces(state)
+    assert [lever1, lever2] == pytest.approx(forces.torque / forces.force.mean(), rel=5e-4)
+    shear = forces.tangential.mean()
+    assert rest == pytest.approx([shear, *forces.normal], rel=2e-3, abs=1e-8)
+
+
+@pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
+def test_object_turns_as_predicted(grasp: Grasp, delta: float) -> None:
+    state = grasp.symmetric(0.0035)
+    if delta:
+        state = grasp.steer(state, delta)
+    _, _, turn1, turn2, _, width, _ = motion_of(state)
+    small = 1e-4
+    turned = grasp.steer(state, small, steps=2).pose[2] - state.pose[2]
+    assert turned / small == pytest.approx(turn1 + turn2, rel=0.02)
+    assert width == pytest.approx(WIDTH, rel=1e-12)
+
+
+def test_arms_and_slide_are_the_derivatives_of_what_the_tips_share() -> None:
+    def both(q1: float, q2: float, angle: float) -> float:
+        tips = HAND.tips([q1, q2])
+        return -float((tips[1] - tips[0]) @ [math.cos(angle), math.sin(angle)])
+
+    at = (0.12, 0.21, -0.1)
+    arm1, arm2, _, _, slide, _, _ = held_motion(at[0], at[1], 3e-3, 4e-3, at[2], 0.0, *LENGTHS)
+    step = 1e-6
+    slopes = []
+    for j in range(3):
+        ahead, behind = list(at), list(at)
+        ahead[j] += step
+        behind[j] -= step
+        slopes.append((both(*ahead) - both(*behind)) / (2.0 * step))
+    assert [arm1, arm2, slide] == pytest.approx(slopes, rel=1e-8)
+
+
+def test_levers_without_contacts_are_zero(grasp: Grasp) -> None:
+    motion = held_motion(0.1, 0.1, 0.0, 1e-3, 0.0, 0.0, *LENGTHS)
+    data = grasp.table.data
+    assert holding_levers(data, data, 0.0, 1e-3, 0.1, -0.1, 0.0, motion) == (0.0,) * 5
+
+
+def faces(q, d, angle: float, taper: float):
+    """Both faces' n and t, the tips' centres and velocities, and what rolls: a − d − v·t."""
+    n, t = [], []
+    for side in (-0.5, 0.5):
+        at = angle + side * taper
+        n.append(np.array([math.cos(at), math.sin(at)]))
+        t.append(np.array([-math.sin(at), math.cos(at)]))
+    tips, v = HAND.tips(q), HAND.tip_jacobian(q)
+    rolls = [HAND.tip_radius - d[i] - v[i] @ t[i] for i in range(2)]
+    return n, t, tips, v, rolls
+
+
+@pytest.mark.parametrize("taper", [-0.4, 0.0, 0.2])
+def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper: float) -> None:
+    q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
+    n, t, tips, v, rolls = faces(q, d, angle, taper)
+    a = HAND.tip_radius
+    middle = tips.mean(axis=0)  # whatever point of the object
+    w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
+    s = [(tips[i] - middle) @ t[i] for i in range(2)]
+    arm1, arm2, turn1, turn2, slide, width, across = held_motion(*q, *d, angle, taper, *LENGTHS)
+    for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
+        # For (Gx, Gy, φ): d_t of both tips stays, and both d change alike.
+        left = np.array(
+            [
+                [*t[0], -w[0]],
+                [*t[1], w[1]],
+                [*(-n[0] - n[1]), s[0] + s[1]],
+            ]
+        )
+        deeper = [n[0] @ v[0] * dq[0], -n[1] @ v[1] * dq[1]]
+        right = [-rolls[0] * dq[0], -rolls[1] * dq[1], deeper[1] - deeper[0]]
+        gx, gy, turned = np.linalg.solve(left, right)
+        both = sum(deeper) + (n[1] - n[0]) @ [gx, gy] + (s[0] - s[1]) * turned
+        assert turned == pytest.approx(turn1 * dq[0] - turn2 * dq[1], rel=1e-12)
+        found = arm1 * dq[0] + arm2 * dq[1] + slide * turned
+        assert found == pytest.approx(both, rel=1e-12, abs=1e-15)
+    touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
+    along = np.array([math.cos(angle), math.sin(angle)])
+    assert width == pytest.approx((touched[1] - touched[0]) @ along, rel=1e-12)
+    assert across == pytest.approx(width / math.cos(0.5 * taper), rel=1e-12)
+
+
+@pytest.mark.parametrize("taper", [-0.4, 0.2])
+def test_what_holds_a_tapering_object_balances_it(grasp: Grasp, taper: float) -> None:
+    q, d, angle = (0.2, 0.16), (3.1e-3, 3e-3), 0.05
+    n, t, tips, v, rolls = faces(q, d, angle, taper)
+    a, data = HAND.tip_radius, grasp.table.data
+    theta = (angle - 0.5 * taper + q[0], angle + 0.5 * taper - q[1])
+    motion = held_motion(*q, *d, angle, taper, *LENGTHS)
+    lever1, lever2, mean, normal1, normal2 = holding_levers(data, data, *d, *theta, taper, motion)
+    lean = math.tan(0.5 * taper)
+    normal = 0.5 * (normal1 + normal2)
+    shear = (mean - lean * normal, mean + lean * normal)
+    pressed = (normal + lean * mean, normal - lean * mean)
+    looked_up = [lookup(data, d[i], theta[i]) for i in range(2)]
+    felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
+    for i, each in enumerate((normal1, normal2)):
+        assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
+    # The forces on the object, at the contacts, and the tips' turning moments.
+    forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
+    assert sum(forces) == pytest.approx([0.0, 0.0], abs=1e-12)
+    touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
+    moments = [p[0] * f[1] - p[1] * f[0] for p, f in zip(touched, forces, strict=True)]
+    turning = felt[0][1] + felt[1][1]
+    assert sum(moments) == pytest.approx(turning, abs=5e-4 * normal * a)
+    # The joints' torques by virtual work on each face.
+    force = 0.5 * (looked_up[0][0] + looked_up[1][0])
+    torque1 = pressed[0] * n[0] @ v[0] + shear[0] * rolls[0] + felt[0][1]
+    torque2 = -pressed[1] * n[1] @ v[1] - shear[1] * rolls[1] - felt[1][1]
+    assert [lever1, lever2] == pytest.approx([torque1 / force, torque2 / force], rel=1e-4)
+
+
+def test_each_tip_has_its_own_table(grasp: Grasp) -> None:
+    soft = grasp.table.data
+    stiff = ContactTable.build(Fingertip(0.020), Material.constant(0.6e6)).data
+    q1, q2, d1, d2, angle = 0.14, 0.22, 4.0e-3, 2.6e-3, 0.03
+
+    def levers(left, right, q1, q2, d1, d2, angle):
+        motion = held_motion(q1, q2, d1, d2, angle, 0.2, *LENGTHS)
+        theta1, theta2 = angle - 0.1 + q1, angle + 0.1 - q2
+        return holding_levers(left, right, d1, d2, theta1, theta2, 0.2, motion)
+
+    here = levers(soft, stiff, q1, q2, d1, d2, angle)
+    mirrored = levers(stiff, soft, q2, q1, d2, d1, -angle)
+    turned = [mirrored[1], mirrored[0], -mirrored[2], mirrored[4], mirrored[3]]
+    assert here == pytest.approx(turned, rel=1e-12)
+    assert here[:2] != pytest.approx(levers(soft, soft, q1, q2, d1, d2, angle)[:2], rel=1e-3)
+
+
+def test_total_tilt_is_the_angle_of_the_normal_with_the_axis() -> None:
+    assert total_tilt(0.3, 0.0) == pytest.approx(0.3)
+    x, y = math.sin(0.2), math.sin(-0.1)
+    assert math.cos(total_tilt(0.2, -0.1)) == pytest.approx(math.sqrt(1.0 - x * x - y * y))

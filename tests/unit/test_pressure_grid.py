@@ -1,0 +1,214 @@
+"""The forward model: cell averages against plain integration, sums against the closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+A = 0.020
+E = 0.304e6
+TIP = Fingertip(A)
+LINEAR = Material.constant(E)
+MEASURED = Material.table_i()
+PITCH = 0.058 / 44
+
+
+def tilts(theta, azimuth):
+    return (
+        math.asin(math.sin(theta) * math.cos(azimuth)),
+        math.asin(math.sin(theta) * math.sin(azimuth)),
+    )
+
+
+def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
+    """Plain twin: mean σ(ε) over a cell, midpoint rule in y, Gauss in the angle x = R sin t."""
+    n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
+    n_z = math.sqrt(1.0 - n_x**2 - n_y**2)
+    _, x_first, y_first, pitch_x, pitch_y = grid.geometry(TIP)
+    x0 = x_first + col * pitch_x
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    y = (y_first + (row + (np.arange(lines) + 0.5) / lines) * pitch_y)[:, None]
+    radius2 = A**2 - y**2
+    q = (A - d) - y * n_y
+    # (h − x n_x − y n_y)² = n_z² (R² − x²) bounds the footprint on each line.
+    a2 = n_x**2 + n_z**2
+    root = (q * n_x) ** 2 - a2 * (q**2 - n_z**2 * radius2)
+    inside = (root > 0.0) & (radius2 > 0.0)
+    half = np.sqrt(np.where(inside, root, 0.0))
+    left = np.maximum((q * n_x - half) / a2, x0)
+    right = np.minimum((q * n_x + half) / a2, x0 + pitch_x)
+    inside &= right > left
+    radius = np.sqrt(np.where(inside, radius2, 1.0))
+    start = np.arcsin(np.clip(np.where(inside, left / radius, 0.0), -1.0, 1.0))
+    stop = np.arcsin(np.clip(np.where(inside, right / radius, 0.0), -1.0, 1.0))
+    t = start + (stop - start) * 0.5 * (nodes + 1.0)
+    x, z = radius * np.sin(t), radius * np.cos(t)
+    strain = np.clip(1.0 - (q - x * n_x) / (n_z * z), 0.0, 1.0)
+    line = (material.stress(strain) * z * weights).sum(axis=1) * 0.5 * (stop - start)[:, 0]
+    return line.sum() / lines / pitch_x
+
+
+@pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
+@pytest.mark.parametrize(
+    ("d", "degrees", "azimuth"),
+    [
+        (1e-5, 0.0, 0.0),  # a footprint smaller than a cell
+        (2e-4, 5.0, 1.0),
+        (1e-3, 10.0, 0.3),
+        (4e-3, 30.0, 0.7),
+        (8e-3, 30.0, 2.2),
+        (8e-3, 36.0, 0.4),  # nearly at the rim
+    ],
+)
+def test_every_kind_of_cell_is_averaged_to_a_millionth_of_the_modulus(
+    material, d, degrees, azimuth
+):
+    grid = SensorGrid(44, 44, PITCH, centre=(0.3e-3, -0.2e-3))
+    tilt_x, tilt_y = tilts(math.radians(degrees), azimuth)
+    p = grid.pressure(TIP, material, d, tilt_x, tilt_y)
+    touched = np.argwhere(p > 0.0)
+    order = np.argsort(p[p > 0.0])
+    # The weakest cells are those that the outline cuts; and some of all the others.
+    chosen = np.unique(np.concatenate([order[:25], order[:: max(1, len(order) // 15)]]))
+    for row, col in touched[chosen]:
+        expected = cell_mean(grid, material, d, tilt_x, tilt_y, row, col)
+        assert abs(p[row, col] - expected) <= 1e-6 * material.reference_modulus
+
+
+def test_cells_off_the_footprint_read_exactly_zero():
+    grid = SensorGrid(44, 44, PITCH)
+    p = grid.pressure(TIP, LINEAR, 0.002, 0.2, -0.1)
+    n_x, n_y = math.sin(0.2), math.sin(-0.1)
+    centres = (np.arange(44) - 21.5) * PITCH
+    far = np.hypot(centres[None, :] - 0.018 * n_x, centres[:, None] - 0.018 * n_y)
+    rho = math.sqrt(2 * A * 0.002 - 0.002**2)
+    assert np.all(p[far > rho + PITCH] == 0.0)
+    assert np.all(p[far < 0.9 * rho - PITCH] > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("d", "degrees", "force"),
+    [(2, 0, 3.8201766667652), (4, 15, 15.819751632242), (8, 30, 70.578560861082)],
+)
+def test_the_cells_sum_to_the_closed_force(d, degrees, force):
+    grid = SensorGrid(44, 44, PITCH)
+    p = grid.pressure(TIP, LINEAR, d * 1e-3, math.radians(degrees))
+    assert p.sum() * PITCH**2 == pytest.approx(force, rel=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("d", "degrees", "force"),
+    [(8, 45, 81.266754123), (10, 35, 114.126873792), (12, 30, 153.849535079)],
+)
+@pytest.mark.parametrize("azimuth", [0.0, 0.5, math.pi / 2])
+def test_beyond_the_limit_the_strain_ends_at_the_rim(d, degrees, force, azimuth):
+    grid = SensorGrid(44, 44, PITCH, centre=(1e-4, 3e-4))
+    p = grid.pressure(TIP, LINEAR, d * 1e-3, *tilts(math.radians(degrees), azimuth))
+    assert p.sum() * PITCH**2 == pytest.approx(force, rel=2e-5)
+    assert p.max() <= E * (1 + 1e-12)
+
+
+def test_moments_of_the_map_are_the_closed_ones():
+    grid = SensorGrid(44, 44, PITCH)
+    p = grid.pressure(TIP, LINEAR, 0.004, math.radians(15.0))
+    x = (np.arange(44) - 21.5) * PITCH
+    total = p.sum()
+    centroid = (p.sum(axis=0) * x).sum() / total
+    var_x = (p.sum(axis=0) * x**2).sum() / total - centroid**2 - PITCH**2 / 12
+    var_y = (p.sum(axis=1) * x**2).sum() / total - PITCH**2 / 12
+    # Moments of cell averages keep a discretisation error of a few 1e-5.
+    assert centroid == pytest.approx(4.8312888419137e-3, rel=1e-4)
+    assert var_x == pytest.approx(23.6958660463e-6, rel=3e-4)
+    assert var_y == pytest.approx(25.3333333333e-6, rel=3e-4)
+
+
+@settings(max_examples=40)
+@given(
+    d=st.floats(1e-4, 8e-3),
+    theta=st.floats(0.0, 0.55),
+    azimuth=st.floats(-math.pi, math.pi),
+    x=st.floats(-5e-4, 5e-4),
+    y=st.floats(-5e-4, 5e-4),
+)
+def test_halving_the_pitch_averages_four_cells_to_one(d, theta, azimuth, x, y):
+    coarse = SensorGrid(20, 24, (0.002, 0.0022), centre=(x, y))
+    fine = SensorGrid(40, 48, (0.001, 0.0011), centre=(x, y))
+    at = tilts(theta, azimuth)
+    p = coarse.pressure(TIP, MEASURED, d, *at)
+    q = fine.pressure(TIP, MEASURED, d, *at)
+    mean = q.reshape(20, 2, 24, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(p, mean, atol=1e-6 * MEASURED.reference_modulus)
+
+
+def test_rows_run_along_y_and_columns_along_x():
+    grid = SensorGrid(44, 44, PITCH)
+    along_x = grid.pressure(TIP, LINEAR, 0.003, 0.3, 0.0)
+    along_y = grid.pressure(TIP, LINEAR, 0.003, 0.0, 0.3)
+    np.testing.assert_allclose(along_x, along_y.T, atol=1e-7 * E)
+    assert along_x.sum(axis=0)[30] > 10 * along_x.sum(axis=0)[13]
+    back = grid.pressure(TIP, LINEAR, 0.003, -0.3, 0.0)
+    np.testing.assert_allclose(along_x, back[:, ::-1], atol=1e-7 * E)
+
+
+def test_a_turned_sensor_sees_the_tilt_turned_back():
+    plain = SensorGrid(44, 44, PITCH)
+    turned = SensorGrid(44, 44, PITCH, rotation=math.pi / 2)
+    # The sensor's x axis lies along the finger's y axis.
+    np.testing.assert_allclose(
+        turned.pressure(TIP, LINEAR, 0.003, 0.0, 0.25),
+        plain.pressure(TIP, LINEAR, 0.003, 0.25, 0.0),
+        atol=1e-9 * E,
+    )
+
+
+def test_the_tip_centre_shifts_the_map_and_gain_scales_it():
+    plain = SensorGrid(44, 44, PITCH).pressure(TIP, LINEAR, 0.003, 0.1)
+    shifted = SensorGrid(44, 44, PITCH, centre=(3 * PITCH, -2 * PITCH))
+    np.testing.assert_allclose(
+        shifted.pressure(TIP, LINEAR, 0.003, 0.1)[:-2, 3:], plain[2:, :-3], atol=1e-7 * E
+    )
+    doubled = SensorGrid(44, 44, PITCH).pressure(TIP, LINEAR, 0.003, 0.1, gain=2.0)
+    np.testing.assert_allclose(doubled, 2.0 * plain, rtol=1e-14)
+
+
+def test_a_footprint_off_the_sensor_is_cut_not_wrapped():
+    grid = SensorGrid(44, 44, PITCH, centre=(0.029, 0.0))
+    p = grid.pressure(TIP, LINEAR, 0.004)
+    whole = SensorGrid(88, 88, PITCH).pressure(TIP, LINEAR, 0.004)
+    assert p.sum() == pytest.approx(whole.sum() / 2, rel=1e-3)
+    assert np.all(p[:, :20] == 0.0)
+
+
+def test_no_contact_is_all_zero_and_out_is_reused():
+    grid = SensorGrid(8, 9, PITCH)
+    out = np.ones((8, 9))
+    assert grid.pressure(TIP, LINEAR, 0.0, out=out) is out
+    assert np.all(out == 0.0)
+    assert np.all(grid.pressure(TIP, LINEAR, -0.001) == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: SensorGrid(0, 4, PITCH), "rows and columns"),
+        (lambda: SensorGrid(4, 4, 0.0), "pitch"),
+        (lambda: SensorGrid(4, 4, (PITCH, math.nan)), "pitch"),
+        (lambda: SensorGrid(4, 4, PITCH, centre=(math.inf, 0.0)), "centre"),
+        (lambda: SensorGrid(4, 4, PITCH).pressure(TIP, LINEAR, math.nan), "finite"),
+        (lambda: SensorGrid(4, 4, PITCH).pressure(TIP, LINEAR, 0.021), "radius"),
+        (lambda: SensorGrid(4, 4, PITCH).pressure(TIP, LINEAR, 0.001, 2.0), "normal"),
+        (lambda: SensorGrid(4, 4, PITCH).pressure(TIP, LINEAR, 0.001, 1.2, 1.2), "normal"),
+        (lambda: SensorGrid(4, 4, PITCH).pressure(TIP, LINEAR, 0.001, out=np.ones(4)), "shape"),
+    ],
+)
+def test_nonsense_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

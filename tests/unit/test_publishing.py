@@ -1,0 +1,157 @@
+"""What goes out when: exact decimation, rates as they really were, and the statistics' message."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.publishing import Broadcast
+from softfinger.daemon.loop.rates import Schedule
+from softfinger.daemon.loop.timing import Statistics, record
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import State
+from softfinger.daemon.wire.messages import SCHEMA, STATE, STATS, TACTILE, Rates, stats_message
+from softfinger.daemon.wire.publisher import bit
+from tests.conftest import until
+from tests.harness.gateway import Served
+
+
+class Listener:
+    """Wants everything and keeps the tick numbers of what it got."""
+
+    wanted = bit(STATE) | bit(TACTILE) | bit(STATS)
+
+    def __init__(self) -> None:
+        self.ticks: dict[str, list[int]] = {"state": [], "stats": []}
+        self.frames: tuple[list[int], list[int]] = ([], [])  # of each finger, by number
+        self.rates: list[Rates] = []
+        self.seq = 0
+
+    def state(self, state: State, *_: Any) -> None:
+        self.ticks["state"].append(state.seq)
+
+    def tactile(self, frame: Any, _data: Any, finger: int, *_: Any) -> None:
+        self.frames[finger].append(frame.seq)
+
+    def stats(self, state: State, _period: float, rates: Rates, *_: Any) -> None:
+        self.ticks["stats"].append(state.seq)
+        self.rates.append(rates)
+
+    def event(self, *_: Any) -> None: ...
+
+
+def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}, **sections})
+    listener = Listener()
+    with Daemon(settings, wire=False) as daemon:
+        loop = daemon.loop
+        sending = Broadcast(settings, listener, loop.perceptions, loop.statistics)  # type: ignore[arg-type]
+
+        def broadcast(state: State) -> None:
+            listener.seq = state.seq
+            sending(state)
+
+        loop._broadcast = broadcast  # type: ignore[assignment]
+        loop.advance(seconds)
+    return listener, daemon
+
+
+def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame() -> None:
+    listener, _ = listened(4.0, stream={"tactile_rate": 25.0})
+    ticks = listener.ticks
+    assert ticks["state"] == list(range(5, 2001, 5))
+    assert ticks["stats"] == [3, 503, 1003, 1503]
+    assert not set(ticks["state"]) & set(ticks["stats"])
+    for frames in listener.frames:  # 100 Hz, of which 25 are published: one of each four
+        assert [seq // 4 for seq in frames] == list(range(len(frames)))
+        assert len(frames) == pytest.approx(100, abs=1)
+
+
+def test_rates_are_what_really_happened_in_the_last_second() -> None:
+    stream = {"state_rate": 50.0, "tactile_rate": 20.0}
+    listener, _ = listened(4.0, tactile={"rate": 80.0}, stream=stream)
+    rates = listener.rates[-1]
+    assert rates.tick == pytest.approx(500.0, abs=0.5)
+    assert rates.left == pytest.approx(80.0, abs=1.01)
+    assert rates.right == pytest.approx(80.0, abs=1.01)
+    assert rates.state == pytest.approx(50.0, abs=0.1)
+    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # 20 of each finger
+
+
+@pytest.mark.parametrize(
+    ("rate", "wanted", "every"), [(500.0, 100.0, 5), (1000.0, 100.0, 10), (500.0, 300.0, 2),
+                                  (100.0, 400.0, 1), (10.0, 0.1, 100)]
+)  # fmt: skip
+def test_the_schedule_takes_the_nearest_whole_number_of_ticks(
+    rate: float, wanted: float, every: int
+) -> None:
+    settings = Settings.model_validate({"loop": {"rate": rate}, "stream": {"state_rate": wanted}})
+    schedule = Schedule(settings)
+    assert schedule.state.every == every
+    due = [seq for seq in range(1, 10 * every + 1) if schedule.state.due(seq)]
+    assert due == list(range(every, 10 * every + 1, every))
+    assert f"hand/state ({rate / every:.4g} Hz)" in str(schedule)
+
+
+def test_the_schedule_tells_every_rate() -> None:
+    told = str(Schedule(Settings.model_validate({"stream": {"tactile_rate": 25.0}})))
+    for words in (
+        "every tick (500 Hz)",
+        "frames as they come (100 Hz)",
+        "every 5 ticks hand/state (100 Hz)",
+        "every 4 frames hand/tactile (25 Hz)",
+        "every 500 ticks hand/stats (1 Hz)",
+    ):
+        assert words in told
+    blind = str(Schedule(Settings.model_validate({"tactile": {"backend": "none"}})))
+    assert "frames" not in blind
+
+
+def test_the_statistics_message_has_every_field_as_documented(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    served = Served(addresses[0], queue=10)
+    publisher = served.publisher
+    socket = context.socket(zmq.SUB)
+    socket.subscribe("hand/stats")
+    socket.connect(addresses[0])
+    until(lambda: [served.settle(), publisher.wanted & bit(STATS)][1])
+    assert not publisher.wanted & bit(STATE)
+    statistics = Statistics()
+    record(statistics.counts, statistics.largest, 1e-6, 2e-5, 1e-5, 2e-6)
+    rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
+    publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
+    until(lambda: [served.settle(), socket.poll(0)][1])
+    topic, payload = socket.recv_multipart()
+    assert topic == b"hand/stats"
+    message = msgpack.unpackb(payload)
+    assert message == {
+        "schema": SCHEMA,
+        "seq": 503,
+        "timestamp": 9.0,
+        "mono_ns": 1_500_000_000,
+        "seq_step": 500,
+        "ticks": 1,
+        "overruns": 0,
+        "period_s": 0.002,
+        **{name: spread._asdict() for name, spread in statistics.spreads().items()},
+        "rates": {"tick": 500.0, "left": 100.0, "right": 99.0, "state": 100.0, "tactile": 50.0},
+    }
+    socket.close()
+    served.close()
+
+
+def test_statistics_that_are_zero_are_still_floats() -> None:
+    message = stats_message(State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), Statistics(), 1)
+    for name in ("wake", "compute", "bus", "publish"):
+        assert [type(message[name][key]) for key in ("p50", "p99", "p999", "max")] == [float] * 4
+    assert all(isinstance(rate, float) for rate in message["rates"].values())
+
+
+def test_the_loop_counts_the_times_of_each_tick() -> None:
+    _, daemon = listened(0.5)
+    assert daemon.loop.statistics.ticks == daemon.loop.state.seq == 250

@@ -1,0 +1,221 @@
+"""Torque on and off, whatever the servos answer, and who may ask for it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.types import Reading
+from softfinger.daemon.wire.command_server import Refused
+from tests.conftest import until
+from tests.harness.gateway import Served
+from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
+
+
+def test_a_goal_that_is_no_number_is_a_fault_though_a_command_was_refused_for_it(
+    make: Make,
+) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    daemon.loop.state.goal.q[0] = math.nan
+    daemon.loop._safety.bound(daemon.loop.state)
+    assert "a goal was no number" in refusal(daemon, "grasp")
+    daemon.loop.advance(daemon.loop.period)
+    assert daemon.loop.state.fault_name == "goal.number"
+    command(daemon, "clear")
+
+
+def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert daemon.loop.servos is not None
+
+    def failing(reading: Any) -> None:
+        reading.valid = False
+
+    daemon.loop.servos.read = failing  # type: ignore[method-assign]
+    advance_to(daemon, "fault", 0.2)
+    assert "no good reading" in daemon.loop.state.fault
+    with pytest.raises(Refused, match="clear: servos: no good reading"):
+        command(daemon, "clear")
+
+
+def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(
+    make: Make,
+) -> None:
+    """Writes get lost and readings come, which keep the servos' watchdogs from acting."""
+    daemon = make()
+    events: list[tuple[str, str, str]] = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    lost = Deaf(daemon)
+    assert command(daemon, "stop")["torque_off"] == "unconfirmed"
+    assert daemon.loop.state.torque
+    daemon.loop.advance(0.17)
+    assert not torque_of(daemon).any(), "1.5 times the watchdog's time, and 20 ms of its own"
+    assert daemon.loop.state.fault_name == "torque.off"
+    assert daemon.loop.state.torque, "it is not confirmed yet"
+    assert "clear: the servos have not confirmed torque off yet" in refusal(daemon, "clear")
+    daemon.loop.advance(1.0)
+    lost.mend()
+    daemon.loop.advance(0.2)
+    assert not daemon.loop.state.torque
+    told = [text for _, kind, text in events if kind == "torque.off"]
+    assert len(told) == 2, "once when it goes wrong and once when it is well, however long it lasts"
+    assert "the bus is kept silent" in told[0]
+    assert "torque off confirmed" in told[1]
+    command(daemon, "clear")
+    assert command(daemon, "stop")["torque_off"] == "confirmed"
+
+
+def test_without_a_watchdog_nothing_is_gained_by_silence(make: Make) -> None:
+    daemon = make(servos={"watchdog": 0.0})
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    lost = Deaf(daemon)
+    command(daemon, "stop")
+    daemon.loop.advance(0.3)
+    assert "cut their power" in daemon.loop.state.fault
+    assert lost.tries > 140, "at every tick"
+    lost.mend()
+    daemon.loop.advance(2 * daemon.loop.period)
+    assert not torque_of(daemon).any()
+
+
+def test_the_end_tries_to_turn_torque_off_more_than_once(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    lost = Deaf(daemon, tries=5)
+    daemon.loop.run(0.0)
+    assert lost.tries == 6
+    assert not torque_of(daemon).any()
+    assert not daemon.loop.state.torque
+
+
+class Deaf:
+    """Servos that answer, and hear nothing of what is written: so many tries, or until mended."""
+
+    def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
+        assert daemon.loop.servos is not None
+        self._servos = daemon.loop.servos
+        self._really = self._servos.torque_off
+        self._most = tries
+        self.tries = 0
+        self._servos.torque_off = self._try  # type: ignore[method-assign]
+        self._servos.write = lambda goal: None  # type: ignore[method-assign]
+
+    def _try(self, reading: Reading) -> bool:
+        self.tries += 1
+        if self.tries > self._most:
+            return self._really(reading)
+        self._servos.read(reading)
+        return False
+
+    def mend(self) -> None:
+        self._most = 0
+
+
+def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
+    daemon = make()
+    servos = daemon.loop.servos
+    assert servos is not None
+    really = servos.torque_on
+
+    def failing() -> None:
+        really()
+        raise ServoError("overload")
+
+    servos.torque_on = failing  # type: ignore[method-assign]
+    command(daemon, "arm")
+    daemon.loop.advance(daemon.loop.period)
+    assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("fault", "overload")
+    assert not daemon.loop.state.torque
+    assert not torque_of(daemon).any()
+
+
+def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make: Make) -> None:
+    daemon = grasped(make(), 6.0)
+    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process stood still
+    advance_to(daemon, "fault", 0.1)
+    assert "watchdog" in daemon.loop.state.fault
+    daemon.loop.advance(0.2)
+    command(daemon, "clear")
+    command(daemon, "arm")
+    command(daemon, "move", left=-0.1, right=-0.1)
+    advance_to(daemon, "armed", 3.0)
+    assert daemon.hand is not None
+    assert daemon.hand.q.tolist() == pytest.approx([-0.1, -0.1], abs=0.04)
+
+
+def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> None:
+    daemon = make()
+    assert daemon.loop.servos is not None
+    for name in ("stop", "disarm"):
+        daemon.loop.servos.torque_on()  # as another program may have done
+        assert command(daemon, name)["torque_off"] == "confirmed"
+        daemon.loop.advance(daemon.loop.period)
+        assert daemon.hand is not None
+        assert not torque_of(daemon).any()
+        assert not daemon.loop.state.torque
+
+
+def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
+    make: Make, context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    daemon = make()
+    with Served(commands=addresses[1]) as served:
+        daemon.loop._server = served.server
+        client = context.socket(zmq.DEALER)
+        client.connect(addresses[1])
+        for _ in range(20):
+            client.send(msgpack.packb({"command": "arm"}))
+        until(lambda: [served.settle(1), served.link.asked][1])
+        daemon.loop.stop()
+        told = []
+
+        def tick() -> int:
+            daemon.loop.advance(daemon.loop.period)
+            assert daemon.loop.state.mode == "disarmed"
+            served.settle()
+            while client.poll(0):
+                told.append(msgpack.unpackb(client.recv()))
+            return len(told)
+
+        until(lambda: tick() == 20)
+        assert all("before a stop" in reply["error"] for reply in told)
+        client.send(msgpack.packb({"command": "arm"}))
+        until(lambda: [served.settle(1), served.link.asked][1])
+        daemon.loop.advance(daemon.loop.period)
+        assert daemon.loop.state.mode == "armed"
+
+
+def test_arm_waits_until_torque_off_is_confirmed(make: Make) -> None:
+    daemon = make()
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    Deaf(daemon, tries=3)
+    command(daemon, "stop")
+    assert "arm: the servos have not confirmed torque off yet" in refusal(daemon, "arm")
+    daemon.loop.advance(3 * daemon.loop.period)
+    command(daemon, "arm")
+
+
+def test_arm_is_refused_before_the_servos_were_read() -> None:
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
+    with Daemon(settings, wire=False) as daemon:
+        assert daemon.loop.servos is not None
+        daemon.loop.servos.read = lambda reading: None  # type: ignore[method-assign]
+        daemon.loop.advance(0.01)
+        with pytest.raises(Refused, match="arm: servos: no good reading yet"):
+            command(daemon, "arm")

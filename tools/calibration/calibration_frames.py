@@ -1,0 +1,193 @@
+"""Frames for a calibration step: load by load or in one run from the live sensor, or recorded."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.perception.calibration_file import Calibration, Converter
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.tactile.base import TactileError, TactileSensor
+from softfinger.daemon.tactile.recording import TRUTHS, RecordingError, load_recording
+from softfinger.daemon.types import FINGERS, Frame
+from softfinger.kinematics.sensing.calibration import CalibrationError
+
+_UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
+_PATIENCE = 3.0  # s without a new frame
+_WAIT = 60.0  # s for a press to begin
+_TOUCHED = 3  # cells that are clear of their noise: something touches the tip
+_CLEAR = 6.0  # standard deviations of a cell's noise, and two counts, are clear of it
+_FEWEST = 5  # frames of a press
+_BACK = 0.95  # of the run's largest reading: the tip is let go
+
+
+@dataclass(frozen=True)
+class Loads:
+    """``frames``: for each load counts uint16 [k, rows, cols]; ``truths``: float64 [loads] each."""
+
+    frames: list[NDArray[np.uint16]]
+    truths: dict[str, NDArray[np.float64]]
+
+
+def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
+    """The step's loads. Raises TactileError, RecordingError or CalibrationError.
+
+    ``calibration`` is what the step goes into: it tells the sensor and, live, its zero.
+    """
+    sensor = calibration.sensor
+    given = {
+        name: np.array(getattr(arguments, name)) * unit
+        for name, unit in _UNITS.items()
+        if getattr(arguments, name)
+    }
+    tactile = settings.tactile
+    if arguments.recording:
+        runs = [
+            load_recording(path, tactile.pascal_per_count, tactile.rate)
+            for path in arguments.recording
+        ]
+        for path, recording in zip(arguments.recording, runs, strict=True):
+            if recording.counts.shape[1:] != (sensor.rows, sensor.cols):
+                found = " × ".join(map(str, recording.counts.shape[1:]))
+                raise RecordingError(
+                    f"{path}: frames of {found} cells, {sensor.rows} × {sensor.cols} expected"
+                )
+        whole = runs[0]
+        if len(runs) == 1 and whole.truths:
+            # A run: each frame is a load of its own; only pressed ones tell something.
+            used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
+            frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
+            return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
+        return Loads([each.counts for each in runs], _spread(given, len(runs)))
+    if arguments.speed is not None:
+        return _live_run(arguments, settings, calibration, given)
+    count = max([arguments.loads, 1, *(len(values) for values in given.values())])
+    truths = _spread(given, count)
+    return Loads(_live(arguments, settings, sensor.finger, truths, count), truths)
+
+
+def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
+    """Each list of values as long as there are loads; one value stands for all."""
+    for name, values in given.items():
+        if len(values) not in (1, count):
+            raise CalibrationError(f"--{name}: found {len(values)} values for {count} loads")
+    return {name: np.broadcast_to(given[name], count).copy() for name in TRUTHS if name in given}
+
+
+def _live(
+    arguments: argparse.Namespace,
+    settings: Settings,
+    finger: str,
+    truths: dict[str, Any],
+    count: int,
+) -> list[NDArray[np.uint16]]:
+    clock = RealClock()
+    loads = []
+    with _opened(settings, clock, finger) as backend:
+        for k in range(count):
+            if count > 1 or truths:
+                words = [f"{name} {values[k] / _UNITS[name]:g}" for name, values in truths.items()]
+                _say(
+                    f"load {k + 1} of {count}: {', '.join(words) or 'uniform pressure'}; "
+                    "then press Enter"
+                )
+                if not sys.stdin.readline():
+                    raise CalibrationError("ended before all loads were on")
+            # What was scanned before this moment may show the last load still.
+            frames = _fresh(backend, clock, clock.now())
+            loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
+    return loads
+
+
+def _live_run(
+    arguments: argparse.Namespace,
+    settings: Settings,
+    calibration: Calibration,
+    given: dict[str, Any],
+) -> Loads:
+    """One press at constant speed, from the first touch to the deepest frame, each a load.
+
+    d counts from the last frame without a touch, so that its zero is off by up to a frame's way.
+    """
+    clock = RealClock()
+    converter = Converter(calibration, settings.tactile.pascal_per_count)
+    if calibration.tare is None:
+        raise CalibrationError("--speed: tare first, which tells a touch from noise")
+    noise = calibration.tare.noise
+    speed = arguments.speed * 1e-3
+    with _opened(settings, clock, calibration.sensor.finger) as backend:
+        _say(f"press at {arguments.speed:g} mm/s from clear of the tip, then let go")
+        begin, last_free, most = clock.now(), -math.inf, 0.0
+        frames: list[NDArray[np.uint16]] = []
+        d: list[float] = []
+        for frame in _fresh(backend, clock, begin):
+            readings = converter.readings(frame.data.astype(np.float64))
+            total = float(readings.sum())
+            if not frames and clock.now() - begin > _WAIT:
+                raise CalibrationError(f"no press from clear of the tip within {_WAIT:g} s")
+            if np.count_nonzero(readings > _CLEAR * noise + 2.0) < _TOUCHED:
+                if frames:  # let go between two frames
+                    break
+                last_free = frame.t_sample
+            elif last_free > -math.inf:
+                if total < _BACK * most:
+                    break
+                most = max(most, total)
+                frames.append(frame.data)
+                d.append(speed * (frame.t_sample - last_free))
+    totals = [float(converter.readings(each.astype(np.float64)).sum()) for each in frames]
+    count = int(np.argmax(totals))  # the deepest itself may be past the turn
+    if count < _FEWEST:
+        raise CalibrationError(f"{count} frames while it was pressed: press slower")
+    _say(f"{count} frames of a press to {1e3 * d[count]:.2f} mm")
+    truths = {**_spread(given, count), "d": np.array(d[:count])}
+    return Loads([each[None] for each in frames[:count]], truths)
+
+
+@contextlib.contextmanager
+def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[TactileSensor]:
+    """The finger's sensor, open. Raises TactileError."""
+    hand = None
+    if settings.tactile.backend == "simulated":
+        from softfinger.daemon.simulation.physics.hand import SimulatedHand
+
+        hand = SimulatedHand(settings, clock.now())
+    backend = make_sensor(settings, clock, hand, FINGERS.index(finger))
+    if backend is None:
+        raise TactileError("tactile.backend: found none, expected a sensor")
+    backend.open()
+    try:
+        yield backend
+    finally:
+        backend.close()
+
+
+def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[Frame]:
+    """Each new frame scanned after ``since``. Raises TactileError when the sensor stops."""
+    last = backend.latest()
+    waited = clock.now()
+    while True:
+        clock.sleep_until(clock.now() + 1e-3)
+        frame = backend.latest()
+        if frame is not last and frame is not None:
+            last, waited = frame, clock.now()
+            if not frame.valid:
+                raise TactileError(f"the sensor stopped: {getattr(backend, 'error', '')}")
+            if frame.t_sample >= since:
+                yield frame
+        elif clock.now() - waited > _PATIENCE:
+            raise TactileError(f"no new frame within {_PATIENCE:g} s")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,134 @@
+"""How all pictures look: sizes for print, and lines told apart without their colour.
+
+Families that are ordered (by displacement, by angle) take colours of falling lightness, which stay
+in order in grey and for colour-blind readers, each with a dash of its own. Things of different
+kinds take the colours of Okabe and Ito, each with a marker of its own.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from softfinger.daemon.wire.own_files import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 200
+GREY = "#707070"
+INK = "#202020"
+KINDS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999999")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+_DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.5)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (1.2, 1.2)),
+    (0, (8, 2, 2, 2)),
+    (0, (3, 1.2, 1, 1.2, 1, 1.2)),
+    (0, (2.5, 2.5)),
+)
+_SETTINGS: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 8.5,
+    "legend.fontsize": 7.5,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+}
+
+
+class NoMatplotlib(Exception):
+    """matplotlib is not installed. The message says what to install."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "pictures need matplotlib, the extra 'plot'; from the project's folder: "
+            "pip install '.[plot]'"
+        )
+
+
+def settings() -> AbstractContextManager[None]:
+    """A context in which figures are made in this style. Raises NoMatplotlib without it."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise NoMatplotlib from None
+    return matplotlib.rc_context(_SETTINGS)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of this size [inch], free of any window system."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write the picture as its suffix says."""
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=DPI, format=path.suffix.removeprefix(".") or None)
+    with write_bytes(path) as file:
+        file.write(picture.getbuffer())
+
+
+def ordered(count: int) -> list[dict[str, Any]]:
+    """Colour and dash of each line of an ordered family, light to dark; the first continuous."""
+    import matplotlib
+
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))
+    return [{"color": shades[i], "linestyle": _DASHES[i % len(_DASHES)]} for i in range(count)]
+
+
+def label_ends(
+    axes: Axes, x: float, ends: Sequence[float], labels: Sequence[str], gap: float = 0.05
+) -> None:
+    """Write each label right of its line's end (x, y), pushed apart by ``gap`` of the axis."""
+    low, high = axes.get_ylim()
+    step = gap * (high - low)
+    order = np.argsort(ends)
+    places = np.array(ends, dtype=np.float64)[order]
+    for _ in range(200):  # relax until none overlap
+        lack = step - np.diff(places)
+        if not np.any(lack > 1e-9 * step):
+            break
+        push = 0.5 * np.maximum(lack, 0.0)
+        places[:-1] -= push
+        places[1:] += push
+    for rank, i in enumerate(order):
+        axes.annotate(
+            labels[i],
+            xy=(x, ends[i]),
+            xytext=(14, places[rank]),
+            textcoords=("offset points", "data"),
+            va="center",
+            fontsize=7.5,
+            color=INK,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "lw": 0.4, "color": GREY, "shrinkA": 0, "shrinkB": 1},
+        )
+
+
+def caption(figure: Figure, lines: Sequence[str]) -> None:
+    """Notes below the panels, wrapped to the figure's width."""
+    import textwrap
+
+    columns = int(figure.get_figwidth() * 17.5)
+    text = "\n".join(textwrap.fill(line, columns) for line in lines)
+    figure.supxlabel(text, x=0.01, ha="left", fontsize=7.5, color=INK)

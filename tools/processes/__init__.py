@@ -1,0 +1,1 @@
+"""Processes beside the daemon: monitor, recorder, kernel compilation, log of events."""

@@ -1,0 +1,354 @@
+"""What the public wire says, kept for one who looks at it: the newest state and frames, the last
+events, statistics over the last second, a short history.
+
+Holds the subscriber's side of the stream, without its sockets (`feed_sockets`), and nothing that
+draws. Every message is taken as data of unknown origin: a missing or wrong-typed field is a
+NaN or an empty text, a message that can't be read is counted and skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import time
+from bisect import insort
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.control.modes import Lease
+from softfinger.daemon.profile.settings import GRIP_SHARE
+
+FINGERS = ("left", "right")
+SCHEMA = 1  # of hand/state, the newest this module knows
+
+HISTORY_STEP = 0.2  # s in one column of the trends
+HISTORY_LENGTH = 600
+WINDOW = 1.0  # s of statistics
+LATELY = 3.0  # s in which a busy machine is called so
+EVENTS = 200  # kept
+
+
+def field(record: object, *path: str) -> Any:
+    """The value at ``path`` in nested maps, None where there is none."""
+    for key in path:
+        if not isinstance(record, dict):
+            return None
+        record = record.get(key)
+    return record
+
+
+def number(record: object, *path: str) -> float:
+    """The number at ``path``, NaN where there is none."""
+    value = field(record, *path)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    return math.nan
+
+
+def text(record: object, *path: str) -> str:
+    """The text at ``path`` without control characters (they would reach the terminal)."""
+    value = field(record, *path)
+    return printable(value) if isinstance(value, str) else ""
+
+
+def printable(value: str) -> str:
+    """``value`` on one line, with nothing in it that a terminal would obey."""
+    return "".join(c if c.isprintable() else " " for c in value)
+
+
+@dataclass(frozen=True, slots=True)
+class TactileFrame:
+    """One frame as it came. ``scale`` is Pa per count, NaN when the message doesn't tell.
+
+    ``aspect`` is a cell's height over its width.
+    """
+
+    arrived: float
+    rows: int
+    cols: int
+    scale: float
+    data: bytes
+    aspect: float = 1.0
+
+    def grid(self) -> NDArray[np.float64]:
+        """Pressures [rows, cols], Pa; counts where the scale isn't known."""
+        counts = np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
+        return counts * (1.0 if math.isnan(self.scale) else self.scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One line of hand/event."""
+
+    timestamp: float  # Unix s, NaN when not told
+    level: str
+    kind: str
+    text: str
+
+    def clock(self) -> str:
+        """Local time of day."""
+        try:
+            return time.strftime("%H:%M:%S", time.localtime(self.timestamp))
+        except (ValueError, OverflowError, OSError):
+            return "--:--:--"
+
+
+@dataclass(frozen=True, slots=True)
+class TickStatistics:
+    """Medians and worst values over the last second; NaN where nothing was told."""
+
+    messages: float = math.nan  # states a second
+    rate: float = math.nan  # ticks a second
+    compute: float = math.nan
+    compute_max: float = math.nan
+    late: float = math.nan
+    late_max: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class LoopTimes:
+    """What ``hand/stats`` tells of all ticks so far [s]; NaN where it doesn't."""
+
+    compute: tuple[float, ...]  # median, p99, largest
+    late: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Commanding:
+    """Who has the commander's lease, and until when."""
+
+    client: str  # empty: the clients that give no name
+    until: float  # monotonic s
+
+
+class Feed:
+    """Takes messages, remembers what a page shows. ``now`` is monotonic seconds throughout.
+
+    ``events`` are in the order in which they happened, which after a late subscription is not the
+    order in which they came; ``news`` hands them over as they came.
+    """
+
+    def __init__(self) -> None:
+        self.state: dict[str, Any] | None = None
+        self.state_at = -math.inf
+        self.frames: dict[str, TactileFrame] = {}
+        self.events: list[Event] = []
+        self._news: deque[Event] = deque(maxlen=EVENTS)
+        self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
+        self.times: LoopTimes | None = None
+        self.warm = math.inf  # °C from which a servo's temperature is warned about
+        self.commanding: Commanding | None = None
+        self._lease = math.nan  # s
+        self.asked = math.nan  # N that the last grasp was told, by whomever
+        self.force_default = math.nan  # N of a grasp that is told none
+        self.force_most = math.inf  # N that a grip may be asked for
+        self.skipped = 0
+        self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
+        self._bin: list[tuple[float, float]] = []
+        self._bin_end = -math.inf
+        self._ticks: deque[tuple[float, float, float, float]] = deque(maxlen=10_000)
+        self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
+        self._period = 0.0  # s between states, smoothed
+        self._mono = math.nan
+
+    def take(self, message: list[bytes], now: float) -> None:
+        """One message off the wire, whatever it holds."""
+        try:
+            topic, payload = message
+            record = msgpack.unpackb(payload)
+            if not isinstance(record, dict):
+                raise ValueError("not a map")
+            if topic == b"hand/state":
+                self._take_state(record, now)
+            elif topic == b"hand/tactile":
+                self._take_frame(record, now)
+            elif topic == b"hand/event":
+                self._take_event(record)
+            elif topic == b"hand/stats":
+                self._take_stats(record)
+            elif topic == b"hand/command":
+                self._take_command(record, now)
+            elif topic == b"hand/settings":
+                self._take_settings(record)
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+            self.skipped += 1
+
+    def _take_state(self, record: dict[str, Any], now: float) -> None:
+        mono = 1e-9 * number(record, "mono_ns")
+        if number(record, "seq") < number(self.state, "seq"):  # another daemon: a new story
+            self._ticks.clear()
+            self._waits.clear()
+            self.history.clear()
+            self.frames.clear()
+            self._bin.clear()
+            self._period = 0.0
+            self.times = self.commanding = None
+            self.asked = math.nan
+        elif 0.0 < mono - self._mono < 60.0:
+            step = mono - self._mono
+            self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
+            waited = number(record, "behind_s") - number(self.state, "behind_s")
+            if waited > 0.0:
+                self._waits.append((now, waited))
+        self._mono = mono
+        self.state = record
+        self.state_at = now
+        self._ticks.append(
+            (
+                now,
+                number(record, "tick_s"),
+                number(record, "compute_s"),
+                number(record, "wake_late_s"),
+            )
+        )
+        if now >= self._bin_end:
+            if self._bin:
+                left, right = zip(*self._bin, strict=True)
+                self.history.append((statistics.fmean(left), statistics.fmean(right)))
+            self._bin.clear()
+            self._bin_end = now + HISTORY_STEP
+        self._bin.append((number(record, "left", "force"), number(record, "right", "force")))
+
+    def _take_frame(self, record: dict[str, Any], now: float) -> None:
+        finger, data = record.get("finger"), record.get("data")
+        rows, cols = record.get("rows"), record.get("cols")
+        if finger not in FINGERS or not isinstance(data, bytes):
+            raise ValueError("not a frame of one of the fingers")
+        if type(rows) is not int or type(cols) is not int or min(rows, cols) < 1:
+            raise ValueError("not a grid")
+        if len(data) != 2 * rows * cols:
+            raise ValueError("a grid of another size than told")
+        scale = number(record, "scale")
+        aspect = number(record, "pitch_y") / (number(record, "pitch") or math.nan)
+        self.frames[finger] = TactileFrame(
+            now,
+            rows,
+            cols,
+            scale if 0.0 < scale < math.inf else math.nan,
+            data,
+            aspect if 0.01 < aspect < 100.0 else 1.0,
+        )
+
+    def _take_event(self, record: dict[str, Any]) -> None:
+        # Told again for somebody who came later, it has its first seq and times; another daemon's
+        # has other times.
+        name = number(record, "seq"), number(record, "timestamp")
+        if record.get("again") is True and name in self._heard:
+            return
+        self._heard.append(name)
+        self._happened(
+            Event(
+                number(record, "timestamp"),
+                text(record, "level"),
+                text(record, "kind"),
+                text(record, "text"),
+            )
+        )
+
+    def _happened(self, event: Event) -> None:
+        self._news.append(event)
+        if math.isnan(event.timestamp):
+            self.events.append(event)
+        else:
+            insort(self.events, event, key=lambda each: each.timestamp)
+        del self.events[:-EVENTS]
+
+    def _take_stats(self, record: dict[str, Any]) -> None:
+        compute, late = (
+            tuple(number(record, part, share) for share in ("p50", "p99", "max"))
+            for part in ("compute", "wake")
+        )
+        self.times = LoopTimes(compute, late)
+
+    def _take_command(self, record: dict[str, Any], now: float) -> None:
+        """Who commands; a refusal is an event of its own, for those who didn't send it."""
+        name, client = text(record, "command"), text(record, "client")
+        if record.get("again") is True:
+            return
+        if record.get("ok") is not True:
+            said = text(record, "error")
+            by = f" (to {client})" if client else ""
+            when = number(record, "timestamp")
+            self._happened(Event(when, "warning", "refused", f"{said}{by}"))
+            return
+        if name == "grasp":
+            force = number(json.loads(text(record, "request") or "{}"), "force")
+            self.asked = self.force_default if math.isnan(force) else force
+        if name not in Lease.FREE and self._lease > 0.0:
+            self.commanding = Commanding(client, now + self._lease)
+
+    def _take_settings(self, record: dict[str, Any]) -> None:
+        settings = json.loads(text(record, "settings") or "{}")
+        self._lease = number(settings, "commands", "lease")
+        warm = number(settings, "safety", "temperature_warn")
+        self.force_default = number(settings, "control", "force_default")
+        most = number(settings, "safety", "force_max")
+        self.force_most = math.inf if math.isnan(most) else GRIP_SHARE * most
+        self.warm = math.inf if math.isnan(warm) else warm
+
+    def news(self) -> list[Event]:
+        """The events that have come since the last call."""
+        fresh = list(self._news)
+        self._news.clear()
+        return fresh
+
+    def commander(self, now: float) -> str | None:
+        """The client that has the commander's lease, "" for one without a name; None: nobody."""
+        if self.commanding is None or now >= self.commanding.until:
+            return None
+        return self.commanding.client
+
+    def age(self, now: float) -> float:
+        """Seconds since the last state, infinite before the first."""
+        return now - self.state_at
+
+    def status(self, now: float) -> str:
+        """``waiting`` before the first state, then ``live``, ``stale`` or ``lost`` by its age."""
+        if self.state is None:
+            return "waiting"
+        age = self.age(now)
+        if age > max(2.0, 10.0 * self._period):
+            return "lost"
+        return "stale" if age > max(0.5, 3.0 * self._period) else "live"
+
+    def waited(self, now: float) -> float:
+        """Seconds that a simulated hand has lately waited for a busy machine."""
+        while self._waits and self._waits[0][0] < now - LATELY:
+            self._waits.popleft()
+        return sum(waited for _, waited in self._waits)
+
+    def statistics(self, now: float) -> TickStatistics:
+        """What the last second's states say of the tick."""
+        while self._ticks and self._ticks[0][0] < now - WINDOW:
+            self._ticks.popleft()
+        if not self._ticks:
+            return TickStatistics()
+        _, tick, compute, late = zip(*self._ticks, strict=True)
+        period = _median(tick)
+        return TickStatistics(
+            messages=len(self._ticks) / WINDOW,
+            rate=1.0 / period if period > 0.0 else math.nan,
+            compute=_median(compute),
+            compute_max=_greatest(compute),
+            late=_median(late),
+            late_max=_greatest(late),
+        )
+
+
+def _finite(values: tuple[float, ...]) -> list[float]:
+    return [value for value in values if math.isfinite(value)]
+
+
+def _median(values: tuple[float, ...]) -> float:
+    finite = _finite(values)
+    return statistics.median(finite) if finite else math.nan
+
+
+def _greatest(values: tuple[float, ...]) -> float:
+    return max(_finite(values), default=math.nan)

@@ -1,0 +1,142 @@
+"""The sockets of one who looks at the hand and commands it, without ever waiting.
+
+`Subscriber` takes the stream into a feed, `Commander` sends what a person asks for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import zmq
+
+from softfinger.daemon.client.patience import PATIENCE, SILENCE
+from softfinger.tools.terminal.feed import Feed, field, text
+
+TOPICS = (
+    *(b"hand/state", b"hand/tactile", b"hand/event"),
+    *(b"hand/stats", b"hand/command", b"hand/settings"),
+)
+_DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
+_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+
+
+class Subscriber:
+    """The stream's socket: everything that waits is taken into a feed."""
+
+    def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
+        self.feed = feed
+        self._socket = context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, _DRAIN_LIMIT)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+        for topic in TOPICS:
+            self._socket.setsockopt(zmq.SUBSCRIBE, topic)
+        self._socket.connect(address)
+
+    def drain(self, now: float) -> int:
+        """Take what waits; how many messages that was."""
+        for count in range(_DRAIN_LIMIT):
+            try:
+                message = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return count
+            self.feed.take(message, now)
+        return _DRAIN_LIMIT
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What came of a command, for the page."""
+
+    at: float
+    ok: bool
+    text: str
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A command that is not answered yet."""
+
+    label: str
+    socket: zmq.Socket[bytes]
+    sent: float
+    told: bool = False  # that it takes long
+
+
+class Commander:
+    """Sends commands without ever waiting. The newest reply is kept in ``reply``.
+
+    Each command has a request socket of its own: an answer that never comes holds nothing up,
+    a stop least of all.
+    """
+
+    OPEN_LIMIT = 8  # commands under way; further ones are dropped, except stop
+
+    def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
+        self._context = context
+        self._address = address
+        self._envelope = {"client": client} if client else {}
+        self._pending: list[_Pending] = []
+        self.reply: Reply | None = None
+
+    def send(self, now: float, label: str, command: str, **fields: float) -> None:
+        """Send ``command`` with ``fields``; the reply is shown under ``label``."""
+        if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
+            self.reply = Reply(now, False, f"{label}: dropped, the daemon doesn't answer")
+            return
+        request = self._context.socket(zmq.REQ)
+        request.setsockopt(zmq.LINGER, 0)
+        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+        request.connect(self._address)
+        request.send(msgpack.packb({"command": command, **self._envelope, **fields}), zmq.NOBLOCK)
+        self._pending.append(_Pending(label, request, now))
+
+    def refuse(self, now: float, why: str) -> None:
+        """Say that a key was not turned into a command."""
+        self.reply = Reply(now, False, why)
+
+    def collect(self, now: float) -> None:
+        """Take the replies that came, give up on those that are overdue."""
+        waiting = []
+        for each in self._pending:
+            try:
+                payload = each.socket.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                overdue = now - each.sent >= PATIENCE
+                if overdue or (not each.told and now - each.sent >= SILENCE):
+                    each.told = True
+                    so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
+                    said = f"{each.label}: no answer from {self._address} {so_far}"
+                    self.reply = Reply(now, False, said)
+                if not overdue:
+                    waiting.append(each)
+                    continue
+            else:
+                self.reply = self._read(now, each.label, payload)
+            each.socket.close()
+        self._pending = waiting
+
+    @staticmethod
+    def _read(now: float, label: str, payload: bytes) -> Reply:
+        try:
+            record = msgpack.unpackb(payload)
+        except (ValueError, RecursionError, msgpack.UnpackException):
+            record = None
+        if field(record, "ok") is True:
+            return Reply(now, True, f"{label}: ok")
+        why = text(record, "error") or "an answer that can't be read"
+        said = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
+        return Reply(now, False, why if said else f"{label}: {why}")
+
+    def close(self) -> None:
+        """Close what is open; commands that were not taken yet are dropped."""
+        for each in self._pending:
+            each.socket.close()
+        self._pending = []

@@ -1,0 +1,200 @@
+"""The terminal of a full-screen page: taken over, written line by line, given back as it was.
+
+Holds screen modes, key decoding and output, and nothing of what is shown. Only lines that changed
+are written, in one write a redraw: that is light over ssh and doesn't flicker.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import termios
+import tty
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+from rich.color import ColorSystem
+from rich.console import Console
+from rich.segment import Segment
+
+from softfinger.tools.terminal.heatmap import Depth
+
+_ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, pastes marked
+_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # CAN ends a sequence that was cut off
+_HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # terminals that know it show a redraw as one
+
+_COLOUR_SYSTEMS = {
+    "truecolor": ColorSystem.TRUECOLOR,
+    "256": ColorSystem.EIGHT_BIT,
+    "standard": ColorSystem.STANDARD,
+}
+
+_SEQUENCES = {
+    b"\x1b[D": "left",
+    b"\x1b[C": "right",
+    b"\x1bOD": "left",
+    b"\x1bOC": "right",
+}
+_PASTE, _PASTE_END = b"\x1b[200~", b"\x1b[201~"
+
+
+class TerminalGone(Exception):
+    """The terminal can't be written to any more, or a signal ended a write that was stuck."""
+
+
+class Keys:
+    """Bytes from a terminal in, names of keys out. Pasted text is no key."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._pasting = False
+
+    def decode(self, data: bytes) -> list[str]:
+        """The keys in ``data``: ``left``, ``right`` or the character itself."""
+        data = self._rest + data
+        self._rest = b""
+        keys: list[str] = []
+        at = 0
+        while at < len(data):
+            if self._pasting:
+                end = data.find(_PASTE_END, at)
+                if end < 0:
+                    self._rest = data[max(at, len(data) - len(_PASTE_END) + 1) :]
+                    return keys
+                self._pasting = False
+                at = end + len(_PASTE_END)
+                continue
+            length = _length(data, at)
+            if length == 0:  # a sequence that is cut off: the rest comes with the next bytes
+                self._rest = data[at:]
+                return keys
+            piece = data[at : at + length]
+            at += length
+            if piece == _PASTE:
+                self._pasting = True
+            elif piece in _SEQUENCES:
+                keys.append(_SEQUENCES[piece])
+            elif len(piece) == 1 and 0x20 <= piece[0] < 0x7F:
+                keys.append(piece.decode())
+        return keys
+
+    def settle(self) -> None:
+        """No more bytes for now: a lone Escape begins nothing."""
+        if not self._pasting:
+            self._rest = b""
+
+
+def _length(data: bytes, at: int) -> int:
+    """Bytes of the key or sequence at ``at``, 0 when its end is still to come."""
+    if data[at] != 0x1B:
+        return 1
+    if at + 1 >= len(data):
+        return 0
+    if data[at + 1] == ord("O"):
+        return 3 if at + 2 < len(data) else 0
+    if data[at + 1] != ord("["):
+        return 2
+    for end in range(at + 2, len(data)):
+        if 0x40 <= data[end] <= 0x7E:
+            return end - at + 1
+    return 0
+
+
+class Terminal:
+    """A context: inside it the page owns the terminal, after it everything is as before."""
+
+    def __init__(self, output: int, keyboard: int | None, suspendable: bool = True) -> None:
+        self._output = output
+        self._keyboard = keyboard
+        self._suspendable = suspendable
+        self._attributes: list[Any] | None = None
+        self._shown: list[str] = []
+        self._size = (0, 0)
+        self.writing = False
+        self._stuck = False
+        console = Console()
+        name = None if console.no_color else console.color_system
+        self._colours = _COLOUR_SYSTEMS.get(name) if name else None
+        # Sixteen colours are too few for a map; shades of one character read better there.
+        self.depth: Depth = "none"
+        if self._colours in (ColorSystem.TRUECOLOR, ColorSystem.EIGHT_BIT):
+            self.depth = "any" if self._colours is ColorSystem.TRUECOLOR else "fixed"
+
+    def __enter__(self) -> Terminal:
+        if self._keyboard is not None:
+            self._attributes = termios.tcgetattr(self._keyboard)
+            tty.setcbreak(self._keyboard)  # drops what was typed ahead: no key by accident
+            if not self._suspendable:  # Ctrl-Z would stop the daemon too, torque on
+                ours = termios.tcgetattr(self._keyboard)
+                ours[6][termios.VSUSP] = b"\0"
+                termios.tcsetattr(self._keyboard, termios.TCSANOW, ours)
+        self._shown = []
+        self._size = (0, 0)
+        try:
+            self._write(_ENTER)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with contextlib.suppress(OSError, termios.error, TerminalGone):
+            if self._attributes is not None and self._keyboard is not None:
+                # At once and not after the output has drained: a stuck line would hold us here.
+                termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
+        with contextlib.suppress(OSError, termios.error, TerminalGone):
+            if self._stuck:  # what it did not take shall not stand before what follows
+                termios.tcflush(self._output, termios.TCOFLUSH)
+            termios.tcflow(self._output, termios.TCOON)  # as Ctrl-Q, or the next write hangs
+            self._write(_LEAVE)
+
+    def size(self) -> tuple[int, int]:
+        """(columns, lines) of now."""
+        try:
+            size = os.get_terminal_size(self._output)
+        except OSError:
+            size = shutil.get_terminal_size()
+        # A serial console may say 0 × 0: then as a terminal of old.
+        return size.columns or 80, size.lines or 24
+
+    def draw(self, lines: Sequence[Sequence[Segment]]) -> None:
+        """Show ``lines``, each exactly as wide as the terminal."""
+        size = self.size()
+        parts = []
+        if size != self._size:
+            self._size = size
+            self._shown = []
+            parts.append("\x1b[0m\x1b[2J")
+        new = ["".join(map(self._render, line)) for line in lines]
+        for row, line in enumerate(new):
+            if row >= len(self._shown) or line != self._shown[row]:
+                parts.append(f"\x1b[{row + 1};1H{line}")
+        if parts:
+            self._write(_HOLD + "".join(parts) + _SHOW)
+        self._shown = new
+
+    def _render(self, segment: Segment) -> str:
+        if segment.style is None:
+            return segment.text
+        return segment.style.render(segment.text, color_system=self._colours)
+
+    def _write(self, text: str) -> None:
+        data = memoryview(text.encode("utf-8", "replace"))
+        self.writing = True
+        try:
+            while data:
+                data = data[os.write(self._output, data) :]
+        except TerminalGone:
+            self._stuck = True
+            raise
+        except OSError as error:
+            raise TerminalGone(str(error)) from error
+        finally:
+            self.writing = False
