@@ -1,4 +1,4 @@
-"""What was recorded once, through today's code: nothing of the hand's behaviour changes unnoticed."""
+"""The golden recording through today's code: no change of the hand's behaviour goes unnoticed."""
 
 from __future__ import annotations
 
