@@ -38,8 +38,13 @@ __all__ = [
     "Hand",
     "Material",
     "SensorGrid",
+    "SoftfingerError",
     "__version__",
 ]
+
+
+class SoftfingerError(Exception):
+    """The root of all exceptions of this package."""
 
 
 def __getattr__(name: str) -> Any:

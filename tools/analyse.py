@@ -8,9 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from softfinger.daemon.profile.settings import SettingsError
+from softfinger.daemon.errors import RecordingError, SettingsError
 from softfinger.tools.arguments import add_profile, profile
-from softfinger.tools.recordings.errors import RecordingError
 
 if TYPE_CHECKING:
     from softfinger.tools.analysis.contacts import Contacts
@@ -42,9 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
+    from softfinger.daemon.errors import RecordingError as FramesError
+    from softfinger.daemon.errors import TactileError
     from softfinger.daemon.loop.warm_up import FRAMES
-    from softfinger.daemon.tactile.base import TactileError
-    from softfinger.daemon.tactile.recording import RecordingError as FramesError
     from softfinger.tools.analysis.contacts import analyse, write_csv
     from softfinger.tools.analysis.sources import open_source
     from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache

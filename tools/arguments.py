@@ -9,8 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.own_files import require_own, runtime_folder
 
 if TYPE_CHECKING:

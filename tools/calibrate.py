@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.errors import SettingsError, SoftfingerError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
 
 if TYPE_CHECKING:
@@ -79,9 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
+    from softfinger.daemon.errors import RecordingError, TactileError
     from softfinger.daemon.perception.calibration_file import save_calibration
-    from softfinger.daemon.tactile.base import TactileError
-    from softfinger.daemon.tactile.recording import RecordingError
     from softfinger.kinematics.sensing.calibration import CalibrationError
     from softfinger.tools.calibration.calibration_frames import gather
 
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class _NoPlot(Exception):
+class _NoPlot(SoftfingerError):
     """The picture can't be drawn."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from softfinger.daemon.profile.settings import SettingsError
+from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.kernel_build import build_kernels, print_event
 

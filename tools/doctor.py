@@ -16,7 +16,8 @@ from softfinger.daemon.diagnosis.machine import check_machine
 from softfinger.daemon.diagnosis.mending import mend_latency_timer, mend_servos
 from softfinger.daemon.diagnosis.ports import check_latency_timer, check_port, note_ports
 from softfinger.daemon.diagnosis.result import Result
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.kernel_build import build_kernels, print_event

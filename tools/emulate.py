@@ -12,7 +12,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from softfinger.daemon.profile.settings import ServoSettings, Settings, SettingsError
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 
 _FAULTS = """\

@@ -7,8 +7,8 @@ import math
 import sys
 from pathlib import Path
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.tools.arguments import moment, seconds, teller
-from softfinger.tools.recordings.errors import RecordingError
 
 _EPILOG = """\
 Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A

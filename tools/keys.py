@@ -6,7 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from softfinger.daemon.wire.keys import KeyFileError, make_keys
+from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.wire.keys import make_keys
 
 _EPILOG = """\
 The first call makes the daemon's keys and those of the client `local`, for the tools on the

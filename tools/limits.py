@@ -6,7 +6,8 @@ import argparse
 import sys
 from typing import Any
 
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
 
 

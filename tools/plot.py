@@ -7,8 +7,8 @@ import math
 import sys
 from pathlib import Path
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.tools.arguments import moment, seconds, teller
-from softfinger.tools.recordings.errors import RecordingError
 
 # Beside each other in help, so that a page can be chosen without drawing all.
 PAGES = {

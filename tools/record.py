@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Stream
 from softfinger.tools.arguments import (
     ALL,
@@ -23,7 +24,6 @@ from softfinger.tools.arguments import (
     topic,
     waiting,
 )
-from softfinger.tools.recordings.errors import RecordingError
 
 _EPILOG = """\
 Ends with Ctrl-C, after --duration, or at --to; prints what it wrote and what was lost on the way.
@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Record until told to end; 1 with one line when something went wrong."""
-    from softfinger.daemon.wire.keys import KeyFileError
+    from softfinger.daemon.errors import KeyFileError
 
     try:
         if arguments.recover:

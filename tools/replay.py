@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.profile.settings import SettingsError, Stream
+from softfinger.daemon.errors import RecordingError, SettingsError
+from softfinger.daemon.profile.settings import Stream
 from softfinger.daemon.wire.own_files import write_text
 from softfinger.tools.arguments import moment, seconds, teller
-from softfinger.tools.recordings.errors import RecordingError
 
 _EPILOG = """\
 Without --recompute the messages go out on the stream's socket as they were, at their own pace or
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Publish, or recompute; 1 with one line when the recording is no good."""
-    from softfinger.daemon.tactile.base import TactileError
+    from softfinger.daemon.errors import TactileError
     from softfinger.tools.recordings.reader import Recording
 
     try:

@@ -11,8 +11,9 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.loop.sd_notify import Service
-from softfinger.daemon.profile.settings import Settings, SettingsError, Task
+from softfinger.daemon.profile.settings import Settings, Task
 from softfinger.tools.arguments import add_profile, profile, seconds
 from softfinger.tools.processes.event_log import EventLog
 from softfinger.tools.processes.recorder_beside import NoRecorder
@@ -81,16 +82,13 @@ def _serve(
     hold_collector()
     from softfinger.daemon.loop.build import Daemon
     from softfinger.daemon.loop.rates import Schedule
-    from softfinger.daemon.servos.base import ServoError
-    from softfinger.daemon.tactile.base import TactileError
-    from softfinger.daemon.wire.sockets import AddressError
     from softfinger.tools.processes.kernel_build import build_kernels, table_cache
 
     log.line("info", "start", f"softfinger: {_scene(settings)}")
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=table_cache())
-    except (SettingsError, AddressError, ServoError, TactileError, ValueError) as error:
+    except SoftfingerError as error:
         log.plain(f"softfinger: {error}", "error")
         return 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:

@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from softfinger.daemon.diagnosis.ports import serial_ports
-from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.servos.registers import BAUD_RATES
 from softfinger.daemon.servos.scanning import ALONE, FoundServo, search
 

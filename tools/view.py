@@ -101,8 +101,7 @@ def _rate(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show until told to end; 1 with one line when something went wrong."""
-    from softfinger.daemon.wire.keys import KeyFileError
-    from softfinger.tools.recordings.errors import RecordingError
+    from softfinger.daemon.errors import KeyFileError, RecordingError
 
     try:
         with _Ending(arguments.duration) as ending:

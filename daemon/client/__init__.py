@@ -18,7 +18,6 @@ needs no more than its two addresses; nothing in it touches the daemon's own sta
 
 from softfinger.daemon.client.asynchronous import AsyncHand
 from softfinger.daemon.client.command_client import NoAnswer
-from softfinger.daemon.client.errors import HandFault, NoStream, NotInTime
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.records import (
     Event,
@@ -28,7 +27,7 @@ from softfinger.daemon.client.records import (
     TactileFrame,
     to_columns,
 )
-from softfinger.daemon.wire.command_server import Refused
+from softfinger.daemon.errors import HandFault, NoStream, NotInTime, Refused
 
 __all__ = [
     "AsyncHand",

@@ -14,11 +14,11 @@ import zmq
 import zmq.asyncio
 
 from softfinger.daemon.client.command_client import LOCALLY, NoAnswer
-from softfinger.daemon.client.errors import HandFault, NoStream, NotInTime
 from softfinger.daemon.client.hand import COMMANDS, STREAM, accepted
 from softfinger.daemon.client.patience import PATIENCE, SILENCE, answer_to, still_waiting
 from softfinger.daemon.client.records import Event, HandState, TactileFrame
 from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
+from softfinger.daemon.errors import HandFault, NoStream, NotInTime
 from softfinger.daemon.wire import messages
 from softfinger.daemon.wire.keys import load_client
 from softfinger.daemon.wire.local_stop import stop_locally

@@ -10,6 +10,7 @@ import msgpack
 import zmq
 
 from softfinger.daemon.client.patience import PATIENCE, SILENCE, answer_to, still_waiting
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -18,7 +19,7 @@ _log = logging.getLogger(__name__)
 LOCALLY = 0.5  # s for a daemon to answer past all other clients
 
 
-class NoAnswer(Exception):
+class NoAnswer(SoftfingerError):
     """The daemon did not answer in time."""
 
 

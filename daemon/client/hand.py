@@ -12,13 +12,12 @@ from typing import Any, Generic, TypeVar
 import zmq
 
 from softfinger.daemon.client.command_client import send
-from softfinger.daemon.client.errors import HandFault, NoStream, NotInTime
 from softfinger.daemon.client.patience import PATIENCE, SILENCE
 from softfinger.daemon.client.records import Event, HandState, TactileFrame
 from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
+from softfinger.daemon.errors import HandFault, NoStream, NotInTime, Refused
 from softfinger.daemon.profile.settings import CommandSettings, Stream
 from softfinger.daemon.wire import messages
-from softfinger.daemon.wire.command_server import Refused
 from softfinger.daemon.wire.keys import load_client
 
 _Record = TypeVar("_Record")

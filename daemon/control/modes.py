@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from softfinger.daemon.wire.command_server import Refused
+from softfinger.daemon.errors import Refused
 
 
 class Mode(StrEnum):

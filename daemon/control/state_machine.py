@@ -13,10 +13,10 @@ from typing import Any
 from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.control.modes import Command, Mode
 from softfinger.daemon.control.setpoint import Reference
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.perception.contact_filter import Held
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.daemon.types import FINGERS, Contact, Goal, ObjectPose, Reading
-from softfinger.daemon.wire.command_server import Refused
 
 Event = tuple[str, str, str]  # level, kind, text
 

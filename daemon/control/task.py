@@ -10,6 +10,7 @@ from itertools import chain, cycle
 from typing import Any
 
 from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 
@@ -19,7 +20,7 @@ _PATIENCE = 10.0  # s for a step
 _PAUSE = 2.0  # s in which a person can read what went wrong
 
 
-class TaskOver(Exception):
+class TaskOver(SoftfingerError):
     """The task can't go on. The message says why."""
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.keys import KeyFileError, load_client
+from softfinger.daemon.wire.keys import load_client
 
 _PATIENCE = 0.5  # s for a daemon to answer
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 
 from softfinger.daemon.diagnosis.result import Result, Status
+from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.checks import check_angle
 from softfinger.daemon.servos.examine import Examined, examine, servo_name
 from softfinger.daemon.servos.identity import plan
@@ -19,7 +19,6 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.scanning import ALONE, FoundServo, search
 from softfinger.daemon.servos.units import JointScale
 from softfinger.daemon.tactile import make_sensor
-from softfinger.daemon.tactile.base import TactileError
 from softfinger.daemon.types import FINGERS
 
 _PATIENCE = 0.05  # s for a reply: a factory-new servo behind a slow adapter answers within it

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from softfinger.daemon.diagnosis.ports import check_latency_timer, latency_file
 from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.mend import mend
 
 

@@ -12,10 +12,10 @@ import socket
 import sys
 from pathlib import Path
 
+from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway import link
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.service import StartAnew, open_service
-from softfinger.daemon.wire.sockets import AddressError
 
 _MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
 _DESCRIPTORS = 64  # that are not clients'
@@ -40,7 +40,7 @@ def main(words: list[str]) -> int:
 def _serve(end: socket.socket, config: Config) -> int:
     try:
         service = open_service(end, config, _be_bounded())
-    except (AddressError, ValueError) as error:
+    except (AddressError, KeyFileError) as error:
         end.send(link.FAILED + str(error).encode()[: link.LARGEST // 2])
         return 1
     end.send(link.READY)

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple, Protocol
 
 import msgpack
 
-from softfinger.daemon.wire.command_server import PASSED, Refused, decode
+from softfinger.daemon.errors import Refused
+from softfinger.daemon.wire.command_server import PASSED, decode
 
 _UNDER_WAY = 4  # requests that the loop has and hasn't answered; a stop goes beside them
 _WAITING_EACH = 64  # requests of one client that wait here …

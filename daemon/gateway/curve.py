@@ -18,10 +18,11 @@ import zmq
 import zmq.utils.z85
 from zmq.auth.thread import ThreadAuthenticator
 
+from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.gateway.admission import Pace
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.service import Service, StartAnew
-from softfinger.daemon.wire.keys import DOMAIN, KeyFileError, ServerKeys, load_server
+from softfinger.daemon.wire.keys import DOMAIN, ServerKeys, load_server
 from softfinger.daemon.wire.sockets import IpcFile, bind_error
 
 _NOW = int(zmq.NOBLOCK)

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import msgpack
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.gateway import link
 from softfinger.daemon.gateway.admission import Requests
 from softfinger.daemon.gateway.config import Config, Topics
@@ -57,7 +58,7 @@ class StreamDoor(AnyDoor, Protocol):
         """One message to all who want its topic."""
 
 
-class StartAnew(Exception):
+class StartAnew(SoftfingerError):
     """All connections are to end, and clients to come in again. The message says why."""
 
 

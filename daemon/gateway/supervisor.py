@@ -12,9 +12,9 @@ import threading
 import time
 from pathlib import Path
 
+from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway import link
 from softfinger.daemon.gateway.config import Config
-from softfinger.daemon.wire.sockets import AddressError
 
 _ROOT = Path(__file__).parents[3]  # where the package is found
 _PATIENCE = 20.0  # s for a gateway to bind its sockets

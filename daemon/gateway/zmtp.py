@@ -6,6 +6,8 @@ bytes. Source: https://rfc.zeromq.org/spec/23/
 
 from __future__ import annotations
 
+from softfinger.daemon.errors import SoftfingerError
+
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 
 _MORE, _LONG, _COMMAND = 1, 2, 4
@@ -13,7 +15,7 @@ _HEAD = 2  # bytes of a short frame's head
 _LONG_HEAD = 9
 
 
-class Broken(Exception):
+class Broken(SoftfingerError):
     """The peer does not keep to the protocol, or to our bounds: it is hung up on."""
 
 

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from softfinger.daemon.control.modes import Command, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskOver
+from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.clock import LoopClock
 from softfinger.daemon.loop.lateness import Lateness
 from softfinger.daemon.loop.publishing import Broadcast
@@ -24,9 +25,9 @@ from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import BUS, Safety
 from softfinger.daemon.safety.torque_state import Drive
-from softfinger.daemon.servos.base import ServoError, Servos
+from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import FINGERS, Contact, State
-from softfinger.daemon.wire.command_server import Handler, Refused
+from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.messages import Truth
 from softfinger.daemon.wire.publisher import Publisher
 

@@ -14,15 +14,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.perception.contact_filter import Prediction
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings, Task
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.tactile.given import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
-from softfinger.daemon.wire.command_server import Handler, Refused
+from softfinger.daemon.wire.command_server import Handler
 
 
 class Recomputation:

@@ -12,14 +12,12 @@ from typing import Any
 
 from softfinger.daemon.control.modes import Lease, parse
 from softfinger.daemon.control.state_machine import Control
+from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import Drive
-from softfinger.daemon.servos.base import ServoError
-from softfinger.daemon.tactile.base import TactileError
 from softfinger.daemon.types import FINGERS, State
-from softfinger.daemon.wire.command_server import Refused
 
 
 class Orders:

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
-from softfinger.daemon.profile.settings import MaterialLaw, Settings, SettingsError
+from softfinger.daemon.profile.settings import MaterialLaw, Settings
 from softfinger.daemon.profile.table_files import load_or_build
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.closed_form import Fingertip

@@ -15,7 +15,8 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import contradictions, shown
 
 _DEEPEST = 8  # tables and arrays in each other

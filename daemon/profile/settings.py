@@ -52,10 +52,6 @@ def _known(name: str) -> str:
 Model = Annotated[str, AfterValidator(_known)]  # of a servo
 
 
-class SettingsError(Exception):
-    """The settings can't be used. The message lists every error: file, key, found, expected."""
-
-
 class Section(BaseModel):
     """What all sections share: unknown keys are errors, values are not converted, nothing changes.
 

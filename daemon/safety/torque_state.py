@@ -12,9 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.safety.safety import BUS, TORQUE_OFF, Safety
-from softfinger.daemon.servos.base import ServoError, Servos
+from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.registers import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 

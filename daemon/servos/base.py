@@ -7,13 +7,6 @@ from typing import Protocol
 from softfinger.daemon.types import Goal, Reading
 
 
-class ServoError(Exception):
-    """The servos can't be used: port missing or busy, a servo absent or set up wrongly.
-
-    The message lists everything that was found wrong, one line each, with what mends it.
-    """
-
-
 class Servos(Protocol):
     """Joints of the hand, in one of three operating modes (``servos.mode``).
 

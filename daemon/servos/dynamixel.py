@@ -19,10 +19,10 @@ from collections import deque
 
 from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.checks import check_latency
 from softfinger.daemon.servos.examine import examine
 from softfinger.daemon.servos.groups import GroupRead

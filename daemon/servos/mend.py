@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import time
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.checks import DRIVE_UNFIT, RETURN_DELAY_MAX
 from softfinger.daemon.servos.examine import servo_name
 from softfinger.daemon.servos.identity import Change, Plan, plan

@@ -19,7 +19,7 @@ from typing import Any
 import serial
 from dynamixel_sdk.port_handler import PortHandler
 
-from softfinger.daemon.servos.base import ServoError
+from softfinger.daemon.errors import ServoError
 
 BITS_PER_BYTE = 10
 _READ_SIZE = 4096

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.line import ServoLine
 from softfinger.daemon.servos.models import by_number
 from softfinger.daemon.servos.packets import PacketHandler

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.checks import check_model
 from softfinger.daemon.servos.models import by_name
 from softfinger.daemon.servos.modes import current_toward, mode_number

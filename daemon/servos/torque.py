@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Hand, ServoSettings
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.checks import check_angle
 from softfinger.daemon.servos.groups import GroupWrite
 from softfinger.daemon.servos.joints import GOAL_SIZE, Joint, goal_in, pack_goal

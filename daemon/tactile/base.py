@@ -7,10 +7,6 @@ from typing import Protocol
 from softfinger.daemon.types import Frame
 
 
-class TactileError(Exception):
-    """The sensor can't be used: port missing, busy, silent, or a grid of another size."""
-
-
 class TactileSensor(Protocol):
     """The pressure grid under one fingertip. Reading runs outside the tick."""
 

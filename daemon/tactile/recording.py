@@ -22,16 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.tactile import tekscan
 from softfinger.daemon.wire.own_files import write_bytes
 
 FloatArray = NDArray[np.float64]
 TRUTHS = ("d", "theta", "force")
 _FULL = 65535
-
-
-class RecordingError(Exception):
-    """The recording can't be used. The message names the file and what is wrong."""
 
 
 @dataclass(frozen=True)

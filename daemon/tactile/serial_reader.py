@@ -20,8 +20,8 @@ import numpy as np
 import serial
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import TactileError
 from softfinger.daemon.loop.clock import Clock
-from softfinger.daemon.tactile.base import TactileError
 from softfinger.daemon.types import Frame
 
 _CHUNK = 65536  # bytes taken at once: all that a Linux tty can hold

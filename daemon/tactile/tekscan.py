@@ -18,6 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import SoftfingerError
+
 _MOST = 1024  # rows or cols
 _LARGEST = 1e12  # of any reading, in its unit
 _LENGTHS = {
@@ -59,7 +61,7 @@ _KEYS = (
 )
 
 
-class TekscanError(ValueError):
+class TekscanError(SoftfingerError, ValueError):
     """The text is no such export. The message names the line."""
 
 

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import msgpack
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.gateway.link import Ask, Link
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
@@ -23,10 +24,6 @@ PASSED = "came while the daemon stood still or was starting, or before a stop; s
 _BEGUN_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
 _A_TICK = 2  # commands carried out at one, a stop not counted
 _VALUES = (str, int, float)  # and bool, which is an int
-
-
-class Refused(Exception):
-    """A command that is not carried out. The message is what the client is told."""
 
 
 class Local(Protocol):

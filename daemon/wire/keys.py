@@ -27,6 +27,8 @@ from typing import Any
 import zmq
 import zmq.utils.z85
 
+from softfinger.daemon.errors import KeyFileError
+
 LOCAL = "local"  # the client that every folder of keys has
 DOMAIN = b"softfinger"
 HANDSHAKE = 2000  # ms in which a client has to have shown who it is
@@ -35,10 +37,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _KEY = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"]*)"\s*$', re.MULTILINE)
 _LENGTH = 40  # characters of a key in Z85
 _LARGEST = 65_536  # bytes of a key file
-
-
-class KeyFileError(ValueError):
-    """Keys can't be made or read. The message says which file, and what mends it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from typing import Any
 
 import msgpack
 
-from softfinger.daemon.wire.sockets import AddressError
+from softfinger.daemon.errors import AddressError
 
 _ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
 _LONGEST = 4096  # bytes

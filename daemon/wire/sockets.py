@@ -13,13 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.errors import AddressError
+
 _INFO = struct.Struct("=24xI")  # struct tcp_info, of a listener: connections that wait
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _BACKLOG = 1024  # connections that wait to be accepted; the system may allow less
-
-
-class AddressError(Exception):
-    """A socket can't be bound: the address is in use or can't be had."""
 
 
 class IpcFile:

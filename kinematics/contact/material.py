@@ -16,6 +16,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.closed_form import flatten
 
@@ -92,7 +93,7 @@ def _energy_densities(energy_law: FloatArray, strain: FloatArray, out: FloatArra
         out[i] = energy_density_at(energy_law, strain[i])
 
 
-class MaterialError(ValueError):
+class MaterialError(SoftfingerError, ValueError):
     """The data make no usable stress-strain law. The message says what is wrong and where."""
 
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger import SoftfingerError
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import (
     FORM,
@@ -37,7 +38,7 @@ __all__ = ["Certificate", "Contact", "ContactTable", "TableError", "lookup", "lo
 FloatArray = NDArray[np.float64]
 
 
-class TableError(Exception):
+class TableError(SoftfingerError):
     """A table can't be built to the tolerance, or a file holds no sound table of this kind."""
 
 

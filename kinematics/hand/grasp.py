@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable, lookup
@@ -36,7 +37,7 @@ _ITERATIONS = 60
 _MOMENT_NODES = 48  # exponential convergence: 1e-10 and better up to d = 0.9 a
 
 
-class GraspError(ValueError):
+class GraspError(SoftfingerError, ValueError):
     """No such grasp: a contact opens, leaves the tip's range, or no balance is found."""
 
 

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger import SoftfingerError
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
@@ -32,7 +33,7 @@ _LEAST_TILT = math.radians(3.0)  # tilts that differ by less tell no direction
 _UPRIGHT = math.radians(0.5)
 
 
-class CalibrationError(ValueError):
+class CalibrationError(SoftfingerError, ValueError):
     """The data don't determine what is asked for. The message says what is missing or wrong."""
 
 

@@ -23,11 +23,12 @@ import msgpack
 import zmq
 
 from softfinger.daemon.control.modes import COMMANDS
+from softfinger.daemon.errors import Refused, SettingsError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception.calibration_file import CalibrationFileError, load_calibration
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.profile.settings import Settings, SettingsError
-from softfinger.daemon.wire.command_server import Refused, decode
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.command_server import decode
 from tests.harness.gateway import Served
 
 ROOT = Path(__file__).parents[2]

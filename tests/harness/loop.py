@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.wire.command_server import Refused
 
 Make = Callable[..., Daemon]
 

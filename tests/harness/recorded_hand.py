@@ -9,9 +9,10 @@ from typing import Any
 
 import msgpack
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon, facts
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.wire.command_server import Handler, Refused
+from softfinger.daemon.wire.command_server import Handler
 from softfinger.tools.recordings.writer import RecordingWriter
 
 Messages = list[tuple[bytes, dict[str, Any]]]

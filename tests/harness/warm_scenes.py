@@ -16,6 +16,7 @@ from typing import Any
 
 from numba.core import event
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
@@ -26,7 +27,6 @@ from softfinger.daemon.perception.calibration_file import (
 )
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import Refused
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SCENES: dict[str, dict[str, Any]] = {

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from softfinger import Fingertip, Material, SensorGrid
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
 from softfinger.daemon.wire import messages
 from softfinger.tools.analysis.contacts import analyse, write_csv
 from softfinger.tools.analysis.sources import open_source
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.daemon_process import softfinger
 

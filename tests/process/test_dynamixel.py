@@ -18,11 +18,11 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import port as port_module
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.checks import check_latency, check_servo
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.groups import GroupRead

@@ -16,6 +16,7 @@ import pytest
 
 from softfinger.daemon.client import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway import link
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -23,7 +24,6 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import TOPICS, Publisher
-from softfinger.daemon.wire.sockets import AddressError
 from tests.conftest import until
 from tests.harness.daemon_process import Running, softfinger
 from tests.harness.zmtp_client import RawClient

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.diagnosis import hand
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import mend as mending
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.identity import plan
 from softfinger.daemon.servos.mend import mend
 from softfinger.daemon.servos.models import by_name

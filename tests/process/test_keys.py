@@ -15,7 +15,8 @@ import zmq.auth
 
 from softfinger.daemon.client import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
-from softfinger.daemon.wire.keys import KeyFileError, load_client, load_server, make_keys
+from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import until
 from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
 from tests.harness.gateway import Served

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import pytest
 
 from softfinger.daemon.client import AsyncHand, Hand, NoStream
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire.keys import make_keys
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.republish import Wire
 from tests.conftest import own_addresses, until

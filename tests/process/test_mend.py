@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import mend as mending
 from softfinger.daemon.servos import registers as reg
 from softfinger.daemon.servos import scanning
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.mend import mend
 from softfinger.daemon.servos.scanning import FoundServo, scan

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import registers as reg
 from softfinger.daemon.simulation.emulator.emulator import Emulator
-from softfinger.daemon.wire.command_server import Refused
 from tests.conftest import until
 
 

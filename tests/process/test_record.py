@@ -20,8 +20,8 @@ import pytest
 import zmq
 
 from softfinger.daemon.client import Hand
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import messages, schema
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recover import recover
 from softfinger.tools.recordings.writer import RecordingWriter

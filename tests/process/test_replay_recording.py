@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import zmq
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.types import Frame
 from softfinger.daemon.wire import messages
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import Comparison, recompute
 from softfinger.tools.recordings.writer import RecordingWriter

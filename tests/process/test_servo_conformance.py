@@ -11,18 +11,18 @@ from typing import Any, Protocol
 
 import pytest
 
+from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.clock import Clock, VirtualClock
 from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import make_servos
 from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.base import ServoError, Servos
+from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.modes import NUMBERS, current_toward
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.physics.hand import SimulatedHand
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
-from softfinger.daemon.wire.command_server import Refused
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable

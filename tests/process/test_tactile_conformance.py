@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.errors import TactileError
 from softfinger.daemon.types import Frame
 from tests.harness.tactile import BACKENDS, COLS, ROWS, SERIAL, Rig, image
 

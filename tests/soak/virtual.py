@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 
 from softfinger.daemon.control.modes import COMMANDS, Mode
+from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.types import Frame, Goal, Reading
-from softfinger.daemon.wire.command_server import Refused
 
 TICKS = 10_000_000
 _GRIPPING = ("grasping", "holding", "rotating")

@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.errors import AddressError, Refused
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import Refused, decode
-from softfinger.daemon.wire.sockets import AddressError
+from softfinger.daemon.wire.command_server import decode
 from tests.conftest import until
 from tests.harness.gateway import Served
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.setpoint import Reference
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import Refused
 from softfinger.tools.benchmarks.control_rig import Watched
 
 PAPER: dict[str, dict[str, Any]] = {

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
-from softfinger.daemon.wire.command_server import Refused
 from softfinger.daemon.wire.messages import Parts, pack, state_message
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
 

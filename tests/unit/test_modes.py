@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.control.modes import COMMANDS, Command, Lease, Mode, parse
-from softfinger.daemon.wire.command_server import Refused
+from softfinger.daemon.errors import Refused
 
 
 def heard(mode: Mode) -> set[str]:

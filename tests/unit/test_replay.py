@@ -5,16 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.tactile.base import TactileError
-from softfinger.daemon.tactile.recording import (
-    Recording,
-    RecordingError,
-    load_recording,
-    save_recording,
-)
+from softfinger.daemon.tactile.recording import Recording, load_recording, save_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
 
 FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)

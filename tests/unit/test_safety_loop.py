@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.types import Frame
-from softfinger.daemon.wire.command_server import Refused
 
 Make = Callable[..., "Hand"]
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.control.task import Task
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Reading
-from softfinger.daemon.wire.command_server import Refused
 from softfinger.daemon.wire.messages import Parts, state_message
 from tests.harness.loop import Make, advance_to, command, grasped
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.profile.settings import Settings
 
 CONFIG = Path(__file__).parents[2] / "config"
 

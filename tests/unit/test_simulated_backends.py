@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.profile.factory import make_estimator, make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import make_servos
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.hand import SimulatedHand
 from softfinger.daemon.tactile import make_sensor

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile import table_files
 from softfinger.daemon.profile.factory import make_table
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.table_files import load_or_build, load_table, save_table, table_file
 from softfinger.kinematics.contact.table import TableError
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softfinger.daemon.tactile.recording import RecordingError, load_recording
+from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.tactile.recording import load_recording
 from softfinger.daemon.tactile.tekscan import TekscanError, parse
 
 EXPORT = """\

@@ -9,11 +9,10 @@ import msgpack
 import pytest
 import zmq
 
+from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import ServoError
 from softfinger.daemon.types import Reading
-from softfinger.daemon.wire.command_server import Refused
 from tests.conftest import until
 from tests.harness.gateway import Served
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of

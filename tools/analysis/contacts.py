@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.tactile.given import GivenFrames
 from softfinger.daemon.types import FINGERS, Contact, Frame
 from softfinger.daemon.wire.own_files import write_text
 from softfinger.tools.analysis.sources import Progress, Source
-from softfinger.tools.recordings.errors import RecordingError
 
 FloatArray = NDArray[np.float64]
 

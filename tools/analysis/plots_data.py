@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
 from softfinger.daemon.loop.process_replay import with_calibrations
 from softfinger.daemon.profile.factory import FingerModel, make_models
-from softfinger.daemon.profile.settings import Settings, SettingsError
-from softfinger.daemon.tactile.base import TactileError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import messages
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recorded_settings
 
@@ -47,7 +46,7 @@ _TRUE_OBJECT = ("angle",)
 _GAP = 0.1  # s without a state, at least, over which no line is drawn
 
 
-class Missing(Exception):
+class Missing(SoftfingerError):
     """What a picture needs is not in the recording. The message says what."""
 
 

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.factory import FingerModel, make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.recording import load_recording
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import messages
 from softfinger.tools.arguments import teller
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 
 Counts = NDArray[np.uint16]

@@ -14,8 +14,8 @@ import time
 from collections.abc import Iterator
 from unittest import mock
 
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.wire.command_server import Refused
 from softfinger.tools.benchmarks.faults_rig import Rig, RigError, stopped
 from softfinger.tools.benchmarks.faults_trials import Trial, judge_wire
 

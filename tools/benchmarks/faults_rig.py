@@ -20,6 +20,7 @@ import msgpack
 import zmq
 
 from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
 from softfinger.daemon.wire.messages import STATE
@@ -32,7 +33,7 @@ _LOOK = 0.003  # s between two looks at the hand
 _SCHEDSTAT = 80  # bytes
 
 
-class RigError(Exception):
+class RigError(SoftfingerError):
     """The set-up itself does not work: nothing was measured."""
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire.own_files import write_bytes
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ _SETTINGS: dict[Any, Any] = {
 }
 
 
-class NoMatplotlib(Exception):
+class NoMatplotlib(SoftfingerError):
     """matplotlib is not installed. The message says what to install."""
 
     def __init__(self) -> None:

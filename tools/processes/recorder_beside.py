@@ -17,11 +17,13 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
+from softfinger.daemon.errors import SoftfingerError
+
 _PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
 _LOOK = 0.01  # s
 
 
-class NoRecorder(Exception):
+class NoRecorder(SoftfingerError):
     """The recorder did not come up. The message says what it said."""
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-
-class RecordingError(Exception):
-    """The recording can't be written or read. The message names the file and what is wrong."""
+from softfinger.daemon.errors import RecordingError
 
 
 class NoMcap(RecordingError):

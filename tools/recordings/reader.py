@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softfinger.tools.recordings.errors import RecordingError, require_packages
+from softfinger.daemon.errors import RecordingError
+from softfinger.tools.recordings.errors import require_packages
 from softfinger.tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:

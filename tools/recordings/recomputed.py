@@ -12,11 +12,11 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.loop.process_replay import Recomputation
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import messages
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 
 # What depends on the machine and the moment, and not on what the loop took in.

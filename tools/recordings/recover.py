@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from softfinger.tools.recordings.errors import RecordingError
+from softfinger.daemon.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.writer import RecordingWriter
 

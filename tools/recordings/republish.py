@@ -6,13 +6,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from softfinger.daemon.errors import AddressError, RecordingError
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.validation import address_fault
 from softfinger.daemon.wire import messages
 from softfinger.daemon.wire.publisher import TOPICS
-from softfinger.daemon.wire.sockets import AddressError
-from softfinger.tools.recordings.errors import RecordingError
 
 _QUEUE = 10_000  # messages that wait for a subscriber; what it does not take by then it misses
 _PATIENCE = 1.0  # s for the gateway to take a message

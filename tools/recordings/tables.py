@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import messages, schema
 from softfinger.daemon.wire.own_files import write_bytes, write_text
-from softfinger.tools.recordings.errors import RecordingError
 from softfinger.tools.recordings.reader import Recording
 
 BLOCK = 2000  # rows

@@ -10,9 +10,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import messages
 from softfinger.tools.recordings.container import Container
-from softfinger.tools.recordings.errors import RecordingError, require_packages
+from softfinger.tools.recordings.errors import require_packages
 from softfinger.tools.recordings.layout import (
     ENCODING,
     LIBRARY,

@@ -19,6 +19,7 @@ from rich.color import ColorSystem
 from rich.console import Console
 from rich.segment import Segment
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.heatmap import Depth
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, pastes marked
@@ -40,7 +41,7 @@ _SEQUENCES = {
 _PASTE, _PASTE_END = b"\x1b[200~", b"\x1b[201~"
 
 
-class TerminalGone(Exception):
+class TerminalGone(SoftfingerError):
     """The terminal can't be written to any more, or a signal ended a write that was stuck."""
 
 

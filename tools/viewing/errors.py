@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from softfinger.daemon.errors import SoftfingerError
 
-class ViewError(Exception):
+
+class ViewError(SoftfingerError):
     """Nothing can be shown. The message says why, and what to do."""
 
 

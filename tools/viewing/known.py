@@ -12,8 +12,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_material, make_tip
-from softfinger.daemon.profile.settings import Settings, SettingsError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable, TableError
 from softfinger.kinematics.hand.geometry import HandGeometry

@@ -13,6 +13,7 @@ import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.simulation.emulator.link_folder import FolderError
 
 NAME = "control"
@@ -21,7 +22,7 @@ _CLIENTS = 8  # at a time
 _PATIENCE = 2.0  # s that a client waits for its reply
 
 
-class NoEmulator(Exception):
+class NoEmulator(SoftfingerError):
     """No emulator runs in that folder, or it does not answer."""
 
 

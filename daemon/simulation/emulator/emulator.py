@@ -18,6 +18,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.simulation.emulator.control_port import ControlPort
@@ -46,7 +47,7 @@ DEFAULT_BOARD = {
 }
 
 
-class EmulatorError(Exception):
+class EmulatorError(SoftfingerError):
     """The stand-in hand can't be set up. The message says why, and what mends it."""
 
 

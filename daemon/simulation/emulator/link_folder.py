@@ -7,13 +7,14 @@ import fcntl
 import os
 from pathlib import Path
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire.own_files import require_own
 
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"
 
 
-class FolderError(Exception):
+class FolderError(SoftfingerError):
     """The folder can't be used. The message says why, and what mends it."""
 
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, fields
 
+from softfinger.daemon.errors import SoftfingerError
+
 LATE = 0.010  # s that a late reply is late by
 
 
-class FaultError(ValueError):
+class FaultError(SoftfingerError, ValueError):
     """A fault that can't be understood. The message says what is known."""
 
 
