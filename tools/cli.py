@@ -11,6 +11,8 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from softfinger import __version__
+
 SUBCOMMANDS = {
     "run": "run the daemon; without a config, on the built-in simulated hand",
     "emulate": "a stand-in hand in a process of its own: servos and tactile boards on ptys",
@@ -52,13 +54,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["help"]:
+        words = [*words[1:2], "--help"]
     parser = argparse.ArgumentParser(
         prog="softfinger",
         description="Two rotational fingers with soft tips: daemon and tools.",
+        epilog="softfinger help SUBCOMMAND tells more of one. To begin: softfinger run --monitor",
     )
+    parser.add_argument("--version", action="version", version=f"softfinger {__version__}")
     # Only the subcommand that is called is imported, for its arguments and for its work.
     called = next((word for word in words if word in SUBCOMMANDS), None)
-    subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
+    subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND")
     module = None
     for name, text in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(name, help=text, description=text)
@@ -66,7 +72,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             module = importlib.import_module(f"softfinger.tools.{name.replace('-', '_')}")
             module.add_arguments(subparser)
     arguments = parser.parse_args(words)
-    assert module is not None  # argparse has refused everything else
+    if module is None:  # no words at all: argparse has refused everything else
+        parser.print_help()
+        return 0
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         status: int = module.run(arguments)

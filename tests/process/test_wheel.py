@@ -1,0 +1,76 @@
+"""The wheel: one package, whole, whatever else the environment and the current folder hold."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+_FOREIGN = 'raise ImportError("a package of somebody else, imported in the place of ours")\n'
+_PUBLIC = """
+import sys
+from softfinger import AsyncHand, Hand
+loaded = [name for name in sys.modules if name.startswith(("numba", "softfinger.daemon.loop"))]
+assert not loaded, loaded
+from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
+tip, material = Fingertip(radius=0.020), Material.constant(0.304e6)
+assert SensorGrid(rows=8, cols=8, pitch=0.005).pressure(tip, material, 0.004, 0.1, 0.0).max() > 1e3
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in ("config", "daemon", "kinematics", "softfinger", "tools"):
+        shutil.copytree(
+            ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    for name in ("LICENSE", "README.md", "pyproject.toml"):
+        shutil.copy(ROOT / name, source)
+    words = ("wheel", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", str(folder))
+    subprocess.run(
+        [sys.executable, "-m", "pip", *words, str(source)], check=True, capture_output=True
+    )
+    (built,) = folder.glob("softfinger-*.whl")
+    return built
+
+
+def test_it_holds_one_package_with_all_its_data(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"softfinger"}
+    for rooms in ("daemon", "kinematics", "tools"):
+        for module in (ROOT / rooms).rglob("*.py"):
+            assert f"softfinger/{module.relative_to(ROOT)}" in names
+    for profile in (ROOT / "config").glob("*.toml"):
+        assert f"softfinger/config/{profile.name}" in names
+    assert {"softfinger/py.typed", "softfinger/daemon/wire/STREAM.md"} <= names
+    assert not any(name.startswith("softfinger/tests") for name in names)
+
+
+def test_folders_of_the_same_names_are_in_nobodys_way(wheel: Path, tmp_path: Path) -> None:
+    site, here = tmp_path / "site", tmp_path / "here"
+    zipfile.ZipFile(wheel).extractall(site)
+    for folder in (site / "daemon", here / "tools", here / "daemon", here / "config"):
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").write_text(_FOREIGN, encoding="utf-8")
+
+    def run(*words: str) -> str:
+        environment = {**os.environ, "PYTHONPATH": str(site)}
+        done = subprocess.run(
+            [sys.executable, *words], cwd=here, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run("-c", "import softfinger; print(softfinger.__file__)").startswith(str(site))
+    run("-c", _PUBLIC)
+    assert run("-m", "softfinger", "--version").startswith("softfinger ")
+    assert "tip.force" in run("-m", "softfinger", "limits")
