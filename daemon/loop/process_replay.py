@@ -20,7 +20,7 @@ from softfinger.daemon.perception.contact_filter import Prediction
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings, Task
-from softfinger.daemon.tactile.given import GivenFrames
+from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
 from softfinger.daemon.wire.command_server import Handler
 

@@ -7,8 +7,8 @@ What a board's firmware has to do, at any baud (USB boards may ignore it), for e
    ======  ====== =====================================================================
    offset  type   what
    ======  ====== =====================================================================
-   0       uint8  bytes a count: 1 (uint8 counts) or 2 (uint16 counts)
-   1       uint8  0, kept for later
+   0       uint8  bytes per count: 1 (uint8 counts) or 2 (uint16 counts)
+   1       uint8  0, reserved
    2       uint16 sequence number: one more each scan, 0 after 65535, also for scans not sent
    4       uint32 the board's clock at the middle of the scan [µs]; wraps at 2³²
    8       uint16 rows
@@ -31,9 +31,9 @@ What a board's firmware has to do, at any baud (USB boards may ignore it), for e
 4. Send a zero byte. One more before the first frame does no harm.
 
 A 44 × 44 frame of uint16 is 3903 bytes on the wire at most. `encode` is the reference. A reader
-that comes in the middle is in step at the next zero byte; a torn or flipped frame is dropped (the
-CRC sees every error of up to 16 adjacent bits, and all but 1 in 65536 of the others); frames that
-never came are told by the sequence number.
+that starts in the middle is in step at the next zero byte; a torn or damaged frame is dropped (the
+CRC detects every error of up to 16 adjacent bits, and all but 1 in 65536 of the others); gaps in
+the sequence numbers count the frames that never came.
 """
 
 from __future__ import annotations
@@ -44,16 +44,15 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.loop.clock import Clock
-from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile.cobs_packet import BAD_CRC, CRC_START, crc_tables, unpack
-from softfinger.daemon.tactile.delimited import DelimitedDecoder
-from softfinger.daemon.tactile.serial_reader import Decoded, SerialReader
+from softfinger.daemon.tactile.decoder import Decoded, DelimitedDecoder
+from softfinger.daemon.tactile.serial_reader import SerialReader
+from softfinger.kinematics.compiled.kernel import kernel
 
 _HEADER = struct.Struct("<BBHIHH")
-_CRC = 2
+_CRC = struct.Struct("<H")
+_CRC_START = 0xFFFF
 _TICK = 1e-6  # s of the board's clock
-_BLOCK = 254
+_BLOCK = 254  # bytes that a COBS code can announce
 
 
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
@@ -67,7 +66,7 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
     kind = counts.dtype.itemsize
     message = _HEADER.pack(kind, 0, seq & 0xFFFF, ticks, *counts.shape)
     message += counts.astype(f"<u{kind}").tobytes()
-    message += binascii.crc_hqx(message, CRC_START).to_bytes(_CRC, "little")
+    message += _CRC.pack(binascii.crc_hqx(message, _CRC_START))
     parts = []
     pieces = message.split(b"\0")
     for number, piece in enumerate(pieces):
@@ -83,64 +82,81 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
 
 def longest_frame(rows: int, cols: int) -> int:
     """Bytes on the wire of a uint16 frame at most, with the delimiter."""
-    message = _HEADER.size + 2 * rows * cols + _CRC
+    message = _HEADER.size + 2 * rows * cols + _CRC.size
     return message + 1 + message // _BLOCK + 1
 
 
+@kernel
+def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
+    """Undo COBS: write the message of ``packet``, which holds no zero byte, into ``out``.
+
+    ``out`` needs the packet's length. Returns the message's, or -1 where the packet ends within a
+    block.
+    """
+    code = _BLOCK + 1  # of the block at work
+    left = 0  # bytes of it still to come
+    size = 0
+    for value in packet:
+        if left > 0:
+            out[size] = value
+            size += 1
+            left -= 1
+            continue
+        if code <= _BLOCK:
+            out[size] = 0
+            size += 1
+        code = int(value)
+        left = code - 1
+    return size if left == 0 else -1
+
+
 class CobsDecoder(DelimitedDecoder):
-    """Bytes of a COBS stream in, frames of counts with number and board's time out."""
+    """Bytes of our framing in, frames of counts with number and board's time out."""
 
     def __init__(self, rows: int, cols: int) -> None:
-        super().__init__(rows, cols, 0, longest_frame(rows, cols))
-        self._tables = crc_tables()
-        self._scratch = np.zeros(self.longest, np.uint8)
+        super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
+        self._message = np.zeros(self.longest, np.uint8)
         # Compiled here, and not when the first frame comes.
-        unpack(np.frombuffer(bytearray(8), np.uint8), self._tables, self._scratch)
-        self._reason = ""
+        unstuff(np.frombuffer(bytearray(1), np.uint8), self._message)
         self._bad_crc = 0
         self._missed = 0
         self._seq: int | None = None
-        self._steps = 1
         self._ticks = 0
-        self._turns = 0  # of the board's clock
+        self._wraps = 0  # of the board's clock
 
-    def parse(self, packet: bytearray) -> NDArray[np.uint16] | None:
-        """As :meth:`DelimitedDecoder.parse`."""
+    def parse(self, packet: bytearray, t: float) -> Decoded | None:
+        """As :meth:`DelimitedDecoder.parse`, with the board's own number and time."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None
-        size = unpack(np.frombuffer(packet, np.uint8), self._tables, self._scratch)
+        size = unstuff(np.frombuffer(packet, np.uint8), self._message) - _CRC.size
         if size < _HEADER.size:
-            self._bad_crc += size == BAD_CRC
-            self._reason = "packets whose CRC is wrong" if size == BAD_CRC else "packets not COBS"
+            self._reason = "packets too short or not COBS"
             return None
-        kind, kept, seq, ticks, rows, cols = _HEADER.unpack_from(self._scratch.data)
-        if kind not in (1, 2) or kept != 0:
-            self._reason = f"packets of kind {kind}.{kept}, which this version doesn't know"
+        message = self._message.data
+        if binascii.crc_hqx(message[:size], _CRC_START) != _CRC.unpack_from(message, size)[0]:
+            self._bad_crc += 1
+            self._reason = "packets whose CRC is wrong"
+            return None
+        kind, version, seq, ticks, rows, cols = _HEADER.unpack_from(message)
+        if kind not in (1, 2) or version != 0:
+            self._reason = f"packets of kind {kind}.{version}, which this version doesn't know"
             return None
         if (rows, cols) != (self.rows, self.cols) or size != _HEADER.size + kind * rows * cols:
             self._reason = f"frames of {rows} × {cols} cells in {size} bytes"
             return None
-        self._steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
-        if self._steps > 32768:  # it went back: the board started anew
-            self._steps = 1
-        self._missed += self._steps - 1
+        steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
+        if steps > 32768:  # it went back: the board restarted
+            steps = 1
+        self._missed += steps - 1
         self._seq = seq
-        # The clock wrapped, or the board started anew, which its reader notices.
-        self._turns += ticks < self._ticks
+        # The clock wrapped, or the board restarted, which SensorClock notices.
+        self._wraps += ticks < self._ticks
         self._ticks = ticks
-        raw = self._scratch[_HEADER.size : size]
-        counts = raw if kind == 1 else raw.view("<u2")
-        return counts.astype(np.uint16).reshape(rows, cols)
-
-    def decoded(self, counts: NDArray[np.uint16], t: float) -> Decoded:
-        """As :meth:`DelimitedDecoder.decoded`, with the board's own number and time."""
-        t_sensor = (self._turns * 2.0**32 + self._ticks) * _TICK
-        return Decoded(counts, t, self._steps, t_sensor)
-
-    def reason(self) -> str:
-        """As :meth:`DelimitedDecoder.reason`."""
-        return self._reason
+        cells = self._message[_HEADER.size : size]
+        counts = (cells if kind == 1 else cells.view("<u2")).astype(np.uint16)
+        t_sensor = (self._wraps * 2.0**32 + ticks) * _TICK
+        return Decoded(counts.reshape(rows, cols), t, steps, t_sensor)
 
     def counters(self) -> dict[str, int]:
         """Besides the usual ones ``bad_crc``, and ``missed``: frames that never came."""
@@ -150,17 +166,6 @@ class CobsDecoder(DelimitedDecoder):
 class Cobs(SerialReader):
     """A board with our framing under one fingertip."""
 
-    def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """``finger`` 0 is the left one; it chooses the port."""
-
-        def make_decoder() -> CobsDecoder:
-            return CobsDecoder(settings.rows, settings.cols)
-
-        super().__init__(
-            settings.port[finger],
-            settings.baud,
-            make_decoder,
-            clock,
-            latency=settings.latency,
-            open_timeout=settings.open_timeout,
-        )
+    def make_decoder(self) -> CobsDecoder:
+        """As :meth:`SerialReader.make_decoder`."""
+        return CobsDecoder(self.settings.rows, self.settings.cols)

@@ -12,62 +12,51 @@ from typing import Literal
 
 import numpy as np
 
-from softfinger.daemon.loop.clock import Clock
-from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, Decoded, SerialReader
+from softfinger.daemon.tactile.decoder import Decoded, Decoder
+from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
 _LEVELS = 12  # frames that a search may look back on before it drops the oldest
-_LOST_AFTER = 10  # frames' worth of bytes without a frame
 _MARKERS_KEPT = 96  # for recognising a grid of another size
 _GAP = 1e-3  # s; a line quiet for longer has gaps between frames
 _SMALLEST_GRID = 16  # cells; closer markers are an image's own pattern
 
 
-class FlexiTacDecoder:
-    """Bytes of a FlexiTac stream in, frames out. Pure and incremental.
+class FlexiTacDecoder(Decoder):
+    """Bytes of a FlexiTac stream in, frames out.
 
     *Lock.* Nothing tells a marker from two counts ``AA 55`` but its place. So the search asks for
     two markers one frame apart, and as long as other ``AA 55`` between them recur at that distance
-    too it waits for more frames, until only one place is left. An image that stands still to the
-    last bit and contains ``AA 55`` can't be locked on: it is counted as ``ambiguous``, never
-    guessed.
+    too it waits for more frames, until only one place is left. An image that is constant to the
+    last bit and contains ``AA 55`` can't be locked on: it is counted as ``ambiguous``.
 
     *Hold.* Once locked, a frame is handed over when the next marker stands where it must, which
-    tells that no byte of the frame was lost. On a line with gaps between frames that would cost a
-    frame's period. There a whole frame is handed over at once if it is no splice of a torn frame
-    and the next one: its counts contain no ``AA 55``, and it came in the time its bytes take. Else
-    it waits for the next marker, or for ``settle``, which says that the line is quiet.
+    proves that no byte of the frame was lost. On a line with gaps between frames that would cost a
+    frame's period. There a whole frame is handed over at once if it can't be spliced from a torn
+    frame and the next one: its counts contain no ``AA 55``, and it came in the time its bytes take.
+    Else it waits for the next marker, or for ``settle``.
 
     *Loss.* A marker that isn't where it must be drops the frame before it and starts the search
-    anew. Every byte fed is part of a frame, counted as skipped, or still held.
+    anew.
     """
 
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
         """``byte_time`` [s]: what a byte takes on the wire."""
-        self.rows = rows
-        self.cols = cols
-        self.frame_bytes = len(MARKER) + rows * cols
+        super().__init__(rows, cols, len(MARKER) + rows * cols)
         self._longest = 1.25 * self.frame_bytes * byte_time + _GAP  # s for one frame's bytes
         self._t_whole = -math.inf  # when the last frame handed over was whole
-        self._buffer = bytearray()
         self._start = 0  # place of the buffer's first byte in the stream
-        self._locked = False
         # Where in the stream each piece in the buffer ended, and when it was read.
         self._pieces: deque[tuple[int, float]] = deque()
-        self._frames = 0
-        self._resyncs = 0
-        self._skipped = 0
         self._ambiguous = 0
-        self._skipped_at_frame = 0
         self._markers: deque[int] = deque(maxlen=_MARKERS_KEPT)  # places in the stream, no lock
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """Take the next bytes, read at time ``t`` [s]; the newest frame that they completed."""
+        """As :meth:`Decoder.feed`."""
         self._buffer += data
         self._pieces.append((self._start + len(self._buffer), t))
         newest = None
-        while self._locked or self._search():
+        while self.locked or self._search():
             if self._misplaced(0) or self._misplaced(self.frame_bytes):
                 self._lose()
             elif len(self._buffer) >= self.frame_bytes + len(MARKER):
@@ -79,30 +68,13 @@ class FlexiTacDecoder:
         return newest
 
     def settle(self) -> Decoded | None:
-        """The line is quiet: hand over a held frame, unless its counts could hide a marker."""
+        """As :meth:`Decoder.settle`; None while the counts could hide a marker."""
         return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
     def pending(self) -> bool:
-        """A whole frame waits for the marker after it."""
-        return self._locked and len(self._buffer) >= self.frame_bytes
-
-    @property
-    def missing(self) -> int:
-        """Bytes until the frame in hand is whole; 0 before its first byte and without a lock."""
-        held = len(self._buffer)
-        return max(self.frame_bytes - held, 0) if self._locked and held else 0
-
-    @property
-    def locked(self) -> bool:
-        """The frames' place in the stream is known."""
-        return self._locked
-
-    @property
-    def lost(self) -> bool:
-        """No frame within the last ten frames' worth of bytes."""
-        behind = self._skipped - self._skipped_at_frame + len(self._buffer)
-        return behind > _LOST_AFTER * self.frame_bytes
+        """As :attr:`Decoder.pending`."""
+        return self.locked and len(self._buffer) >= self.frame_bytes
 
     @property
     def found_cells(self) -> int:
@@ -124,17 +96,12 @@ class FlexiTacDecoder:
         return spacing - len(MARKER) if spacing not in (0, self.frame_bytes) else 0
 
     def counters(self) -> dict[str, int]:
-        """``frames``, ``resyncs`` (losses of the lock), ``skipped_bytes``, ``ambiguous``."""
-        return {
-            "frames": self._frames,
-            "resyncs": self._resyncs,
-            "skipped_bytes": self._skipped,
-            "ambiguous": self._ambiguous,
-        }
+        """Besides the usual ones ``ambiguous``: searches that no place of the marker decided."""
+        return {**super().counters(), "ambiguous": self._ambiguous}
 
     def diagnosis(self) -> str:
-        """What is wrong with a stream that gives no frames, in one line."""
-        expected = f"{self.rows} × {self.cols} = {self.rows * self.cols} cells"
+        """As :meth:`Decoder.diagnosis`."""
+        expected = self._grid()
         found = self.found_cells
         if found:
             side = round(found**0.5)
@@ -160,7 +127,7 @@ class FlexiTacDecoder:
             if verdict == "undecided":
                 return False
             if verdict == "yes":
-                self._locked = True
+                self.locked = True
                 self._markers.clear()
                 return True
             if verdict == "no":
@@ -229,7 +196,7 @@ class FlexiTacDecoder:
         return Decoded(data.reshape(self.rows, self.cols), self._t_whole, behind=read_to - end)
 
     def _lose(self) -> None:
-        self._locked = False
+        self.locked = False
         self._resyncs += 1
         if self._buffer.startswith(MARKER):  # of a torn frame
             self._note(0)
@@ -255,17 +222,7 @@ class FlexiTacDecoder:
 class FlexiTac(SerialReader):
     """The FlexiTac board under one fingertip."""
 
-    def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """``finger`` 0 is the left one; it chooses the port."""
-
-        def make_decoder() -> FlexiTacDecoder:
-            return FlexiTacDecoder(settings.rows, settings.cols, BITS_PER_BYTE / settings.baud)
-
-        super().__init__(
-            settings.port[finger],
-            settings.baud,
-            make_decoder,
-            clock,
-            latency=settings.latency,
-            open_timeout=settings.open_timeout,
-        )
+    def make_decoder(self) -> FlexiTacDecoder:
+        """As :meth:`SerialReader.make_decoder`."""
+        settings = self.settings
+        return FlexiTacDecoder(settings.rows, settings.cols, BITS_PER_BYTE / settings.baud)

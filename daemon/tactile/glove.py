@@ -12,29 +12,22 @@ Boards with a 12-bit converter send the same with 6 bits in each half; ``tactile
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from softfinger.daemon.loop.clock import Clock
-from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile.delimited import DelimitedDecoder
+from softfinger.daemon.tactile.decoder import Decoded, DelimitedDecoder
 from softfinger.daemon.tactile.serial_reader import SerialReader
 
-REQUEST = b"a"
-_NEWLINE = 10
 _OFFSET = 11
 _BITS = 5  # of each half of a count
-_PATIENCE = 0.1  # s over a frame's time on the wire until the board is asked again
 
 
 class GloveDecoder(DelimitedDecoder):
     """Bytes of a glove-style board in, frames of counts with twice ``bits`` bits out."""
 
     def __init__(self, rows: int = 32, cols: int = 32, bits: int = _BITS) -> None:
+        super().__init__(rows, cols, b"\n", 2 + 2 * rows * cols)
         self._values = 1 << bits  # of each half
-        super().__init__(rows, cols, _NEWLINE, 2 + 2 * rows * cols)
-        self._reason = ""
 
-    def parse(self, packet: bytearray) -> NDArray[np.uint16] | None:
+    def parse(self, packet: bytearray, t: float) -> Decoded | None:
         """As :meth:`DelimitedDecoder.parse`."""
         if len(packet) != self.longest - 1:
             cells = (len(packet) - 1) // 2
@@ -43,16 +36,12 @@ class GloveDecoder(DelimitedDecoder):
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
         # Bytes below the offset wrap round to large ones.
         if packet[0] < _OFFSET or halves.max() >= self._values:
-            self._reason = "a byte that stands for no half of a count (tactile.full_count = 4095?)"
+            self._reason = "a byte that is no half of a count (tactile.full_count = 4095?)"
             return None
         counts = halves[0::2].astype(np.uint16)
         counts *= self._values
         counts += halves[1::2]
-        return counts.reshape(self.rows, self.cols)
-
-    def reason(self) -> str:
-        """As :meth:`DelimitedDecoder.reason`."""
-        return self._reason
+        return Decoded(counts.reshape(self.rows, self.cols), t)
 
 
 def bits_of(full_count: int) -> int:
@@ -63,19 +52,9 @@ def bits_of(full_count: int) -> int:
 class Glove(SerialReader):
     """The glove-style board under one fingertip, asked for its next frame after each one."""
 
-    def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """``finger`` 0 is the left one; it chooses the port."""
+    request = b"a"
 
-        def make_decoder() -> GloveDecoder:
-            return GloveDecoder(settings.rows, settings.cols, bits_of(settings.full_count))
-
-        super().__init__(
-            settings.port[finger],
-            settings.baud,
-            make_decoder,
-            clock,
-            latency=settings.latency,
-            open_timeout=settings.open_timeout,
-            request=REQUEST,
-            patience=_PATIENCE,
-        )
+    def make_decoder(self) -> GloveDecoder:
+        """As :meth:`SerialReader.make_decoder`."""
+        settings = self.settings
+        return GloveDecoder(settings.rows, settings.cols, bits_of(settings.full_count))

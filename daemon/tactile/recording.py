@@ -1,7 +1,7 @@
-"""Recordings of a tactile sensor: what one is, and its files.
+"""Reads recordings of a tactile sensor from their files:
 
 - ``.npz`` with ``frames`` [n, rows, cols] and optionally ``t`` [n] s, ``live`` [rows, cols] bool,
-  and what was known of the contact at each frame: ``d`` [m], ``theta`` [rad], ``force`` [N], each
+  and the true contact at each frame, where known: ``d`` [m], ``theta`` [rad], ``force`` [N], each
   [n].
 - a folder of ``.npy`` files, in the order of their names with numbers read as numbers, each one
   frame [rows, cols] or several [n, rows, cols]; ``t.npy`` [n] s among them.
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.tactile import tekscan
-from softfinger.daemon.wire.own_files import write_bytes
 
 FloatArray = NDArray[np.float64]
 TRUTHS = ("d", "theta", "force")
@@ -35,14 +34,14 @@ _FULL = 65535
 class Recording:
     """Counts uint16 [n, rows, cols] at times t float64 [n], rising from 0 [s].
 
-    ``live`` [rows, cols] tells the cells there are; ``truths`` what was known, see the module.
+    ``live`` [rows, cols] is False where the sensor has no cell; ``truths`` is the true contact.
     """
 
     counts: NDArray[np.uint16]
     t: FloatArray
     live: NDArray[np.bool_]
     truths: dict[str, FloatArray] = field(default_factory=dict)
-    pitch: tuple[float, float] | None = None  # x and y [m], where the file tells it
+    pitch: tuple[float, float] | None = None  # x and y [m], where the file has it
 
 
 def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recording:
@@ -58,18 +57,6 @@ def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recordin
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise RecordingError(f"{path}: {reason}") from None
-
-
-def save_recording(path: Path, recording: Recording) -> None:
-    """Write a recording as ``.npz``."""
-    with write_bytes(path) as file:
-        np.savez_compressed(
-            file,
-            frames=recording.counts,
-            t=recording.t,
-            live=recording.live,
-            **recording.truths,  # type: ignore[arg-type]
-        )
 
 
 def _folder(path: Path, scale: float, rate: float) -> Recording:

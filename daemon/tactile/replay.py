@@ -1,4 +1,4 @@
-"""A recording in the place of the sensor under one tip. Works with the virtual clock; no thread."""
+"""Recorded frames instead of a sensor's: at their own times, or each set by the caller."""
 
 from __future__ import annotations
 
@@ -16,12 +16,37 @@ from softfinger.daemon.tactile.recording import Recording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
 
+class GivenFrames:
+    """A sensor whose newest frame the caller sets in ``frame``.
+
+    ``live`` [rows, cols] is False where the sensor has no cell; None: it has all.
+    """
+
+    def __init__(self, live: NDArray[np.bool_] | None = None) -> None:
+        self.frame: Frame | None = None
+        self.live = live
+
+    def open(self) -> None:
+        """Nothing to open."""
+
+    def latest(self) -> Frame | None:
+        """The frame that was set last."""
+        return self.frame
+
+    def counters(self) -> dict[str, int]:
+        """None: nothing can go wrong."""
+        return {}
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
 class ReplayTactile:
     """Frames of a recording at its own times, counted from ``open``.
 
-    At its end it starts again, one mean interval after the last frame, or, with
-    ``tactile.replay_again`` false, hands the last frame over once more with ``valid`` False.
-    ``live`` [rows, cols] are the cells that the recording has.
+    After its last frame and one mean interval it starts again, or, with ``tactile.replay_again``
+    false, repeats that frame once with ``valid`` False.
+    ``live`` [rows, cols] is False where the recording has no cell.
     """
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:

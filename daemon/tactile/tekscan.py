@@ -1,4 +1,4 @@
-"""Import of Tekscan-style ASCII exports: text in, pressure frames out. No clock, no files.
+"""Parses Tekscan-style ASCII exports: text in, pressure frames out.
 
 Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
 ``Frame n`` (more may stand behind it) and its rows, cells separated by commas, ``B`` where the
@@ -62,16 +62,16 @@ _KEYS = (
 
 
 class TekscanError(SoftfingerError, ValueError):
-    """The text is no such export. The message names the line."""
+    """The text is no such export; the message names the line."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """What an export holds.
+    """A parsed export.
 
     ``values`` float64 [frames, rows, cols]: Pa, or counts where ``raw``; 0 where ``live`` [rows,
     cols] is False. ``t`` float64 [frames] from the first frame on [s]; ``pitch`` (x, y) [m], NaN
-    where the header doesn't tell. ``header`` has every ``KEY value``, keys spelt right.
+    where the header lacks it. ``header`` has every ``KEY value``, keys spelt right.
     """
 
     values: NDArray[np.float64]
@@ -88,7 +88,7 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     header, first = _header(lines)
     rows, cols = _count(header, "ROWS"), _count(header, "COLS")
     numbers, frames = _frames(lines, first, rows, cols)
-    values = np.stack(frames)
+    values = np.array(frames)
     wrong = (values < 0.0) | (values > _LARGEST)
     if wrong.any():
         k, i, j = (int(x) for x in np.argwhere(wrong)[0])
@@ -132,60 +132,52 @@ def _spelt(key: str) -> str:
 
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
-) -> tuple[list[int], list[NDArray[np.float64]]]:
+) -> tuple[list[int], list[list[NDArray[np.float64]]]]:
+    """Numbers of the frames and their rows, from line ``first`` on."""
     numbers: list[int] = []
-    frames: list[NDArray[np.float64]] = []
-    row = rows
-    for number, line in enumerate(lines[first:], first + 1):
-        line = line.strip()
+    frames: list[list[NDArray[np.float64]]] = []
+    for number, text in enumerate(lines[first:], first + 1):
+        line = text.strip()
         if not line:
             continue
         if line.startswith("@@"):
             break
-        match = re.match(r"frame\s+(\d{1,9})\b", line, re.IGNORECASE)
-        if match or line[:5].lower() == "frame":
+        if line[:5].lower() == "frame":
+            match = re.match(r"frame\s+(\d{1,9})\b", line, re.IGNORECASE)
             if match is None:
                 raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
-            if row < rows:
-                raise TekscanError(f"line {number}: frame {numbers[-1]} has {row} rows of {rows}")
+            if frames and len(frames[-1]) < rows:
+                had = f"{len(frames[-1])} rows of {rows}"
+                raise TekscanError(f"line {number}: frame {numbers[-1]} has {had}")
             if numbers and int(match[1]) <= numbers[-1]:
                 raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
             numbers.append(int(match[1]))
-            frames.append(np.empty((rows, cols)))
-            row = 0
+            frames.append([])
             continue
-        if row == rows and not frames:  # the export of a single frame
+        if not frames:  # the export of a single frame
             numbers.append(1)
-            frames.append(np.empty((rows, cols)))
-            row = 0
-        if row == rows:
+            frames.append([])
+        if len(frames[-1]) == rows:
             raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
-        frames[-1][row] = _row(line, cols, number)
-        row += 1
+        frames[-1].append(_row(line, cols, number))
     if not frames:
         raise TekscanError("no frame in it")
-    if row < rows:
-        raise TekscanError(f"the file ends in frame {numbers[-1]}: {row} rows of {rows}")
+    if len(frames[-1]) < rows:
+        raise TekscanError(
+            f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
+        )
     return numbers, frames
 
 
 def _row(line: str, cols: int, number: int) -> NDArray[np.float64]:
-    cells = line.rstrip(",").split(",")
+    cells = [cell.strip().upper() for cell in line.rstrip(",").split(",")]
     if len(cells) != cols:
         raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
     try:
-        values = np.array(cells, dtype=np.float64)
-    except ValueError:
-        try:
-            values = np.array(
-                [math.nan if cell.strip().upper() == "B" else float(cell) for cell in cells]
-            )
-        except ValueError as error:
-            raise TekscanError(f"line {number}: {error}") from None
-        written = sum(cell.strip().upper() == "B" for cell in cells)
-    else:
-        written = 0
-    if np.count_nonzero(np.isnan(values)) != written:
+        values = np.array([math.nan if cell == "B" else float(cell) for cell in cells])
+    except ValueError as error:
+        raise TekscanError(f"line {number}: {error}") from None
+    if np.count_nonzero(np.isnan(values)) != cells.count("B"):
         raise TekscanError(f"line {number}: a cell that is no number")
     return values
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
 from softfinger.daemon.tactile.cobs import CobsDecoder
+from softfinger.daemon.tactile.decoder import Decoder
 from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
 from softfinger.daemon.tactile.glove import GloveDecoder
-from softfinger.daemon.tactile.serial_reader import Decoder
 from softfinger.daemon.tactile.tekscan import TekscanError, parse
 
 ROWS, COLS = 4, 5

@@ -9,7 +9,7 @@ from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
-from softfinger.daemon.tactile.given import GivenFrames
+from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import Contact, Frame, State
 from softfinger.daemon.wire.messages import Parts, state_message
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.perception.perception import FingerPerception
-from softfinger.daemon.tactile.given import GivenFrames
+from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Contact, Frame
 from softfinger.daemon.wire.own_files import write_text
 from softfinger.tools.analysis.sources import Progress, Source

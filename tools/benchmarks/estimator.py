@@ -17,7 +17,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.tactile.cobs import CobsDecoder, encode
+from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.tactile.cobs import CobsDecoder
+from softfinger.daemon.tactile.decoder import Decoder
+from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
+from softfinger.daemon.tactile.glove import GloveDecoder
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -52,8 +56,11 @@ _SHARE = 0.002  # of the modulus
 _NOISE = _SHARE * MODULUS
 _PASCAL_PER_COUNT = 4.0
 _TRUTH: Truth = (0.004, *tilts(math.radians(12.0), 0.7))
-# Three codes of 1 and one of 3 in turns: too short for what takes many at once, all to be walked.
-_COSTLIEST = np.where(np.arange(SIZE * SIZE) % 3 == 0, 257, 0).astype(np.uint16).reshape(SIZE, SIZE)
+_DECODERS: dict[str, type[CobsDecoder | FlexiTacDecoder | GloveDecoder]] = {
+    "cobs": CobsDecoder,
+    "flexitac": FlexiTacDecoder,
+    "glove": GloveDecoder,
+}
 _CENTRE = (0.31 * PITCH, -0.17 * PITCH)
 GRID = SensorGrid(SIZE, SIZE, PITCH, _CENTRE)
 
@@ -98,8 +105,8 @@ def measure(effort: Effort | None = None) -> list[Any]:
     frames = clean + _NOISE * random.standard_normal((_FRAMES, SIZE, SIZE))
     empty = _NOISE * random.standard_normal((_FRAMES, SIZE, SIZE))
     cases = {**_rungs(frames), **_steps(frames, empty), **_elsewhere(random)}
-    cases["decode of a 44 × 44 uint16 frame: call"] = _decode(_counts(frames))
-    cases["decode of the costliest such frame known: call"] = _decode([_COSTLIEST] * 8)
+    for framing in _DECODERS:
+        cases[f"decode of a {framing} frame: call"] = _decode(framing, _counts(frames))
     outside, missing = rivals(TIP, LINEAR, GRID, _NOISE)
     for name, method in outside.items():
         slow = "least_squares" in name
@@ -256,17 +263,18 @@ def _counts(frames: FloatArray) -> list[NDArray[np.uint16]]:
     return [np.maximum(frame / _PASCAL_PER_COUNT, 0.0).astype(np.uint16) for frame in frames]
 
 
-def _decode(counts: list[NDArray[np.uint16]]) -> _Case:
-    """Our framing's bytes, as a board sends them, to counts."""
+def _decode(framing: str, counts: list[NDArray[np.uint16]]) -> _Case:
+    """A framing's bytes, as a board sends them, to counts."""
+    encode = ENCODERS[framing].encode
     packets = [encode(each, number, 0.01 * number) for number, each in enumerate(counts)]
-    decoder = CobsDecoder(SIZE, SIZE)
+    decoder: Decoder = _DECODERS[framing](SIZE, SIZE)
 
     def run(repeat: int) -> None:
         for _ in range(repeat):
             for packet in packets:
                 decoder.feed(packet, 0.0)
 
-    return _Case(Subject(run, len(packets)), None, 10.0)
+    return _Case(Subject(run, len(packets)), None, 20.0)
 
 
 def _outside(method: Method, frames: FloatArray) -> _Case:

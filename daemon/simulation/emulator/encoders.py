@@ -1,7 +1,7 @@
 """Framings of emulated tactile boards: counts → bytes, as a board's firmware would send them.
 
-They share no code with the decoders, so that one tested against the other means something. (The
-reference encoder of our own framing, which the documentation of that framing is, serves here too.)
+They share no code with the decoders, so that each can be tested against the other. (Our own
+framing's reference encoder serves here, too.)
 """
 
 from __future__ import annotations
@@ -44,11 +44,6 @@ def encode_glove(
     return bytes((11 + number % 244,)) + halves.astype(np.uint8).tobytes() + b"\n"
 
 
-def encode_cobs(counts: NDArray[np.uint16], number: int = 0, t: float = 0.0) -> bytes:
-    """Our own framing with uint16 counts, see :mod:`tactile.cobs`."""
-    return cobs.encode(counts, number, t)
-
-
 def encoder_for(backend: str, full_count: int) -> Encoder:
     """The framing of a backend's board whose largest count is ``full_count``."""
     if backend == "glove" and 1023 < full_count <= 4095:
@@ -59,5 +54,5 @@ def encoder_for(backend: str, full_count: int) -> Encoder:
 ENCODERS = {
     "flexitac": Encoder(encode_flexitac),
     "glove": Encoder(encode_glove, b"a"),
-    "cobs": Encoder(encode_cobs),
+    "cobs": Encoder(cobs.encode),
 }

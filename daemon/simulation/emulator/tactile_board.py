@@ -85,8 +85,8 @@ class FrameSource(Protocol):
 class FrameWriter:
     """The board's end of a pty. Frames go out whole or not at all.
 
-    A pty holds some tens of kilobytes. While nobody reads, frames are dropped early, so that who
-    comes next isn't fed an old tail, as with a board whose port nobody has opened.
+    A pty holds some tens of kilobytes. While nobody reads, frames are dropped early, so that the
+    next client isn't fed old ones, as with a board whose port nobody has opened.
     """
 
     def __init__(self) -> None:
