@@ -98,7 +98,7 @@ class Subscription(Generic[_Record]):
 class Hand:
     """A hand by its two addresses. Not for use from several threads at once; make one in each.
 
-    ``client`` is the name that owns the commander's lease (`control.modes.Lease`); ``timeout`` [s]
+    ``client`` is the name that owns the commander's lease (`loop.requests.Lease`); ``timeout`` [s]
     is how long a reply, or a first state, is waited for. ``keys`` is the folder of this client's
     keys, where the daemon wants some; `wire.keys.KeyFileError` when they can't be read.
     """

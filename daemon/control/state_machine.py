@@ -1,21 +1,19 @@
 """The control law's modes: commands in, one goal for the servos a tick out.
 
 Holds what each mode does and when it passes into the next. Which command is heard when stands in
-`control.modes`, the grip law in `control.grip`, limits that must not be trusted to a control law in
-`safety.safety`.
+`control.modes`, what else speaks against one in `loop.requests`, the grip law in `control.grip`,
+limits that must not be trusted to a control law in `safety.safety`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from softfinger.daemon.control.grip import Grip
-from softfinger.daemon.control.modes import Command, Mode
+from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.control.setpoint import Reference
-from softfinger.daemon.errors import Refused
 from softfinger.daemon.perception.contact_filter import Held
-from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Contact, Goal, ObjectPose, Reading
 
 Event = tuple[str, str, str]  # level, kind, text
@@ -33,13 +31,14 @@ _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
 
 
 class Control:
-    """Modes and their laws. ``command`` and ``step`` are called from the loop's thread only."""
+    """Modes and their laws. All is called from the loop's thread only.
 
-    def __init__(self, settings: Settings, has_servos: bool, has_sensors: bool) -> None:
+    Its commands are those of `control.modes.COMMANDS`; `loop.requests` has checked them.
+    """
+
+    def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self._has_servos = has_servos
-        self._has_sensors = has_sensors
         self._grip = Grip(settings, self._fingers)
         self._by_position = settings.control.law == "position" and len(self._fingers) == 2
         self._force = settings.control.force_default  # N that the next grip goes to
@@ -65,70 +64,39 @@ class Control:
 
     # Commands
 
-    def command(self, command: Command) -> dict[str, Any]:
-        """Carry out a command that `modes.parse` let through. Raises Refused with the reason."""
-        told = getattr(self, f"_{command.name}")(command.numbers)
-        return {"mode": self.mode.value} | (told or {})
-
     def fail(self, reason: str, name: str) -> None:
         """Latch a fault: torque off until ``clear``. ``name`` is its row of `safety.limits`."""
         self._enter(Mode.FAULT)
         self.torque = False
         self.events.append(("error", name, reason))
 
-    def _arm(self, _: dict[str, float]) -> None:
-        if not self._has_servos:
-            raise Refused("arm: this scene has no servos")
+    def arm(self) -> None:
+        """Torque on, with the joints held where they are."""
         self._hold_here()
         self.torque = True
         self._enter(Mode.ARMED)
 
-    def _disarm(self, _: dict[str, float]) -> None:
+    def disarm(self) -> None:
+        """Torque off; also the way out of a fault."""
         self.torque = False
         self._enter(Mode.DISARMED)
 
-    def _stop(self, _: dict[str, float]) -> None:
+    def stop(self) -> None:
+        """Torque off; a fault stays latched."""
         self.torque = False
         if self.mode is not Mode.FAULT:
             self._enter(Mode.DISARMED)
 
-    def _clear(self, _: dict[str, float]) -> None:
-        self._enter(Mode.DISARMED)
-
-    def _status(self, _: dict[str, float]) -> None:
-        pass
-
-    def _tare(self, _: dict[str, float]) -> None:
-        if not self._has_sensors:
-            raise Refused("tare: this scene has no tactile sensors")
-
-    def _move(self, numbers: dict[str, float]) -> None:
-        if not numbers:
-            raise Refused("move: left or right is missing")
-        hand = self._settings.hand
-        for name, q in numbers.items():
-            index = FINGERS.index(name)
-            if index not in self._fingers:
-                raise Refused(f"move: this scene has no {name} finger")
-            low, high = hand.q_min[index], hand.q_max[index]
-            if not low <= q <= high:
-                raise Refused(f"move: {name}: found {q:g} rad, expected {low:g} to {high:g}")
+    def move(self, **angles: float) -> None:
+        """Joints to these angles [rad], ``left`` and ``right`` or one of them."""
         if self.mode is not Mode.MOVING:
             self._hold_here()
-        for name, q in numbers.items():
+        for name, q in angles.items():
             self._ways[FINGERS.index(name)].target = q
         self._enter(Mode.MOVING)
 
-    def _grasp(self, numbers: dict[str, float]) -> None:
-        if not self._has_sensors:
-            raise Refused("grasp: each finger needs a tactile sensor in this scene")
-        if self._settings.servos.mode == "position":
-            raise Refused('grasp: nothing bounds the current while servos.mode is "position"')
-        force = numbers.get("force", self._settings.control.force_default)
-        low = self._settings.control.contact_force
-        high = GRIP_SHARE * self._settings.safety.force_max
-        if not low < force <= high:
-            raise Refused(f"grasp: force: found {force:g} N, expected above {low:g} to {high:g}")
+    def grasp(self, force: float) -> None:
+        """Close until all fingers touch, then a mean tip force of ``force`` [N]."""
         if self._gripping:
             self._grip.retarget(force)
         else:
@@ -138,37 +106,27 @@ class Control:
             self._force = force
         self._enter(Mode.GRASPING)
 
-    def _rotate(self, numbers: dict[str, float]) -> dict[str, Any] | None:
-        if len(self._fingers) < 2 or not self._settings.scene.object_model:
-            raise Refused("rotate: needs both fingers and the object model in the scene")
-        angle = numbers["angle"]
+    def rotate(self, angle: float) -> None:
+        """Turn the object to ``angle`` [rad]; while grasping, once the grip holds."""
         if self.mode is Mode.GRASPING:
             self._next_angle = angle
-            return {"queued": "rotate", "until": Mode.HOLDING.value}
-        self._turn_to(angle)
-        return None
-
-    def _turn_to(self, angle: float) -> None:
-        if not self._pose.valid:
-            raise Refused("rotate: the object's angle is not known")
-        low, high = self._turns()
-        if not low <= angle <= high:
-            raise Refused(
-                f"rotate: angle: found {angle:.4g} rad, "
-                f"expected {low:.2f} to {high:.2f} in this grip"
-            )
+            return
         self._grip.steer(self._pose.angle, angle)
         self._turn_ended = False
         self._enter(Mode.ROTATING)
 
-    def _set(self, numbers: dict[str, float]) -> None:
-        compliance = numbers["compliance"]
-        low, high = 0.01, 1.0
-        if not low <= compliance <= high:
-            raise Refused(
-                f"set: compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
-            )
+    def set(self, compliance: float) -> None:
+        """Angle by which the grip gives way to a torque [rad/(N·m)]."""
         self._grip.soften(1.0 / compliance)
+
+    def why_not_turn(self, angle: float) -> str:
+        """What speaks against turning the held object to ``angle`` [rad] now; empty: nothing."""
+        if not self._pose.valid:
+            return "the object's angle is not known"
+        low, high = self._turns()
+        if low <= angle <= high:
+            return ""
+        return f"angle: found {angle:.4g} rad, expected {low:.2f} to {high:.2f} in this grip"
 
     def _turns(self) -> tuple[float, float]:
         """The object's angles [rad] that this grip reaches within the tips' and joints' limits.
@@ -190,7 +148,8 @@ class Control:
             low, high = max(low, ends[0]), min(high, ends[1])
         return present + min(low, 0.0), present + max(high, 0.0)
 
-    def _release(self, _: dict[str, float]) -> None:
+    def release(self) -> None:
+        """Open to the hand's open angles."""
         self._hold_here()
         for index in self._fingers:
             self._ways[index].target = self._settings.hand.open_angle[index]
@@ -379,7 +338,7 @@ class Control:
                 f"less than object.width_min {least * 1e3:g} mm; opening"
             )
             self.events.append(("warning", "grasp", text))
-            self._release({})
+            self.release()
         return True
 
     def _watch_slip(self) -> None:
@@ -426,7 +385,7 @@ class Control:
         angle, self._next_angle = self._next_angle, None
         if angle is None:
             return
-        try:
-            self._turn_to(angle)
-        except Refused as reason:
-            self.events.append(("warning", "rotate", str(reason)))
+        if refusal := self.why_not_turn(angle):
+            self.events.append(("warning", "rotate", f"rotate: {refusal}"))
+        else:
+            self.rotate(angle)

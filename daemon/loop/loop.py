@@ -11,14 +11,14 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from softfinger.daemon.control.modes import Command, Mode
+from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskOver
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.clock import LoopClock
 from softfinger.daemon.loop.lateness import Lateness
 from softfinger.daemon.loop.publishing import Broadcast
-from softfinger.daemon.loop.requests import Orders
+from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.perception.contact_filter import Held, Prediction
 from softfinger.daemon.perception.perception import FingerPerception
@@ -79,7 +79,7 @@ class Loop:
         self._publisher = publisher
         self._server = server
         self._on_event = on_event
-        self._control = Control(settings, servos is not None, bool(perceptions))
+        self._control = Control(settings)
         self._task = Task.named(settings)
         self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
         sensors = bool(perceptions)
@@ -89,7 +89,7 @@ class Loop:
         self._drive = Drive(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
-        self._orders = Orders(
+        self._requests = Requests(
             settings,
             self.state,
             self._control,
@@ -98,7 +98,6 @@ class Loop:
             perceptions,
             self.emit,
             self._feel,
-            self._paced,
         )
         self._fault_after_opening = ("", "")  # name and reason
         self.statistics = Statistics()
@@ -261,11 +260,11 @@ class Loop:
         control.observe(state.reading, state.contacts, state.object, self._held)
         stopped, self._stopping = self._stopping, False
         if stopped:
-            self._by_person({"command": "stop"})
+            self.command({"command": "stop"})
         if self._server is not None:
             if stopped:
                 self._server.begin_epoch()
-            self._server.serve(self._by_person)
+            self._server.serve(self.command)
             while self._server.notices:
                 self.emit("warning", "clients", self._server.notices.popleft())
         if self._task is not None:
@@ -300,7 +299,7 @@ class Loop:
         if finding is not None and safety.opens_first(finding, state.mode):
             self.emit("error", *finding)
             self._fault_after_opening = finding
-            control.command(Command("release", {}, ""))
+            control.release()
         elif finding is not None:
             self._fail(finding.text, finding.name)
         elif self._fault_after_opening[0] and state.mode != Mode.RELEASING:
@@ -309,37 +308,40 @@ class Loop:
 
     # Commands, events and faults
 
-    def command(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Carry out one request at the present tick. Raises Refused with the reason."""
+    def command(self, request: dict[str, Any], by_task: bool = False) -> dict[str, Any]:
+        """Carry out one request at the present tick. Raises Refused with the reason.
+
+        One that is not the task's own ends the task.
+        """
+        name = request["command"]
+        if name == "status":
+            if self._server is not None and self._server.refused_by_pace:
+                self._safety.limited["commands.pace"] = self._server.refused_by_pace
+            return self._requests.carry_out(request)
         try:
-            reply = self._orders.carry_out(request)
+            reply = self._requests.carry_out(request)
         except Refused as refusal:
-            self._tell(request, str(refusal))
+            self._publish_command(request, str(refusal))
             raise
-        self._tell(request, "")
-        self._commanded = self._commanded or request["command"] != "status"
+        self._publish_command(request, "")
+        self._commanded = True
+        if name == "clear":
+            self._latch("", "")
+        if self._task is not None and not by_task:
+            self._end_task(f"ended by the command {name}")
         return reply
 
-    def _tell(self, request: dict[str, Any], error: str) -> None:
-        if self._publisher is not None and request["command"] != "status":
+    def _publish_command(self, request: dict[str, Any], error: str) -> None:
+        if self._publisher is not None:
             state = self.state
             self._publisher.command(state.wall, state.t, state.seq, request, error)
-
-    def _paced(self) -> int:
-        return 0 if self._server is None else self._server.refused_by_pace
-
-    def _by_person(self, request: dict[str, Any]) -> dict[str, Any]:
-        reply = self.command(request)
-        if self._task is not None and request["command"] != "status":
-            self._end_task(f"ended by the command {request['command']}")
-        return reply
 
     def _follow(self, task: Task) -> None:
         """Carry out what the task says is due; one that can't go on ends, or begins again."""
         try:
             request = task.next(self.state, self.period)
             if request is not None:
-                self.command(request)
+                self.command(request, by_task=True)
         except (TaskOver, Refused) as reason:
             if task.lasting:
                 self.emit("warning", "task", task.begin_again(self.state, str(reason)))
@@ -366,7 +368,11 @@ class Loop:
         if not self.state.fault:
             if name == BUS:
                 reason = self._with_cause(name, reason)
-            self.state.fault, self.state.fault_name = reason, name
+            self._latch(reason, name)
             self._control.fail(reason, name)
             self._tell_events()
             self.state.mode = self._control.mode
+
+    def _latch(self, reason: str, name: str) -> None:
+        """The one place that writes the state's fault; empty texts clear it."""
+        self.state.fault, self.state.fault_name = reason, name

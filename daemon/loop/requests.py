@@ -1,26 +1,98 @@
-"""A person's requests to a running hand: what they need beyond the control law, and their answers.
+"""Requests to a running hand: the one place that checks what a request asks, and carries it out.
 
-Which command is heard in which mode stands in `control.modes`, what it makes the hand do in
-`control.state_machine`. Here stands what the state speaks against, what is connected or opened anew
-on command, who may command, and what `status` says.
+The gateway has seen to a request's size, pace and form (`gateway.admission`). Which command is
+heard in which mode stands in `control.modes`; what it makes the hand do, in
+`control.state_machine`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
-from softfinger.daemon.control.modes import Lease, parse
+from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import FingerPerception
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import Drive
 from softfinger.daemon.types import FINGERS, State
 
+_COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
+_ENVELOPE = frozenset({"command", "client"})
+_FIRST = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
 
-class Orders:
+
+class Command(NamedTuple):
+    """A request of the right form, heard in the present mode."""
+
+    name: str
+    numbers: dict[str, float]
+    client: str
+
+
+def parse(request: dict[str, Any], mode: Mode) -> Command:
+    """Check a request against the table of commands. Raises Refused with found and expected."""
+    name = request["command"]
+    if name not in COMMANDS:
+        raise Refused(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
+    if name == "stop":  # whatever else the message holds
+        return Command(name, {}, "")
+    client = request.get("client", "")
+    if not isinstance(client, str) or len(client) > 64:
+        raise Refused("client: expected a text of at most 64 characters")
+    heard, parameters = COMMANDS[name]
+    unknown = sorted(set(request) - _ENVELOPE - set(parameters))
+    if unknown:
+        known = ", ".join(parameters) or "no parameters"
+        raise Refused(f"{name}: unknown parameter {unknown[0][:40]!r}; expected {known}")
+    numbers = {}
+    for key, required in parameters.items():
+        if key not in request:
+            if required:
+                raise Refused(f"{name}: {key} is missing")
+            continue
+        value = request[key]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise Refused(f"{name}: {key}: expected a number, found {type(value).__name__}")
+        if not math.isfinite(value):
+            raise Refused(f"{name}: {key}: expected a finite number, found {value}")
+        numbers[key] = float(value)
+    if mode not in heard:
+        hint = _FIRST.get(mode) or f"possible while {', '.join(sorted(heard))}"
+        raise Refused(f"{name}: not while {mode.value}; {hint}")
+    return Command(name, numbers, client)
+
+
+class Lease:
+    """One commander at a time: a client keeps the hand for a while after its last command.
+
+    Clients that give no name share one. What can only make the hand safer needs no lease.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._owner = ""
+        self._until = -math.inf
+
+    def check(self, command: Command, now: float) -> None:
+        """Raises Refused while somebody else has the lease."""
+        if command.name in UNLEASED:
+            return
+        if now < self._until and command.client != self._owner:
+            owner = self._owner or "an unnamed client"
+            raise Refused(f"{command.name}: {owner} commands the hand ({self._until - now:.1f} s)")
+
+    def renew(self, command: Command, now: float) -> None:
+        """Take or prolong the lease, once the command has been carried out."""
+        if command.name not in UNLEASED:
+            self._owner = command.client
+            self._until = now + self._seconds
+
+
+class Requests:
     """Carries out requests between two stages of a tick. One thread, the loop's, may call it."""
 
     def __init__(
@@ -33,9 +105,9 @@ class Orders:
         perceptions: list[FingerPerception],
         emit: Callable[[str, str, str], None],
         feel: Callable[[], None],
-        paced: Callable[[], int],
     ) -> None:
-        """``feel`` looks at the sensors; ``paced`` counts commands refused since too many came."""
+        """``emit`` sends an event, ``feel`` takes in the sensors' newest frames."""
+        self._settings = settings
         self._state = state
         self._control = control
         self._safety = safety
@@ -43,40 +115,95 @@ class Orders:
         self._perceptions = perceptions
         self._emit = emit
         self._feel = feel
-        self._paced = paced
-        self._silent_after = settings.servos.fault_after
         self._lease = Lease(settings.commands.lease)
 
     def carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
         """Do what is asked at the present tick; the reply. Raises Refused with the reason."""
         state, control = self._state, self._control
-        command = parse(request, control.mode)
+        command = name, numbers, _ = parse(request, control.mode)
         self._lease.check(command, state.t)
-        if command.name == "clear":
+        if name == "clear":
             self._reconnect()
-        if command.name in ("clear", "arm"):
-            self._reopen(command.name)
-        self._refuse_unsafe(command.name)
-        reply = control.command(command)
-        self._lease.renew(command, state.t)
-        if command.name in ("stop", "disarm"):
-            reply["torque_off"] = "confirmed" if self._drive.off() else "unconfirmed"
-        if command.name == "tare":
+        if name in ("clear", "arm"):
+            self._reopen(name)
+        for reason in self._against(name, numbers):
+            raise Refused(f"{name}: {reason}")
+        queued = name == "rotate" and control.mode is Mode.GRASPING
+        if name == "tare":
             for perception in self._perceptions:
                 perception.tare()
-        if command.name == "clear":
-            state.fault = state.fault_name = ""
-        if command.name == "status":
+        elif name != "status":
+            getattr(control, "disarm" if name == "clear" else name)(**numbers)
+        self._lease.renew(command, state.t)
+        reply: dict[str, Any] = {"mode": control.mode.value}
+        if queued:
+            reply |= {"queued": name, "until": Mode.HOLDING.value}
+        elif name in ("stop", "disarm"):
+            reply["torque_off"] = "confirmed" if self._drive.off() else "unconfirmed"
+        elif name == "status":
             reply |= self._status()
         return reply
 
+    def _against(self, name: str, numbers: dict[str, float]) -> Iterator[str]:
+        """What the state, the scene and the limits have against a command that is heard."""
+        state, settings = self._state, self._settings
+        if name in ("arm", "clear") and state.torque and not self._control.torque:
+            yield "the servos have not confirmed torque off yet: check their cable and their power"
+        judged = name in ("arm", "clear", "grasp")
+        if judged and (cause := self._safety.cause(state, gripping=name != "arm")):
+            yield cause
+        if name == "arm":
+            if self._drive.servos is None:
+                yield "this scene has no servos"
+            elif not state.reading.valid:
+                yield "the servos were not read at this tick"
+        elif name == "tare":
+            if not self._perceptions:
+                yield "this scene has no tactile sensors"
+            if any(contact.contact for contact in state.contacts):
+                yield "something touches a tip"
+        elif name == "move":
+            yield from self._against_move(numbers)
+        elif name == "grasp":
+            if any(perception.taring for perception in self._perceptions):
+                yield "tare is still at work"
+            if not self._perceptions:
+                yield "each finger needs a tactile sensor in this scene"
+            if settings.servos.mode == "position":
+                yield 'nothing bounds the current while servos.mode is "position"'
+            force = numbers.setdefault("force", settings.control.force_default)
+            low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
+            if not low < force <= high:
+                yield f"force: found {force:g} N, expected above {low:g} to {high:g}"
+        elif name == "rotate":
+            if len(settings.scene.fingers) < 2 or not settings.scene.object_model:
+                yield "needs both fingers and the object model in the scene"
+            now = self._control.mode is not Mode.GRASPING
+            if now and (reason := self._control.why_not_turn(numbers["angle"])):
+                yield reason
+        elif name == "set":
+            compliance, (low, high) = numbers["compliance"], _COMPLIANCE
+            if not low <= compliance <= high:
+                yield f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
+
+    def _against_move(self, numbers: dict[str, float]) -> Iterator[str]:
+        if not numbers:
+            yield "left or right is missing"
+        for name, q in numbers.items():
+            hand, index = self._settings.hand, FINGERS.index(name)
+            if name not in self._settings.scene.fingers:
+                yield f"this scene has no {name} finger"
+            low, high = hand.q_min[index], hand.q_max[index]
+            if not low <= q <= high:
+                yield f"{name}: found {q:g} rad, expected {low:g} to {high:g}"
+
     def _reconnect(self) -> None:
-        """Servos that have gone silent are connected anew: only on command.
+        """Connect servos that have gone silent anew: only on command.
 
         Raises Refused with all that is wrong with them.
         """
         state = self._state
-        silent = state.t - state.reading.t > self._silent_after
+        silent = state.t - state.reading.t > self._settings.servos.fault_after
         if self._drive.servos is None or not silent:
             return
         if self._drive.pending and not state.read_error:
@@ -88,7 +215,7 @@ class Orders:
         self._emit("info", "servos", "connected anew")
 
     def _reopen(self, name: str) -> None:
-        """Sensors whose port was lost are opened anew: only on command and with torque off.
+        """Open sensors anew whose port was lost: only on command and with torque off.
 
         Raises Refused for ``clear`` where one can't be; without sensors a hand may be armed.
         """
@@ -109,37 +236,11 @@ class Orders:
                 self._emit("info", "tactile", f"{side} sensor opened anew")
                 self._feel()
 
-    def _refuse_unsafe(self, name: str) -> None:
-        """What neither the mode nor the control law knows, and still speaks against a command."""
-        state = self._state
-        if name in ("arm", "clear"):
-            if state.torque and not self._control.torque:
-                raise Refused(
-                    f"{name}: the servos have not confirmed torque off yet: check their cable and "
-                    "their power"
-                )
-            cause = self._safety.cause(state, gripping=name == "clear")
-            if cause:
-                raise Refused(f"{name}: {cause}")
-        if name == "arm" and self._drive.servos is not None and not state.reading.valid:
-            raise Refused("arm: the servos were not read at this tick")
-        if name == "grasp":
-            cause = self._safety.cause(state, gripping=True)
-            if cause:
-                raise Refused(f"grasp: {cause}")
-            if any(perception.taring for perception in self._perceptions):
-                raise Refused("grasp: tare is still at work")
-        if name == "tare" and any(contact.contact for contact in state.contacts):
-            raise Refused("tare: something touches a tip")
-
     def _status(self) -> dict[str, Any]:
         state, servos = self._state, self._drive.servos
         counters = {} if servos is None else {"servos": servos.counters()}
         for perception in self._perceptions:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
-        limited = dict(self._safety.limited)
-        if paced := self._paced():
-            limited["commands.pace"] = paced
         return {
             "fault": state.fault,
             "fault_name": state.fault_name,
@@ -147,5 +248,5 @@ class Orders:
             "seq": state.seq,
             "overruns": state.timing.overruns,
             "counters": counters,
-            "limited": limited,
+            "limited": dict(self._safety.limited),
         }

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.control.modes import GRIPPING, HELD
 from softfinger.daemon.perception.contact_filter import Held
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -21,8 +21,6 @@ from softfinger.daemon.servos.models import by_name
 from softfinger.daemon.servos.registers import VOLTAGE_UNIT, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Frame, State
 
-GRIPPING = frozenset({Mode.GRASPING, Mode.HOLDING, Mode.ROTATING})
-HELD = frozenset({Mode.HOLDING, Mode.ROTATING})
 PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
 _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
 _ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer

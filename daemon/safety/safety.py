@@ -12,11 +12,11 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.control.modes import GRIPPING, Mode
 from softfinger.daemon.perception.contact_filter import Held
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.limit_checks import GRIPPING, PAST_STOP, View, reading_age
+from softfinger.daemon.safety.limit_checks import PAST_STOP, View, reading_age
 from softfinger.daemon.safety.limits import ROWS, Row
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Contact, Goal, State

@@ -21,7 +21,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.control.modes import Lease
+from softfinger.daemon.control.modes import UNLEASED
 from softfinger.daemon.profile.settings import GRIP_SHARE
 
 FINGERS = ("left", "right")
@@ -280,7 +280,7 @@ class Feed:
         if name == "grasp":
             force = number(json.loads(text(record, "request") or "{}"), "force")
             self.asked = self.force_default if math.isnan(force) else force
-        if name not in Lease.FREE and self._lease > 0.0:
+        if name not in UNLEASED and self._lease > 0.0:
             self.commanding = Commanding(client, now + self._lease)
 
     def _take_settings(self, record: dict[str, Any]) -> None:

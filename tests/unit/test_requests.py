@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.control.modes import COMMANDS, Command, Lease, Mode, parse
+from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused
+from softfinger.daemon.loop.requests import Command, Lease, parse
 
 
 def heard(mode: Mode) -> set[str]:
