@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FINGERS = ("left", "right")
+Event = tuple[str, str, str]  # level, kind, text
 
 
 def _pair() -> list[float]:

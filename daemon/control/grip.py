@@ -25,7 +25,7 @@ import numpy as np
 from softfinger.daemon.control import grip_kernels as law
 from softfinger.daemon.control.setpoint import Reference
 from softfinger.daemon.control.slip_monitor import SlipWatch
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Contact, ObjectPose, Reading
 
@@ -79,7 +79,7 @@ class Grip:
             return 0.0
         return 1.0 + min(speed * self._control.smooth_time / angle, 1.0)
 
-    def start(self, held: Held, felt: float, force: float) -> None:
+    def start(self, held: GraspState, felt: float, force: float) -> None:
         """Take over from the approach with ``felt`` N on the tips."""
         self.slip.forget()
         self.force.reset(felt)
@@ -115,7 +115,7 @@ class Grip:
         self._memory[law.STEERING] = float(on)
 
     def torques(
-        self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: Held
+        self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: GraspState
     ) -> tuple[float, float]:
         """Joint torques [N·m], positive closing; a finger that takes no part gets 0."""
         if len(self._fingers) == 1:
@@ -144,7 +144,7 @@ class Grip:
             dq2,
         )
 
-    def coast(self, reading: Reading, held: Held) -> tuple[float, float]:
+    def coast(self, reading: Reading, held: GraspState) -> tuple[float, float]:
         """Joint torques [N·m] while frames are late: the push stays, and turning comes to rest.
 
         Joints are read all the same. Torques that stayed as they are would turn the object on, to
@@ -156,7 +156,9 @@ class Grip:
             return (torque, 0.0) if finger == 0 else (0.0, torque)
         return law.coast(self._memory, held.told, *reading.dq)
 
-    def angles(self, contacts: list[Contact], pose: ObjectPose, held: Held) -> tuple[float, float]:
+    def angles(
+        self, contacts: list[Contact], pose: ObjectPose, held: GraspState
+    ) -> tuple[float, float]:
         """Joint goals [rad] of pure position control.
 
         What it can't do is why the other laws exist: its finest step is one count of the joints.
@@ -170,7 +172,7 @@ class Grip:
             pose.angle if pose.valid else math.nan,
         )
 
-    def _keep_margin(self, contacts: list[Contact], held: Held) -> None:
+    def _keep_margin(self, contacts: list[Contact], held: GraspState) -> None:
         """Set the force [N] that is gone to, more than asked for where the tips would slip."""
         if not self.slip.due():
             return

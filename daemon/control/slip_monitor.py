@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.daemon.types import Contact
 
@@ -74,7 +74,7 @@ class SlipWatch:
         self._most = 0.0  # N that the grip may be raised to
         self._idle = 0.0  # s since that was needed
 
-    def begin(self, held: Held) -> None:
+    def begin(self, held: GraspState) -> None:
         """Holding begins, or begins again after a command: learn what is no load."""
         # Where the faces lean towards each other, the object going out takes part of the turning.
         lean = math.tan(0.5 * held.taper)
@@ -109,7 +109,7 @@ class SlipWatch:
         return True
 
     def step(
-        self, held: Held, contacts: list[Contact], asked: float, holding: bool, closing: float
+        self, held: GraspState, contacts: list[Contact], asked: float, holding: bool, closing: float
     ) -> float:
         """Look; the grip force [N] to go to: ``asked``, or more where the margin needs it.
 
@@ -145,7 +145,7 @@ class SlipWatch:
                 self._needed = max(self._needed - back, needed)
         return min(max(asked, self._needed), most)
 
-    def _weigh(self, held: Held) -> None:
+    def _weigh(self, held: GraspState) -> None:
         seen = abs(self._smooth - self._still)
         self._age = min(self._age + self._dt, _LEARN)
         if seen < self._friction:
@@ -159,7 +159,7 @@ class SlipWatch:
         hidden = max(self._law.joint_friction / lever, self._friction)
         self.load = min(max(4.0 * sure, 0.0), seen + hidden)
 
-    def _watch_turning(self, held: Held, contacts: list[Contact]) -> None:
+    def _watch_turning(self, held: GraspState, contacts: list[Contact]) -> None:
         self._away += held.stray - self._stray - self._away * self._dt / _FORGET
         self._stray = held.stray
         sheared = 0.5 * self._law.tip_friction * (contacts[0].d + contacts[1].d) / self._width

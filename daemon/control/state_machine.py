@@ -12,11 +12,9 @@ import math
 from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.control.setpoint import Reference
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, Contact, Goal, ObjectPose, Reading
-
-Event = tuple[str, str, str]  # level, kind, text
+from softfinger.daemon.types import FINGERS, Contact, Event, Goal, State
 
 _REACH = 0.35  # rad beyond the present angle: far enough that the servo's current bound decides
 _ARRIVED = 0.03  # rad from the goal
@@ -36,7 +34,8 @@ class Control:
     Its commands are those of `control.modes.COMMANDS`; `loop.requests` has checked them.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
+        """``state`` and ``grasp`` are looked at as they are at each tick, and never changed."""
         self._settings = settings
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._grip = Grip(settings, self._fingers)
@@ -45,11 +44,9 @@ class Control:
         self.mode = Mode.DISARMED
         self.torque = False  # what the servos' torque shall be
         self.events: list[Event] = []
-        self._reading = Reading()
-        self._held = Held()
-        self._contacts = [Contact(), Contact()]
-        self._touched: list[Contact] = []  # those of the fingers that take part
-        self._pose = ObjectPose()
+        self._reading, self._contacts, self._pose = state.reading, state.contacts, state.object
+        self._touched = [state.contacts[index] for index in self._fingers]
+        self._grasp_state = grasp
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
         self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
         self._next_angle: float | None = None  # rad to turn to once the grip holds
@@ -135,7 +132,7 @@ class Control:
         tilt changes by both.
         """
         settings, present = self._settings, self._pose.angle
-        lean = 1.0 / max(self._held.turn[0] + self._held.turn[1], 0.1)
+        lean = 1.0 / max(self._grasp_state.turn[0] + self._grasp_state.turn[1], 0.1)
         low, high = -math.inf, math.inf
         for index, sense in ((0, 1.0), (1, -1.0)):
             contact, q = self._contacts[index], self._reading.q[index]
@@ -175,17 +172,6 @@ class Control:
 
     # One tick
 
-    def observe(
-        self, reading: Reading, contacts: list[Contact], pose: ObjectPose, held: Held
-    ) -> None:
-        """Take in what the servos and sensors said. Commands are carried out on this picture."""
-        self._reading = reading
-        self._held = held
-        if contacts is not self._contacts:
-            self._contacts = contacts
-            self._touched = [contacts[index] for index in self._fingers]
-        self._pose = pose
-
     def step(self, dt: float, goal: Goal) -> None:
         """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
         goal.valid = self.torque
@@ -224,7 +210,7 @@ class Control:
         Those that stand for torques do not: a grip goes on to damp its joints, and a turn rests.
         """
         if goal.valid and self._gripping and self._lost == 0.0 and not self._by_position:
-            self._pull(self._grip.coast(self._reading, self._held), goal)
+            self._pull(self._grip.coast(self._reading, self._grasp_state), goal)
 
     def _travel(self, dt: float) -> None:
         if self._ramp(self._settings.control.move_speed):
@@ -259,7 +245,7 @@ class Control:
                 return
             felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
             self._gripping = True
-            self._grip.start(self._held, felt, self._force)
+            self._grip.start(self._grasp_state, felt, self._force)
         elif not self._ramp(law.approach_speed) and self._waited(dt) > _GRACE:
             self.events.append(("warning", "grasp", "nothing to grasp within the joints' limits"))
             self._hold_here()
@@ -283,10 +269,10 @@ class Control:
             return
         self._is_empty(dt)
         if self._by_position:
-            goal.q[:] = grip.angles(self._contacts, self._pose, self._held)
+            goal.q[:] = grip.angles(self._contacts, self._pose, self._grasp_state)
             goal.current[0] = goal.current[1] = self._settings.safety.current_max
         else:
-            torques = grip.torques(self._reading, self._contacts, self._pose, self._held)
+            torques = grip.torques(self._reading, self._contacts, self._pose, self._grasp_state)
             self._pull(torques, goal)
         self._watch_slip()
         self._watch_settling(dt, contacts)
@@ -355,7 +341,7 @@ class Control:
             self.events.append(("warning", "slip", f"{text} along its face"))
         elif given <= asked:
             self._raised = False
-        if self.mode is Mode.ROTATING and self._held.shear * grip.turning_on > most:
+        if self.mode is Mode.ROTATING and self._grasp_state.shear * grip.turning_on > most:
             if not self._turn_ended:
                 angle = math.degrees(self._pose.angle)
                 text = f"turning ended at {angle:.1f}°: the tips would slip"
@@ -376,7 +362,7 @@ class Control:
         if self._waiting > _SETTLED_FOR:
             if self._pose.valid and not self._grip.steering:
                 self._grip.steer(self._pose.angle, self._pose.angle)
-            self._grip.slip.begin(self._held)
+            self._grip.slip.begin(self._grasp_state)
             self._enter(Mode.HOLDING)
             self._turn_next()
 

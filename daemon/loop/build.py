@@ -19,13 +19,13 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.clock import LoopClock, make_clock
 from softfinger.daemon.loop.loop import EventSink, Loop
 from softfinger.daemon.loop.warm_up import Scene, warm_up
-from softfinger.daemon.perception.contact_filter import Prediction
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import FingerModel, make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import make_servos
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.tactile import make_sensor
+from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
@@ -71,23 +71,19 @@ class Daemon:
         warm_up(scene)
         self.hand = self._make_hand(cache, on_event)
         self.servos = make_servos(settings, self.clock, self.hand)
-        perceptions = self._make_perceptions()
-        self.prediction: Prediction | None = None
-        if perceptions and self.servos is not None:
-            self.prediction = Prediction(settings, self.tables)
+        perception = Perception(settings, self._make_sensors(), self.models)
         if self.gateway is not None:
             self.gateway.wait()  # a second daemon touches no hardware
         if self.servos is not None:
             self._connect(self.servos)
-        for perception in perceptions:
-            self._closers.append(perception.sensor.close)
-            perception.sensor.open()
+        for each in perception.fingers:
+            self._closers.append(each.sensor.close)
+            each.sensor.open()
         self.loop = Loop(
             settings,
             self.clock,
             self.servos,
-            perceptions,
-            self.prediction,
+            perception,
             publisher,
             server,
             on_event,
@@ -131,13 +127,12 @@ class Daemon:
             table = make_table(settings, make_material(settings.material), cache, on_event)
         return SimulatedHand(settings, self.clock.now(), table)
 
-    def _make_perceptions(self) -> list[FingerPerception]:
-        settings = self.settings
-        made = []
-        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
-            sensor = make_sensor(settings, self.clock, self.hand, finger)
+    def _make_sensors(self) -> dict[int, TactileSensor]:
+        made = {}
+        for finger in sorted(FINGERS.index(name) for name in self.settings.scene.fingers):
+            sensor = make_sensor(self.settings, self.clock, self.hand, finger)
             if sensor is not None:
-                made.append(FingerPerception(sensor, self.models[finger], settings))
+                made[finger] = sensor
         return made
 
     @property

@@ -20,13 +20,12 @@ from softfinger.daemon.loop.lateness import Lateness
 from softfinger.daemon.loop.publishing import Broadcast
 from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Statistics, record
-from softfinger.daemon.perception.contact_filter import Held, Prediction
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import BUS, Safety
 from softfinger.daemon.safety.torque_state import Drive
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.types import FINGERS, Contact, State
+from softfinger.daemon.types import State
 from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.messages import Truth
 from softfinger.daemon.wire.publisher import Publisher
@@ -63,8 +62,7 @@ class Loop:
         settings: Settings,
         clock: LoopClock,
         servos: Servos | None,
-        perceptions: list[FingerPerception],
-        prediction: Prediction | None,
+        perception: Perception,
         publisher: Publisher | None,
         server: Commands | None,
         on_event: EventSink | None = None,
@@ -73,19 +71,14 @@ class Loop:
         self.period = 1.0 / settings.loop.rate
         self._settings = settings
         self._clock = clock
-        self.perceptions = perceptions
-        self._prediction = prediction
-        self._held = Held() if prediction is None else prediction.held
+        self.perception = perception
         self._publisher = publisher
         self._server = server
         self._on_event = on_event
-        self._control = Control(settings)
+        grasp, sensors = perception.filter.grasp, perception.fingers
+        self._control = Control(settings, self.state, grasp)
         self._task = Task.named(settings)
-        self._frames = [Contact(), Contact()]  # what each finger's newest frame alone says
-        sensors = bool(perceptions)
-        self._safety = Safety(
-            settings, servos is not None, sensors, self._held, self._frames, perceptions
-        )
+        self._safety = Safety(settings, servos is not None, bool(sensors), grasp, sensors)
         self._drive = Drive(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
@@ -95,16 +88,15 @@ class Loop:
             self._control,
             self._safety,
             self._drive,
-            perceptions,
+            perception,
             self.emit,
-            self._feel,
         )
         self._fault_after_opening = ("", "")  # name and reason
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing)
         self._broadcast = None
         if publisher is not None:
-            self._broadcast = Broadcast(settings, publisher, perceptions, self.statistics)
+            self._broadcast = Broadcast(settings, publisher, sensors, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
         self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
         self._ending = False
@@ -209,7 +201,7 @@ class Loop:
         state.wall = clock.wall()
         self._read()
         read = clock.host()
-        self._feel()
+        self.perception.update(state)
         self._decide()
         decided = clock.host()
         self._drive.write(self._control.torque, now)
@@ -237,27 +229,11 @@ class Loop:
             reading.valid = False
             state.read_error = str(error)
             self._fail(str(error))
-        if reading.valid and self._prediction is not None:
-            self._prediction.advance(reading)
-
-    def _feel(self) -> None:
-        contacts, prediction = self.state.contacts, self._prediction
-        for perception in self.perceptions:
-            finger = perception.finger
-            if prediction is None:
-                perception.update(contacts[finger])
-            elif perception.update(self._frames[finger]):
-                prediction.correct(finger, self._frames[finger], contacts[finger])
-            if perception.tare_failed:
-                reason, perception.tare_failed = perception.tare_failed, ""
-                self.emit("warning", "tare", f"{FINGERS[finger]} sensor's zero stays: {reason}")
-        if prediction is not None:
-            prediction.fill(contacts, self.state.object)
-        self._safety.mark_stale(self.state)
+        if reading.valid and self.perception.fingers:
+            self.perception.filter.advance(reading)
 
     def _decide(self) -> None:
         state, control = self.state, self._control
-        control.observe(state.reading, state.contacts, state.object, self._held)
         stopped, self._stopping = self._stopping, False
         if stopped:
             self.command({"command": "stop"})
@@ -279,9 +255,10 @@ class Loop:
         state.mode = control.mode
 
     def _tell_events(self) -> None:
-        for event in self._control.events:
-            self.emit(*event)
-        self._control.events.clear()
+        for events in (self.perception.events, self._control.events):
+            for event in events:
+                self.emit(*event)
+            events.clear()
         while self._reports:
             self.emit(*self._reports.popleft())
 

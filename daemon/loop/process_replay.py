@@ -16,8 +16,7 @@ from typing import Any
 
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
-from softfinger.daemon.perception.contact_filter import Prediction
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings, Task
 from softfinger.daemon.tactile.replay import GivenFrames
@@ -40,20 +39,14 @@ class Recomputation:
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
         self._sensors: dict[int, GivenFrames] = {}
-        perceptions = []
         if settings.tactile.backend != "none":
-            for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
-                sensor = self._sensors[finger] = GivenFrames()
-                perceptions.append(FingerPerception(sensor, models[finger], settings))
-        prediction = None
-        if perceptions and self._servos is not None:
-            prediction = Prediction(settings, (models[0].table, models[1].table))
+            for name in settings.scene.fingers:
+                self._sensors[FINGERS.index(name)] = GivenFrames()
         self._loop = Loop(
             settings,
             self._clock,
             self._servos,
-            perceptions,
-            prediction,
+            Perception(settings, self._sensors, models),
             None,
             self._commands,
         )

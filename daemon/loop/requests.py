@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Refused, ServoError, TactileError
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import Drive
@@ -102,19 +102,17 @@ class Requests:
         control: Control,
         safety: Safety,
         drive: Drive,
-        perceptions: list[FingerPerception],
+        perception: Perception,
         emit: Callable[[str, str, str], None],
-        feel: Callable[[], None],
     ) -> None:
-        """``emit`` sends an event, ``feel`` takes in the sensors' newest frames."""
+        """``emit`` sends an event."""
         self._settings = settings
         self._state = state
         self._control = control
         self._safety = safety
         self._drive = drive
-        self._perceptions = perceptions
+        self._perception = perception
         self._emit = emit
-        self._feel = feel
         self._lease = Lease(settings.commands.lease)
 
     def carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -130,7 +128,7 @@ class Requests:
             raise Refused(f"{name}: {reason}")
         queued = name == "rotate" and control.mode is Mode.GRASPING
         if name == "tare":
-            for perception in self._perceptions:
+            for perception in self._perception.fingers:
                 perception.tare()
         elif name != "status":
             getattr(control, "disarm" if name == "clear" else name)(**numbers)
@@ -158,16 +156,16 @@ class Requests:
             elif not state.reading.valid:
                 yield "the servos were not read at this tick"
         elif name == "tare":
-            if not self._perceptions:
+            if not self._perception.fingers:
                 yield "this scene has no tactile sensors"
             if any(contact.contact for contact in state.contacts):
                 yield "something touches a tip"
         elif name == "move":
             yield from self._against_move(numbers)
         elif name == "grasp":
-            if any(perception.taring for perception in self._perceptions):
+            if any(perception.taring for perception in self._perception.fingers):
                 yield "tare is still at work"
-            if not self._perceptions:
+            if not self._perception.fingers:
                 yield "each finger needs a tactile sensor in this scene"
             if settings.servos.mode == "position":
                 yield 'nothing bounds the current while servos.mode is "position"'
@@ -221,7 +219,7 @@ class Requests:
         """
         if self._state.torque:
             return
-        for perception in self._perceptions:
+        for perception in self._perception.fingers:
             sensor, side = perception.sensor, FINGERS[perception.finger]
             if not sensor.counters().get("port_lost"):
                 continue
@@ -234,12 +232,12 @@ class Requests:
                 self._emit("warning", "tactile", str(error))
             else:
                 self._emit("info", "tactile", f"{side} sensor opened anew")
-                self._feel()
+                self._perception.update(self._state)
 
     def _status(self) -> dict[str, Any]:
         state, servos = self._state, self._drive.servos
         counters = {} if servos is None else {"servos": servos.counters()}
-        for perception in self._perceptions:
+        for perception in self._perception.fingers:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()
         return {
             "fault": state.fault,

@@ -23,8 +23,9 @@ from softfinger.daemon.profile.factory import (
     make_models,
 )
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, Contact, ObjectPose, Reading
+from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel_cache import kernel_folder
+from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
 
@@ -157,28 +158,30 @@ def _sensor(scene: Scene) -> None:
 def _control(scene: Scene) -> None:
     from softfinger.daemon.control.grip import Grip
     from softfinger.daemon.loop.timing import Statistics
-    from softfinger.daemon.perception.contact_filter import Prediction
+    from softfinger.daemon.perception.contact_filter import ContactFilter
 
     settings, fingers = scene.settings, scene.sensing
     Statistics()
     if not fingers:
         return
     left, right = scene.models
-    prediction = Prediction(settings, (left.table, right.table))
+    contact_filter = ContactFilter(settings, (left.table, right.table))
     contacts, pose, reading = [Contact(), Contact()], ObjectPose(), Reading()
+    frame = Frame(1, 0.0, 0.0, True, np.zeros((1, 1), np.uint16))
+    touch = ContactEstimate(contact=True, valid=True, d=1e-3)
     for k in (1, 2):
-        prediction.advance(Reading(t=0.01 * k))
+        contact_filter.advance(Reading(t=0.01 * k))
         for finger in fingers:
-            touch = Contact(valid=True, contact=True, d=1e-3, force=1.0, d_std=1e-5)
-            prediction.correct(finger, touch, contacts[finger])
-        prediction.fill(contacts, pose)
+            contact_filter.correct(finger, frame, touch, contacts[finger])
+        contact_filter.publish(0.01 * k, contacts, pose)
+    grasp = contact_filter.grasp
     grip = Grip(settings, fingers)
-    grip.start(prediction.held, 1.0, 2.0)
+    grip.start(grasp, 1.0, 2.0)
     grip.steer(0.0, 0.1)
-    grip.torques(reading, contacts, pose, prediction.held)
-    grip.coast(reading, prediction.held)
+    grip.torques(reading, contacts, pose, grasp)
+    grip.coast(reading, grasp)
     if len(fingers) == len(FINGERS):
-        grip.angles(contacts, pose, prediction.held)
+        grip.angles(contacts, pose, grasp)
 
 
 def _many(scene: Scene) -> None:

@@ -27,25 +27,30 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softfinger.daemon.perception import contact_filter_kernels
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
-from softfinger.daemon.types import Contact, ObjectPose, Reading
-from softfinger.kinematics.contact.table import ContactTable
+from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
+from softfinger.kinematics.contact.table import ContactTable, lookup
+from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.hand.grasp_state import total_tilt
+
+FloatArray = NDArray[np.float64]
 
 
 class _Number:
-    """One number that a `Held` was told."""
+    """One number that a `GraspState` was told."""
 
     def __init__(self, place: int) -> None:
         self._place = place
 
-    def __get__(self, held: Held, owner: type[Held]) -> float:
-        return held.told.item(self._place)
+    def __get__(self, grasp: GraspState, owner: type[GraspState]) -> float:
+        return grasp.told.item(self._place)
 
-    def __set__(self, held: Held, value: float) -> None:
-        held.told[self._place] = value
+    def __set__(self, grasp: GraspState, value: float) -> None:
+        grasp.told[self._place] = value
 
 
 class _Pair:
@@ -54,15 +59,15 @@ class _Pair:
     def __init__(self, place: int, step: int = 1) -> None:
         self._places = slice(place, place + step + 1, step)
 
-    def __get__(self, held: Held, owner: type[Held]) -> list[float]:
-        pair: list[float] = held.told[self._places].tolist()
+    def __get__(self, grasp: GraspState, owner: type[GraspState]) -> list[float]:
+        pair: list[float] = grasp.told[self._places].tolist()
         return pair
 
-    def __set__(self, held: Held, value: list[float]) -> None:
-        held.told[self._places] = value
+    def __set__(self, grasp: GraspState, value: list[float]) -> None:
+        grasp.told[self._places] = value
 
 
-class Held:
+class GraspState:
     """How the held object answers the joints: what a grip law needs. Pairs are (left, right).
 
     It is one array that a kernel writes and others read; the names are for people and slow work.
@@ -100,7 +105,7 @@ class Held:
         self.told = np.zeros(contact_filter_kernels.TOLD_SIZE)
 
 
-class Prediction:
+class ContactFilter:
     """The filter of one hand. Costs nothing but a comparison while no tip is touched."""
 
     def __init__(self, settings: Settings, tables: tuple[ContactTable, ContactTable]) -> None:
@@ -130,8 +135,11 @@ class Prediction:
             ),
             -math.inf,
         )
-        self._live = [False, False]
-        self.held = Held()
+        self._live = [False, False]  # tips that touch and are carried on by the joints
+        self._sound = [False, False]  # the newest frame's estimate can be used
+        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self._age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
+        self.grasp = GraspState()
 
     def switch_off(self) -> None:
         """Pass frames on as they are, late and rare: to show what prediction is worth."""
@@ -144,58 +152,99 @@ class Prediction:
         self._m[contact_filter_kernels.TORQUE + 1] = self._torque_constant * current[1]
         contact_filter_kernels.advance(self._m, self._history, reading.t, q[0], q[1], dq[0], dq[1])
 
-    def correct(self, finger: int, frame: Contact, contact: Contact) -> None:
-        """Take in what was estimated from one finger's new ``frame``, and make it ``contact``."""
-        if not frame.valid:
-            # An unsound estimate is no news: the prediction goes on, and its age tells safety.
-            contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t, frame.t_arrival
-            contact.valid = False
-            return
-        for name in Contact.__slots__:
-            setattr(contact, name, getattr(frame, name))
+    def correct(
+        self, finger: int, frame: Frame, estimate: ContactEstimate, contact: Contact
+    ) -> None:
+        """Take in one finger's new ``frame`` and its ``estimate``; they show in ``contact``."""
+        contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
+        sound = self._sound[finger] = frame.valid and estimate.valid
+        if not sound:
+            return  # no news: the contact is carried on, and its age tells safety
+        contact.t_sound = frame.t_arrival
         # Before a first reading nothing is known of the joints: the frame stands for itself.
-        live = self._live[finger] = frame.contact and self._m[contact_filter_kernels.T] > -math.inf
+        live = self._live[finger] = (
+            estimate.contact and self._m[contact_filter_kernels.T] > -math.inf
+        )
         if not live:
             self._m[contact_filter_kernels.LIVE + finger] = self._m[
                 contact_filter_kernels.D + finger
             ] = 0.0
+            _fill_from_frame(contact, estimate, self._tables[finger])
             return
+        contact.contact = True
+        contact.tilt_y, contact.gain, contact.misfit = (
+            estimate.tilt_y,
+            estimate.gain,
+            estimate.misfit,
+        )
+        d_std, theta_std = estimate.d_std, estimate.tilt_x_std
         contact_filter_kernels.correct(
             self._m,
             self._history,
             finger,
-            frame.t,
-            frame.d,
-            frame.theta,
-            frame.tilt_y,
-            frame.gain,
-            frame.d_std * frame.d_std,
-            frame.theta_std * frame.theta_std,
+            frame.t_sample,
+            estimate.d,
+            estimate.tilt_x,
+            estimate.tilt_y,
+            estimate.gain,
+            d_std * d_std,
+            theta_std * theta_std,
         )
 
-    def fill(self, contacts: list[Contact], pose: ObjectPose) -> None:
-        """Write the present estimates into the contacts that are made, and into the pose."""
+    def publish(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
+        """Write the estimates of time ``t`` into contacts and pose."""
         left, right = self._live
-        pose.valid = False
-        if not (left or right):
-            pose.angle = pose.width = 0.0
-            return
-        told = self.held.told
-        contact_filter_kernels.tell(self._m, *self._tables, told)
-        seen = told[: contact_filter_kernels.ANGLE_STD].tolist()
-        if left:
-            _fill_one(contacts[0], seen[: contact_filter_kernels.TIP_SIZE])
-        if right:
-            _fill_one(
-                contacts[1],
-                seen[contact_filter_kernels.TIP_SIZE : 2 * contact_filter_kernels.TIP_SIZE],
-            )
-        if left and right and self._with_object:
-            pose.valid = True
-            pose.angle = seen[contact_filter_kernels.OBJECT_ANGLE]
-            pose.width = seen[contact_filter_kernels.OBJECT_WIDTH]
-        else:
-            pose.angle = pose.width = 0.0
+        pose.valid = held = left and right and self._with_object
+        pose.angle = pose.width = 0.0
+        if left or right:
+            told = self.grasp.told
+            contact_filter_kernels.tell(self._m, *self._tables, told)
+            seen = told[: contact_filter_kernels.ANGLE_STD].tolist()
+            if left:
+                _fill_one(contacts[0], seen[: contact_filter_kernels.TIP_SIZE])
+            if right:
+                _fill_one(
+                    contacts[1],
+                    seen[contact_filter_kernels.TIP_SIZE : 2 * contact_filter_kernels.TIP_SIZE],
+                )
+            if held:
+                pose.angle = seen[contact_filter_kernels.OBJECT_ANGLE]
+                pose.width = seen[contact_filter_kernels.OBJECT_WIDTH]
+        oldest = t - self._age_max
+        for finger in self._fingers:
+            contact = contacts[finger]
+            fresh = contact.t_sound >= oldest
+            contact.valid = fresh and self._sound[finger]
+            if not fresh:
+                pose.valid = False
+
+
+def _fill_from_frame(contact: Contact, estimate: ContactEstimate, table: FloatArray) -> None:
+    """Make ``contact`` what one frame's estimate says by itself, whatever the joints do.
+
+    ``table``: the contact table's data.
+    """
+    contact.contact = estimate.contact
+    contact.gain = estimate.gain
+    contact.misfit = estimate.misfit
+    if not estimate.contact:
+        contact.d = contact.theta = contact.tilt_y = 0.0
+        contact.force = contact.energy = 0.0
+        contact.d_std = contact.theta_std = 0.0
+        contact.inside = True
+        return
+    contact.d = estimate.d
+    contact.theta = estimate.tilt_x
+    contact.tilt_y = estimate.tilt_y
+    contact.d_std = estimate.d_std
+    contact.theta_std = estimate.tilt_x_std
+    force, energy, _, _, _, _, inside = lookup(
+        table, contact.d, total_tilt(contact.theta, contact.tilt_y)
+    )
+    # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
+    contact.force = contact.gain * force
+    contact.energy = contact.gain * energy
+    contact.inside = inside
 
 
 def _fill_one(contact: Contact, told: list[float]) -> None:

@@ -1,39 +1,76 @@
-"""From tactile frames to contacts: frame → estimate → table.
+"""What the hand feels: each finger's newest frame calibrated and estimated, then filtered.
 
-One `FingerPerception` a sensor; a frame that was seen already costs one comparison. What the tips
-feel between frames is `perception.contact_filter`'s.
+`FingerPerception` estimates each frame once; `perception.contact_filter` carries the estimates on
+to the contacts of every tick.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.perception.calibration_file import Converter, least_end
+from softfinger.daemon.perception.contact_filter import ContactFilter
 from softfinger.daemon.profile.factory import FingerModel, make_estimator
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
-from softfinger.daemon.types import Contact, Frame
+from softfinger.daemon.types import FINGERS, Event, Frame, State
 from softfinger.daemon.wire.messages import SensorFacts
-from softfinger.kinematics.contact.table import lookup
-from softfinger.kinematics.hand.grasp_state import total_tilt
+from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16
 _STEPS = 65535  # of a published pressure
 
 
-class FingerPerception:
-    """One finger's tactile pipeline: newest frame in, its `Contact` filled in place."""
+class Perception:
+    """A hand's tactile sensors and the filter of its contacts. Only the loop's thread calls it."""
 
-    def __init__(self, sensor: TactileSensor, model: FingerModel, settings: Settings) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        sensors: Mapping[int, TactileSensor],
+        models: tuple[FingerModel, FingerModel],
+    ) -> None:
+        """``sensors`` by finger, none in a scene without."""
+        self.events: list[Event] = []  # the loop takes them out
+        self.fingers = [
+            FingerPerception(sensor, models[finger], settings, self.events)
+            for finger, sensor in sorted(sensors.items())
+        ]
+        self.filter = ContactFilter(settings, (models[0].table, models[1].table))
+
+    def update(self, state: State) -> None:
+        """Take in new frames; write the contacts and the object's pose of this tick."""
+        if not self.fingers:
+            return
+        for each in self.fingers:
+            frame = each.update()
+            if frame is not None:
+                self.filter.correct(each.finger, frame, each.estimate, state.contacts[each.finger])
+        self.filter.publish(state.t, state.contacts, state.object)
+
+
+class FingerPerception:
+    """One finger's sensor: its newest frame, and what is estimated from that frame alone."""
+
+    def __init__(
+        self,
+        sensor: TactileSensor,
+        model: FingerModel,
+        settings: Settings,
+        events: list[Event] | None = None,
+    ) -> None:
+        """What became of a tare is added to ``events`` where it failed."""
         tactile, calibration = settings.tactile, model.calibration
         self.finger = model.finger
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frames = 0  # that came
+        self.estimate = ContactEstimate()  # of the last valid frame
         live = getattr(sensor, "live", None)  # of a recording that lacks cells
         self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
-        self._table = model.table.data
         self._scale = tactile.pascal_per_count
         self._full = float(tactile.full_count)
         self._converter: Converter | None = None
@@ -44,11 +81,11 @@ class FingerPerception:
         self._pressure: NDArray[np.float64] | None = None
         self._as_pressure = settings.stream.tactile_unit == "Pa"
         self.facts = self._facts(settings, model)
+        self._events = [] if events is None else events
         self._zero: NDArray[np.uint16] | None = None
         self._tare_sum: NDArray[np.uint32] | None = None
         self._tare_left = 0
         self._zero_before: tuple[NDArray[np.uint16] | None, float | None] = None, None
-        self.tare_failed = ""  # why the last tare left the zero as it was, until that is told
 
     @property
     def taring(self) -> bool:
@@ -60,58 +97,25 @@ class FingerPerception:
         self._tare_sum = None
         self._tare_left = _TARE_FRAMES
 
-    def update(self, contact: Contact) -> bool:
-        """Look for a new frame and fill ``contact`` from it; False when there was none."""
+    def update(self) -> Frame | None:
+        """The newest frame, estimated, where it is a new one; None where it is not."""
         frame = self.sensor.latest()
         if frame is None or frame is self.frame:
-            return False
+            return None
         self.frame = frame
         self.frames += 1
-        contact.seq = frame.seq
-        contact.t = frame.t_sample
-        contact.t_arrival = frame.t_arrival
-        if not frame.valid:
-            contact.valid = False
-            return True
-        counts = frame.data
-        if self._tare_left:
-            self._learn_zero(counts)
-        if self._converter is not None:
-            self._pressure, self._converted = self._converter(counts), frame
-            self.estimate(self._pressure, contact)
-        else:
-            if self._zero is not None:
-                counts = np.maximum(counts, self._zero) - self._zero
-            self.estimate(counts, contact)
-        if contact.valid:
-            contact.t_sound = frame.t_arrival
-        return True
-
-    def estimate(self, counts: NDArray[np.uint16] | NDArray[np.float64], contact: Contact) -> None:
-        """Fill ``contact`` from counts, or from the pressure [Pa] of a calibrated sensor, alone."""
-        estimate = self._estimator.update(counts, self._scale)
-        contact.valid = estimate.valid
-        contact.contact = estimate.contact
-        contact.gain = estimate.gain
-        contact.misfit = estimate.misfit
-        if not estimate.contact:
-            contact.d = contact.theta = contact.tilt_y = 0.0
-            contact.force = contact.energy = 0.0
-            contact.d_std = contact.theta_std = 0.0
-            contact.inside = True
-            return
-        contact.d = estimate.d
-        contact.theta = estimate.tilt_x
-        contact.tilt_y = estimate.tilt_y
-        contact.d_std = estimate.d_std
-        contact.theta_std = estimate.tilt_x_std
-        force, energy, _, _, _, _, inside = lookup(
-            self._table, contact.d, total_tilt(contact.theta, contact.tilt_y)
-        )
-        # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
-        contact.force = contact.gain * force
-        contact.energy = contact.gain * energy
-        contact.inside = inside
+        if frame.valid:
+            counts = frame.data
+            if self._tare_left:
+                self._learn_zero(counts)
+            if self._converter is not None:
+                self._pressure, self._converted = self._converter(counts), frame
+                self.estimate = self._estimator.update(self._pressure, self._scale)
+            else:
+                if self._zero is not None:
+                    counts = np.maximum(counts, self._zero) - self._zero
+                self.estimate = self._estimator.update(counts, self._scale)
+        return frame
 
     def shown(self, frame: Frame) -> NDArray[np.uint16]:
         """The newest frame's data [rows, cols] for subscribers, in steps as ``facts`` tells."""
@@ -158,7 +162,9 @@ class FingerPerception:
         ends = self._full - np.round(mean)
         if not np.median(ends) > 0.0:  # over such a zero no contact could be felt
             self._zero, self._estimator.saturation = self._zero_before
-            self.tare_failed = "most cells are full where nothing presses"
+            side = FINGERS[self.finger]
+            text = f"{side} sensor's zero stays: most cells are full where nothing presses"
+            self._events.append(("warning", "tare", text))
         elif self._converter is not None:
             self._converter.zero[:] = mean
             self._estimator.saturation = self._converter.saturation

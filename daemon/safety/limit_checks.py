@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion
 from softfinger.daemon.servos.models import by_name
 from softfinger.daemon.servos.registers import VOLTAGE_UNIT, hardware_error_names
-from softfinger.daemon.types import FINGERS, Contact, Frame, State
+from softfinger.daemon.types import FINGERS, Frame, State
 
 PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
 _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
@@ -37,16 +37,14 @@ class View:
     def __init__(
         self,
         settings: Settings,
-        held: Held | None = None,
-        frames: Sequence[Contact] = (),
+        grasp: GraspState | None = None,
         sensors: Sequence[FingerPerception] = (),
     ) -> None:
         self.settings = settings
         self.limits = settings.safety
         self.hand = settings.hand
         self.fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self.held = Held() if held is None else held
-        self.frames = frames  # what each finger's newest frame alone says
+        self.grasp = GraspState() if grasp is None else grasp
         self.sensors = sensors
         self.frame_period = 1.0 / settings.tactile.rate
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
@@ -274,14 +272,14 @@ def tip_tilt(view: View, state: State, share: float) -> str:
 
 
 def hand_angle(view: View, state: State, share: float) -> str:
-    if not view.both_held(state) or len(view.frames) < 2:
+    if not view.both_held(state) or len(view.sensors) < 2:
         return ""
-    left, right = view.frames
+    left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames alone
     bound = share * view.limits.residual_angle
-    if not (left.contact and right.contact) or left.theta_std + right.theta_std > 0.25 * bound:
+    if not (left.contact and right.contact) or left.tilt_x_std + right.tilt_x_std > 0.25 * bound:
         return ""
     q = state.reading.q
-    apart = (left.theta - q[0]) - (right.theta + q[1]) + view.settings.object.taper
+    apart = (left.tilt_x - q[0]) - (right.tilt_x + q[1]) + view.settings.object.taper
     if abs(apart) <= bound:
         return ""
     return (
@@ -319,9 +317,9 @@ def hand_force(view: View, state: State, share: float) -> str:
 def hand_torque(view: View, state: State, share: float) -> str:
     if state.mode not in HELD or not view.both_held(state):
         return ""
-    control, held = view.settings.control, view.held
+    control, grasp = view.settings.control, view.grasp
     for index in view.fingers:
-        wanted = held.lever[index] * 0.5 * (state.contacts[0].force + state.contacts[1].force)
+        wanted = grasp.lever[index] * 0.5 * (state.contacts[0].force + state.contacts[1].force)
         found = control.torque_constant * state.reading.current[index]
         free = share * view.limits.residual_torque * abs(wanted) + 2.0 * control.joint_friction
         if abs(found - wanted) > free:
@@ -337,9 +335,9 @@ def slip(view: View, state: State, share: float) -> str:
     if state.mode not in HELD or not view.both_held(state):
         return ""
     bound = share * control.tip_friction * (1.0 - control.slip_margin)
-    if view.held.shear <= bound:
+    if view.grasp.shear <= bound:
         return ""
-    return f"shear is {view.held.shear:.2f} of the grip's force, above {bound:.2f}: may slip"
+    return f"shear is {view.grasp.shear:.2f} of the grip's force, above {bound:.2f}: may slip"
 
 
 # --- tactile frames -------------------------------------------------------------------------

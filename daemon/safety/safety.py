@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING, Mode
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limit_checks import PAST_STOP, View, reading_age
 from softfinger.daemon.safety.limits import ROWS, Row
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.types import Contact, Goal, State
+from softfinger.daemon.types import Goal, State
 
 _AGAIN = 1.0  # s after which a warning that was over may be told again
 _EASE = 0.95  # of a bound: what was told stands until it is below
@@ -73,12 +73,11 @@ class Safety:
         settings: Settings,
         has_servos: bool,
         has_sensors: bool,
-        held: Held | None = None,
-        frames: Sequence[Contact] = (),
+        grasp: GraspState | None = None,
         sensors: Sequence[FingerPerception] = (),
     ) -> None:
-        """``held``, ``frames`` and ``sensors`` are the loop's own, looked at and never changed."""
-        self._view = View(settings, held, frames, sensors)
+        """``grasp`` and ``sensors`` are the loop's own, looked at and never changed."""
+        self._view = View(settings, grasp, sensors)
         self._limits = settings.safety
         self._has_sensors = has_sensors
         self._fingers = self._view.fingers
@@ -228,17 +227,6 @@ class Safety:
         """The hand shall open before this fault takes its torque."""
         wanted = self._limits.frame_age_action == "open"
         return wanted and finding.name == "tactile.silent" and mode in GRIPPING
-
-    def mark_stale(self, state: State) -> None:
-        """A contact whose last sound frame is older than a fault allows is not valid."""
-        if not self._has_sensors:
-            return
-        oldest = state.t - self._frame_age
-        for index in self._fingers:
-            contact = state.contacts[index]
-            if contact.t_sound < oldest:
-                contact.valid = False
-                state.object.valid = False
 
     # Goals
 

@@ -142,7 +142,7 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path: Path) -> None:
     # waits, and does not close on what it no longer feels.
     rig = Rig(tmp_path, tactile=board, safety={"frame_age_hold": 3.0, "frame_age_fault": 40.0})
     try:
-        loop, left = rig.loop, rig.loop.perceptions[0].sensor
+        loop, left = rig.loop, rig.loop.perception.fingers[0].sensor
         rig.does("arm")
         rig.does("grasp")
         assert rig.emulator.tell("left:unplug") == "ok"

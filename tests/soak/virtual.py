@@ -252,9 +252,9 @@ class Soak:
         self.servos = FaultyServos(loop.servos, self.settings, self.daemon.clock)
         loop.servos = self.servos
         self.sensors = [
-            FaultySensor(each.sensor, self.settings, source) for each in loop.perceptions
+            FaultySensor(each.sensor, self.settings, source) for each in loop.perception.fingers
         ]
-        for perception, sensor in zip(loop.perceptions, self.sensors, strict=True):
+        for perception, sensor in zip(loop.perception.fingers, self.sensors, strict=True):
             perception.sensor = sensor
         self._well_at = math.inf  # tick at which the fault ends
         self._failed = ""

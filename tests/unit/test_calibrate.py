@@ -165,7 +165,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         assert contact.theta == pytest.approx(0.15, abs=0.01)
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
         assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
-        for perception in daemon.loop.perceptions:
+        for perception in daemon.loop.perception.fingers:
             perception.tare()  # a new zero is taken in counts, and the converter knows it
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
@@ -183,7 +183,7 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
     for each in (settings, in_pascal):
         with Daemon(each, wire=False) as daemon:
             daemon.loop.advance(0.05)
-            (perception,) = daemon.loop.perceptions
+            (perception,) = daemon.loop.perception.fingers
             frame, facts = perception.frame, perception.facts
             shown = perception.shown(frame)
             message = tactile_message(frame, shown, 0, facts, 1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.grip import Grip
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Contact, ObjectPose, Reading
 
@@ -58,7 +58,7 @@ class Twin:
     steering: bool = False
 
     def torques(
-        self, held: Held, felt: float, turned: float, dq: tuple[float, float]
+        self, held: GraspState, felt: float, turned: float, dq: tuple[float, float]
     ) -> tuple[float, float]:
         law = self.settings.control
         arm1, arm2 = held.arm
@@ -103,8 +103,8 @@ class Twin:
         return self.pull
 
 
-def some_held(generator: np.random.Generator) -> Held:
-    held = Held()
+def some_held(generator: np.random.Generator) -> GraspState:
+    held = GraspState()
     held.q = list(generator.uniform(-0.2, 0.2, 2))
     held.arm = list(generator.uniform(0.06, 0.09, 2))
     held.turn = list(generator.uniform(0.5, 1.0, 2))

@@ -176,7 +176,7 @@ def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(
     assert state.fault.startswith("the bus watchdog")
     servos.torque_on = really  # type: ignore[method-assign]
     advance_to(daemon, "grasping", 5.0)
-    sensor = daemon.loop.perceptions[0].sensor
+    sensor = daemon.loop.perception.fingers[0].sensor
     latest = sensor.latest
 
     def held_up() -> Any:

@@ -130,7 +130,7 @@ def test_too_much_force_latches_a_fault_that_waits_for_clear(make: Make) -> None
 
 def test_frames_that_stop_coming_latch_a_fault(make: Make) -> None:
     daemon = grasped(make(), 5.0)
-    perception = daemon.loop.perceptions[1]
+    perception = daemon.loop.perception.fingers[1]
     frozen = perception.frame
 
     class Silent:
@@ -163,7 +163,7 @@ def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(
     command(daemon, "rotate", angle=0.26)
     daemon.loop.advance(0.1)
     assert daemon.hand is not None
-    for perception in daemon.loop.perceptions:
+    for perception in daemon.loop.perception.fingers:
         last = perception.sensor.latest()
         perception.sensor.latest = lambda last=last: last  # type: ignore[method-assign]
     until_held = (daemon.settings.safety.frame_age_hold + 1.0) / rate
@@ -179,7 +179,7 @@ def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(
 
 def blinded(daemon: Daemon, counts: int) -> None:
     """From now on all cells of both sensors read ``counts``."""
-    for perception in daemon.loop.perceptions:
+    for perception in daemon.loop.perception.fingers:
         really = perception.sensor.latest
 
         def latest(really: Callable[[], Frame | None] = really) -> Frame | None:
@@ -293,7 +293,7 @@ def test_two_runs_with_one_seed_are_the_same_to_the_bit(make: Make) -> None:
 
 def test_tare_removes_a_standing_offset(make: Make) -> None:
     daemon = make()
-    for perception in daemon.loop.perceptions:
+    for perception in daemon.loop.perception.fingers:
         really = perception.sensor.latest
 
         def latest(
@@ -320,7 +320,7 @@ def test_a_tare_of_full_sensors_leaves_the_zero_and_is_told() -> None:
     settings = Settings.model_validate({"loop": {"clock": "virtual"}})
     with Daemon(settings, wire=False, on_event=lambda *event: events.append(event)) as daemon:
         daemon.loop.advance(0.3)
-        perception = daemon.loop.perceptions[1]
+        perception = daemon.loop.perception.fingers[1]
         before = perception._estimator.saturation
         blinded(daemon, settings.tactile.full_count)
         command(daemon, "tare")

@@ -92,7 +92,7 @@ def test_a_wedge_is_felt_and_turned_as_it_is(
             assert rig.state.object.width == pytest.approx(
                 width_at_the_contacts(rig.plant), abs=2e-4
             )
-            held = rig.daemon.loop._held
+            held = rig.daemon.loop.perception.filter.grasp
             used = np.abs(rig.plant.tangential / rig.plant.normal).max()
             assert held.shear == pytest.approx(used, abs=0.03)
             assert held.taper == pytest.approx(taper, abs=0.005)

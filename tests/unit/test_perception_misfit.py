@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softfinger import Fingertip, Material, SensorGrid
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
@@ -17,7 +17,7 @@ from softfinger.daemon.wire.messages import Parts, state_message
 def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:
     settings = Settings()
     sensor = GivenFrames()
-    perception = FingerPerception(sensor, make_models(settings, None)[0], settings)
+    perception = Perception(settings, {0: sensor}, make_models(settings, None))
     grid = SensorGrid(rows=44, cols=44, pitch=0.058 / 44)
     pressure = grid.pressure(Fingertip(0.020), Material.table_i(), 0.005, 0.1, 0.0)
     noise = np.random.default_rng(3)
@@ -29,7 +29,8 @@ def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:
         cells += noise.normal(0.0, settings.tactile.noise, cells.shape)
         counts = np.clip(cells / 4.0, 0, 65535).astype(np.uint16)
         sensor.frame = Frame(seq, 0.01 * seq, 0.01 * seq, True, counts)
-        perception.update(contact)
+        state.t = 0.01 * seq
+        perception.update(state)
 
     feel(1, 0.0)
     assert contact.valid

@@ -16,10 +16,10 @@ from softfinger.daemon.perception.calibration_file import (
     save_calibration,
     sensor_of,
 )
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_estimator, make_material, make_models
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Contact, Frame
+from softfinger.daemon.types import Frame, State
 
 PASCAL_PER_COUNT = 150.0
 FULL = 255  # 38 kPa, less than the contact's peak of 46 kPa
@@ -67,8 +67,10 @@ class Bench:
 
     def __init__(self, given: Settings) -> None:
         self.sensor = Given()
-        self.perception = FingerPerception(self.sensor, make_models(given, None)[0], given)
-        self.contact = Contact()
+        self._hand = Perception(given, {0: self.sensor}, make_models(given, None))
+        (self.perception,) = self._hand.fingers
+        self._state = State()
+        self.contact = self._state.contacts[0]
         self.noise = np.random.default_rng(3)
         self.given = given
         self.seq = 0
@@ -78,7 +80,8 @@ class Bench:
         counts = np.clip(np.round(cells / PASCAL_PER_COUNT + base), 0, FULL).astype(np.uint16)
         self.seq += 1
         self.sensor.frame = Frame(self.seq, 0.01 * self.seq, 0.01 * self.seq, True, counts)
-        self.perception.update(self.contact)
+        self._state.t = 0.01 * self.seq
+        self._hand.update(self._state)
         return self.sensor.frame
 
     def tare(self, base: float) -> None:

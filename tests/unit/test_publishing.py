@@ -49,7 +49,7 @@ def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
     listener = Listener()
     with Daemon(settings, wire=False) as daemon:
         loop = daemon.loop
-        sending = Broadcast(settings, listener, loop.perceptions, loop.statistics)  # type: ignore[arg-type]
+        sending = Broadcast(settings, listener, loop.perception.fingers, loop.statistics)  # type: ignore[arg-type]
 
         def broadcast(state: State) -> None:
             listener.seq = state.seq

@@ -17,12 +17,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.profile.settings import Safety as Limits
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import ROWS
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.types import Contact, Frame, Goal, State
+from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 SETTINGS = Settings()
 LIMITS = SETTINGS.safety
@@ -35,6 +36,7 @@ class Sensor:
     def __init__(self, finger: int) -> None:
         self.finger = finger
         self.frame: Frame | None = None
+        self.estimate = ContactEstimate()
 
     def give(self, t: float, data: Any) -> None:
         seq = 1 if self.frame is None else self.frame.seq + 1
@@ -87,8 +89,8 @@ def later(state: State, dt: float) -> None:
         contact.t_arrival += dt
 
 
-def levers(lever: float) -> Held:
-    held = Held()
+def levers(lever: float) -> GraspState:
+    held = GraspState()
     held.lever = [lever, lever]
     return held
 
@@ -103,7 +105,7 @@ def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]
 
 
 def test_a_sound_state_has_no_cause_and_no_warning() -> None:
-    judge = safety(held=levers(0.08))
+    judge = safety(grasp=levers(0.08))
     state = sound()
     state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
     assert judged(judge, state, 3.0) == ("", "")
@@ -365,25 +367,28 @@ def test_overruns_in_a_row_are_a_cause() -> None:
     assert judged(judge, state) == ("loop.overruns", "loop: 100 overruns in a row")
 
 
-def frames_of(*thetas: float) -> list[Contact]:
-    return [Contact(contact=True, valid=True, theta=theta, theta_std=1e-3) for theta in thetas]
+def felt(finger: int, theta: float) -> Sensor:
+    sensor = Sensor(finger)
+    sensor.estimate = ContactEstimate(contact=True, valid=True, tilt_x=theta)
+    sensor.estimate.covariance[1, 1] = 1e-3**2
+    return sensor
 
 
 def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -> None:
     # θ1 = φ + q1, θ2 = φ − q2: the same φ of 0.1 rad by both
-    frames = frames_of(0.1 + 0.3, 0.1 - 0.25)
-    judge, state = safety(frames=frames), sound()
+    left, right = felt(0, 0.1 + 0.3), felt(1, 0.1 - 0.25)
+    judge, state = safety(sensors=[left, right]), sound()
     state.reading.q = [0.3, 0.25]
     state.goal.q = [0.3, 0.25]
     assert judged(judge, state, 0.5) == ("", "")
-    frames[1].theta += 0.11
+    right.estimate.tilt_x += 0.11
     assert judged(judge, state, 0.5) == ("", "")
     assert [warning.name for warning in judge.warnings] == ["hand.angle"]
-    frames[1].theta += 0.1
+    right.estimate.tilt_x += 0.1
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
     assert "12.0° apart: the object lies askew" in text
-    frames[1].theta_std = 0.06  # not known well enough to accuse anybody
+    right.estimate.covariance[1, 1] = 0.06**2  # not known well enough to accuse anybody
     assert judged(judge, state, 0.5) == ("", "")
 
 
@@ -459,7 +464,7 @@ def test_a_warning_at_its_limit_does_not_flicker() -> None:
 
 
 def test_torque_that_the_tip_does_not_feel_is_told() -> None:
-    judge, state = safety(held=levers(0.08)), sound()
+    judge, state = safety(grasp=levers(0.08)), sound()
     state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
     judged(judge, state, 0.5)
     assert judge.warnings == []
@@ -470,8 +475,8 @@ def test_torque_that_the_tip_does_not_feel_is_told() -> None:
 
 
 def test_shear_near_friction_is_told() -> None:
-    held = Held()
-    judge, state = safety(held=held), sound()
+    held = GraspState()
+    judge, state = safety(grasp=held), sound()
     held.shear = 0.5
     judged(judge, state, 0.3)
     assert [each.name for each in judge.warnings if each.name == "grip.slip"] == ["grip.slip"]

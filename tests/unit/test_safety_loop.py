@@ -52,7 +52,7 @@ class Hand:
 
     def change_frames(self, finger: int, change: Callable[[Frame], Frame | None]) -> None:
         """From now on each new frame of one sensor goes through ``change``."""
-        sensor = self.loop.perceptions[finger].sensor
+        sensor = self.loop.perception.fingers[finger].sensor
         really, last = sensor.latest, [None, None]
 
         def latest() -> Frame | None:
@@ -104,7 +104,7 @@ def test_a_sensor_that_shifts_in_the_grip_is_a_fault(make: Make) -> None:
 
 def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make: Make) -> None:
     hand = make().grasp()
-    kept = hand.loop.perceptions[0].frame
+    kept = hand.loop.perception.fingers[0].frame
     assert kept is not None
     frozen = kept.data.copy()
     hand.change_frames(0, lambda frame: with_data(frame, frozen))
@@ -113,7 +113,7 @@ def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make: Make) -> None:
     assert "left sensor frozen" in hand.state.fault
     with pytest.raises(Refused, match="clear: tactile: left sensor frozen"):
         hand.command("clear")
-    del hand.loop.perceptions[0].sensor.latest  # the class's own again
+    del hand.loop.perception.fingers[0].sensor.latest  # the class's own again
     hand.loop.advance(0.2)
     hand.command("clear")
     hand.command("arm")
@@ -121,8 +121,8 @@ def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make: Make) -> None:
 
 def silent(hand: Hand) -> None:
     for finger in (0, 1):
-        kept = hand.loop.perceptions[finger].frame
-        hand.loop.perceptions[finger].sensor.latest = lambda kept=kept: kept  # type: ignore[misc]
+        kept = hand.loop.perception.fingers[finger].frame
+        hand.loop.perception.fingers[finger].sensor.latest = lambda kept=kept: kept  # type: ignore[misc]
 
 
 def test_without_frames_the_hand_opens_before_the_fault_where_that_is_wanted(make: Make) -> None:

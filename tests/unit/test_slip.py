@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.slip_monitor import SlipWatch
-from softfinger.daemon.perception.contact_filter import Held
+from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Contact
 from softfinger.tools.benchmarks.control_rig import Watched, push_along
@@ -77,8 +77,8 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
             assert (hand.plant.force.mean() > 1.2 * FORCE) == held
 
 
-def held(load: float, normal: float = 10.0) -> Held:
-    made = Held()
+def held(load: float, normal: float = 10.0) -> GraspState:
+    made = GraspState()
     made.load, made.load_lever = load, 0.03
     made.arm, made.turn = [0.079, 0.079], [0.75, 0.75]
     made.normal, made.stiffness = [normal, normal], [6e3, 6e3]

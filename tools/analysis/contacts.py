@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.tactile.replay import GivenFrames
-from softfinger.daemon.types import FINGERS, Contact, Frame
+from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.daemon.wire.own_files import write_text
 from softfinger.tools.analysis.sources import Progress, Source
 
@@ -48,8 +48,9 @@ class _Pass:
 
     def __init__(self, source: Source, finger: int) -> None:
         self._sensor = GivenFrames(source.live)
-        self._perception = FingerPerception(self._sensor, source.models[finger], source.settings)
-        self._contact = Contact()
+        self._perception = Perception(source.settings, {finger: self._sensor}, source.models)
+        self._state = State()
+        self._contact = self._state.contacts[finger]
         self._rows: list[tuple[float, ...]] = []
         shape = source.settings.tactile
         self._shape = (shape.rows, shape.cols)
@@ -61,7 +62,8 @@ class _Pass:
                 f"{self._shape[0]} × {self._shape[1]}"
             )
         self._sensor.frame = Frame(len(self._rows) + 1, t, t, True, counts)
-        self._perception.update(self._contact)
+        self._state.t = t
+        self._perception.update(self._state)
         c = self._contact
         self._rows.append(
             (

@@ -90,13 +90,13 @@ def can(daemon: Daemon, rate: float = 0.0) -> None:
     ``rate`` [Hz], 0 for the settings'.
     """
     loop = daemon.loop
-    grids: list[list[NDArray[np.uint16]]] = [[] for _ in loop.perceptions]
+    grids: list[list[NDArray[np.uint16]]] = [[] for _ in loop.perception.fingers]
     for _ in range(_KEPT):
         loop.advance(1.0 / daemon.settings.tactile.rate)
-        for kept, perception in zip(grids, loop.perceptions, strict=True):
+        for kept, perception in zip(grids, loop.perception.fingers, strict=True):
             assert perception.frame is not None
             kept.append(perception.frame.data)
-    for kept, perception in zip(grids, loop.perceptions, strict=True):
+    for kept, perception in zip(grids, loop.perception.fingers, strict=True):
         perception.sensor = CannedSensor(kept, rate or daemon.settings.tactile.rate, daemon.clock)
     if loop.servos is not None:
         loop.servos = CannedServos(loop.state.reading, daemon.clock)
@@ -107,7 +107,7 @@ def make_noisy(daemon: Daemon, rate: float) -> None:
     generator = np.random.default_rng(1)
     settings = daemon.settings.tactile
     shape = (settings.rows, settings.cols)
-    for perception in daemon.loop.perceptions:
+    for perception in daemon.loop.perception.fingers:
         grids = [
             generator.integers(0, min(settings.full_count, 60_000), shape, dtype=np.uint16)
             for _ in range(_KEPT)

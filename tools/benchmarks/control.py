@@ -141,7 +141,7 @@ def _trials(sections: dict[str, dict[str, Any]], predicted: bool = True, **contr
             }
             with Watched(merged) as hand:
                 if not predicted:
-                    hand.prediction.switch_off()
+                    hand.contact_filter.switch_off()
                 _one_trial(hand, trials)
     return trials
 

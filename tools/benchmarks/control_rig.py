@@ -40,9 +40,8 @@ class Watched:
         settings = Settings.model_validate(sections | {"loop": {"clock": "virtual"}})
         self._daemon = Daemon(settings, wire=False)
         assert self._daemon.hand is not None
-        assert self._daemon.prediction is not None
         self.plant = self._daemon.hand
-        self.prediction = self._daemon.prediction
+        self.contact_filter = self._daemon.loop.perception.filter
         self._friction = settings.simulation.tip_friction
 
     def __enter__(self) -> Watched:

@@ -109,32 +109,29 @@ def _every_tick_estimated(daemon: Daemon) -> None:
 
 
 def _always_fitted(daemon: Daemon) -> None:
-    for perception in daemon.loop.perceptions:
+    for perception in daemon.loop.perception.fingers:
         plan = perception._estimator.compiled_arguments()[0]
         plan[frame_pipeline.PEAK_LEVEL] = plan[frame_pipeline.PATCH_LEVEL] = -1e9
 
 
 def _always_cold(daemon: Daemon) -> None:
-    for perception in daemon.loop.perceptions:
-        estimator, estimate = perception._estimator, perception.estimate
+    for perception in daemon.loop.perception.fingers:
+        estimator = perception._estimator
 
-        def cold(*arguments: Any, e: Any = estimator, then: Any = estimate) -> None:
+        def cold(*arguments: Any, e: Any = estimator, then: Any = estimator.update) -> Any:
             e.reset()
-            then(*arguments)
+            return then(*arguments)
 
-        perception.estimate = cold  # type: ignore[assignment,method-assign]
+        estimator.update = cold  # type: ignore[assignment,method-assign]
 
 
 def _always_predicted(daemon: Daemon) -> None:
-    prediction = daemon.loop._prediction
-    assert prediction is not None
-
     class Live(list[bool]):
         """Both tips count as touched, whatever the frames say."""
 
         def __setitem__(self, *_: Any) -> None: ...
 
-    prediction._live = Live([True, True])
+    daemon.loop.perception.filter._live = Live([True, True])
 
 
 def _always_packed(daemon: Daemon) -> None:
@@ -147,11 +144,7 @@ def _tabulated(daemon: Daemon) -> None:
     """The constant modulus through the form of table that other materials get."""
     model = daemon.models[0]
     table = ContactTable.build(model.table.tip, model.material, form="quintic")
-    for perception in daemon.loop.perceptions:
-        perception._table = table.data
-    prediction = daemon.loop._prediction
-    assert prediction is not None
-    prediction._tables = (table.data, table.data)
+    daemon.loop.perception.filter._tables = (table.data, table.data)
 
 
 # A step: the scene that has it, and the same without it.
