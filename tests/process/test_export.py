@@ -17,7 +17,7 @@ from softfinger.tools.recordings.tables import BLOCK, CsvTable, ParquetTable, ex
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.daemon_process import softfinger
 from tests.process.test_record import written
-from tests.unit.test_contract import flat, sample
+from tests.unit.test_schema import flat, sample
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger
 from tests.harness.fake_daemon import FakeDaemon, frame, state
-from tests.unit.test_contract import flat, sample
+from tests.unit.test_schema import flat, sample
 
 Profile = Callable[[str], Path]
 TOPICS = tuple(schema.TOPICS)

@@ -23,7 +23,7 @@ from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENT, SOFTFINGER, softfinger
 from tests.harness.recorded_hand import Messages, Script, published
-from tests.unit.test_contract import sample
+from tests.unit.test_schema import sample
 
 Profile = Callable[[str], Path]
 

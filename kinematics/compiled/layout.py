@@ -1,0 +1,132 @@
+"""Named state of kernels: a record is declared once, as a class, and both sides use its fields.
+
+    class Tip(Record):
+        d: float              # [m]
+        spread: Pair          # of d and θ
+        cells: int
+        live: bool
+
+    tip = Tip()               # zeros
+    tip.d = 1e-3              # Python: reads and writes by name
+    press(tip.array, 0.1)     # a kernel that Python calls takes the array of one record …
+
+    @kernel
+    def press(tips: Records[Tip], more: float) -> None:
+        tip = tips[0]         # … and works on its first: a reference, not a copy
+        deeper(tip, more)     # inner kernels take the record itself
+
+Fields are `float`, `int` (64 bit), `bool`, another record, or an array of fixed shape by
+:data:`Annotated`. What depends on a grid's size is no field: each size would be compiled anew.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Generic, Protocol, Self, TypeVar, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pair = Annotated[NDArray[np.float64], 2]  # (left, right)
+Each = TypeVar("Each", bound="Record", covariant=True)
+
+_SCALARS: dict[Any, Any] = {float: np.float64, int: np.int64, bool: np.bool_}
+
+
+class Records(Protocol, Generic[Each]):
+    """A structured array of one record class, as kernels index it."""
+
+    def __getitem__(self, index: int, /) -> Each: ...
+    def __len__(self) -> int: ...
+
+
+class _Slotted(type):
+    """Leaves a record no place for attributes that are no fields: a misspelt one is an error."""
+
+    def __new__(meta, name: str, bases: tuple[type, ...], names: dict[str, Any]) -> _Slotted:
+        return super().__new__(meta, name, bases, {"__slots__": (), **names})
+
+
+class Record(metaclass=_Slotted):
+    """State with names. A subclass's annotations are its fields; see the module."""
+
+    __slots__ = ("_fields", "array")
+
+    dtype: np.dtype[np.void]
+    array: Records[Self]  # of one record: what a kernel takes
+
+    def __init_subclass__(cls) -> None:
+        hints = get_type_hints(cls, include_extras=True)
+        kinds = {name: _kind(hints[name]) for name in cls.__annotations__}
+        # Aligned as C has it, or Numba reads each field as if it might lie anywhere.
+        cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
+        for name, (inner, _, shape) in kinds.items():
+            setattr(cls, name, _field(name, inner, shape))
+
+    def __init__(self, array: NDArray[np.void] | None = None) -> None:
+        """A record of zeros, or the first of ``array``."""
+        one: Any = np.zeros(1, self.dtype) if array is None else array
+        if one.dtype != self.dtype:
+            raise TypeError(f"{type(self).__name__}: expected {self.dtype}, found {one.dtype}")
+        self.array = one
+        # Views that are kept: making one takes ten times as long as reading by it.
+        parts = ((name, one[name][:1]) for name in one.dtype.names)
+        self._fields = {name: part.reshape(part.shape[1:]) for name, part in parts}
+        for name, view in self._fields.items():
+            inner = getattr(type(self), name).inner
+            if inner is not None:
+                self._fields[name] = (
+                    inner(view.reshape(1)) if view.ndim == 0 else _Many(inner, view)
+                )
+
+
+class _Many(list[Any]):
+    """An array of records inside a record: their views, and the array for kernels."""
+
+    def __init__(self, kind: type[Record], array: Any) -> None:
+        super().__init__(kind(array[k : k + 1]) for k in range(len(array)))
+        self.array = array
+
+
+class _Scalar:
+    inner = None
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, record: Any, owner: Any) -> Any:
+        return self if record is None else record._fields[self._name].item()
+
+    def __set__(self, record: Any, value: Any) -> None:
+        record._fields[self._name][()] = value
+
+
+class _Part:
+    def __init__(self, name: str, inner: Any) -> None:
+        self._name = name
+        self.inner = inner
+
+    def __get__(self, record: Any, owner: Any) -> Any:
+        return self if record is None else record._fields[self._name]
+
+    def __set__(self, record: Any, value: Any) -> None:
+        if self.inner is not None:
+            raise AttributeError(f"{self._name} is a record: set its fields")
+        record._fields[self._name][...] = value
+
+
+def _field(name: str, inner: Any, shape: tuple[int, ...]) -> Any:
+    return _Scalar(name) if inner is None and not shape else _Part(name, inner)
+
+
+def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
+    """(record class or None, type of one element, shape) of an annotation."""
+    shape = getattr(hint, "__metadata__", ())
+    base = hint.__origin__ if shape else hint
+    if base in _SCALARS:
+        return None, _SCALARS[base], ()
+    if isinstance(base, type) and issubclass(base, Record):
+        return base, base.dtype, ()
+    inner = base.__args__[-1]
+    if isinstance(inner, type) and issubclass(inner, Record):
+        return inner, inner.dtype, shape
+    return None, inner.__args__[0], shape  # NDArray[...]
