@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,3 +131,45 @@ class State:
     object: ObjectPose = field(default_factory=ObjectPose)
     goal: Goal = field(default_factory=Goal)
     timing: Timing = field(default_factory=Timing)
+
+
+class Parts(NamedTuple):
+    """What the scene has: which fingers, and whether they have servos and sensors."""
+
+    fingers: tuple[bool, bool]
+    servos: bool
+    sensors: bool
+
+
+class SensorFacts(NamedTuple):
+    """What subscribers learn of a tactile sensor with each frame; see ``hand/tactile``."""
+
+    pitch: float  # from column to column [m]
+    pitch_y: float  # from row to row [m]
+    centre_x: float  # the tip's centre off the grid's [m]
+    centre_y: float
+    rotation: float  # of the sensor's axes against the finger's [rad]
+    unit: str  # of the published data: "count" or "Pa"
+    scale: float  # one step of the data [Pa]
+    calibrated: bool
+    calibration: str  # name and date, or empty
+
+
+class HandFacts(NamedTuple):
+    """What doesn't change while a daemon runs; texts of JSON, empty where there is nothing."""
+
+    version: str
+    settings: str
+    calibration_left: str
+    calibration_right: str
+    table_left: str
+    table_right: str
+
+
+class Truth(Protocol):
+    """What a simulated hand knows: arrays of both tips, and the object's x, y, φ."""
+
+    d: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    force: NDArray[np.float64]
+    object_pose: NDArray[np.float64]

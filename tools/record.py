@@ -317,10 +317,10 @@ class _Recorder:
 
 
 def _topics(named: list[bytes] | None) -> list[bytes]:
-    from softfinger.daemon.wire import messages, schema
+    from softfinger.daemon.wire import schema
 
     if named is None:
-        return [each for each in schema.TOPICS if each != messages.INPUT]
+        return [each for each in schema.TOPICS if each != schema.INPUT]
     return list(schema.TOPICS) if ALL in named else named
 
 

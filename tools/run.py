@@ -149,13 +149,13 @@ def _tell_times(loop: Any, log: EventLog) -> None:
 
 def _record(path: Path, settings: Settings, daemon: Any) -> Any:
     """A recorder that has subscribed to everything. Raises NoRecorder."""
-    from softfinger.daemon.wire import messages
+    from softfinger.daemon.wire import schema
     from softfinger.daemon.wire.publisher import bit
     from softfinger.tools.processes.recorder_beside import RecorderBeside
 
     def subscribed() -> bool:
         daemon.publisher.look()
-        return bool(daemon.publisher.wanted & bit(messages.INPUT))
+        return bool(daemon.publisher.wanted & bit(schema.INPUT))
 
     def ended(why: str) -> None:
         daemon.loop.report("error", "record", why)

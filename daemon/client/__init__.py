@@ -19,15 +19,9 @@ needs no more than its two addresses; nothing in it touches the daemon's own sta
 from softfinger.daemon.client.asynchronous import AsyncHand
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.client.hand import Hand
-from softfinger.daemon.client.records import (
-    Event,
-    FingerState,
-    HandState,
-    ObjectState,
-    TactileFrame,
-    to_columns,
-)
+from softfinger.daemon.client.records import to_columns
 from softfinger.daemon.errors import HandFault, NoStream, NotInTime, Refused
+from softfinger.daemon.wire.schema import Event, FingerState, HandState, ObjectState, TactileFrame
 
 __all__ = [
     "AsyncHand",

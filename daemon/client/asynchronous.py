@@ -16,12 +16,13 @@ import zmq.asyncio
 from softfinger.daemon.client.command_client import LOCALLY, NoAnswer
 from softfinger.daemon.client.hand import COMMANDS, STREAM, accepted
 from softfinger.daemon.client.patience import PATIENCE, SILENCE, answer_to, still_waiting
-from softfinger.daemon.client.records import Event, HandState, TactileFrame
 from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
 from softfinger.daemon.errors import HandFault, NoStream, NotInTime
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import load_client
 from softfinger.daemon.wire.local_stop import stop_locally
+from softfinger.daemon.wire.packer import pack
+from softfinger.daemon.wire.schema import Event, HandState, TactileFrame
 
 _log = logging.getLogger(__name__)
 
@@ -54,15 +55,15 @@ class AsyncHand:
 
     def stream(self) -> AsyncIterator[HandState]:
         """States one after the other, every one that is published."""
-        return self._records(messages.STATE)
+        return self._records(schema.STATE)
 
     def frames(self) -> AsyncIterator[TactileFrame]:
         """Tactile frames of both fingers."""
-        return self._records(messages.TACTILE)
+        return self._records(schema.TACTILE)
 
     def events(self) -> AsyncIterator[Event]:
         """What the daemon tells: modes, faults, warnings."""
-        return self._records(messages.EVENT)
+        return self._records(schema.EVENT)
 
     async def _records(self, topic: bytes) -> AsyncIterator[Any]:
         decoder = Decoder(topic)
@@ -95,7 +96,7 @@ class AsyncHand:
         last: HandState | None = None
         states = self.stream()
         told = asyncio.get_running_loop().call_later(
-            SILENCE, silent, self.stream_address, messages.STATE, timeout
+            SILENCE, silent, self.stream_address, schema.STATE, timeout
         )
         try:
             async with asyncio.timeout(timeout):
@@ -111,7 +112,7 @@ class AsyncHand:
             told.cancel()
             await states.aclose()  # type: ignore[attr-defined]
         if last is None:
-            raise NoStream(nothing_from(self.stream_address, messages.STATE, timeout))
+            raise NoStream(nothing_from(self.stream_address, schema.STATE, timeout))
         raise NotInTime(f"not within {timeout:g} s; the last state: mode {last.mode}")
 
     async def command(self, name: str, **numbers: float) -> dict[str, Any]:
@@ -127,7 +128,7 @@ class AsyncHand:
                 return accepted(stopped)
         async with self._socket(zmq.REQ) as socket:
             socket.connect(self.command_address)
-            await socket.send(messages.pack(request))
+            await socket.send(pack(request))
             silence = min(SILENCE, self.timeout)
             answered = await socket.poll(silence * 1e3)
             what = answer_to(request, self.command_address)

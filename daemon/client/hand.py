@@ -13,12 +13,12 @@ import zmq
 
 from softfinger.daemon.client.command_client import send
 from softfinger.daemon.client.patience import PATIENCE, SILENCE
-from softfinger.daemon.client.records import Event, HandState, TactileFrame
 from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
 from softfinger.daemon.errors import HandFault, NoStream, NotInTime, Refused
 from softfinger.daemon.profile.settings import CommandSettings, Stream
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import load_client
+from softfinger.daemon.wire.schema import Event, HandState, TactileFrame
 
 _Record = TypeVar("_Record")
 
@@ -149,15 +149,15 @@ class Hand:
 
     def stream(self, timeout: float | None = None) -> Subscription[HandState]:
         """States one after the other, every one that is published."""
-        return Subscription(self._context, self.stream_address, messages.STATE, timeout)
+        return Subscription(self._context, self.stream_address, schema.STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
         """Tactile frames of both fingers; `TactileFrame.finger` tells whose."""
-        return Subscription(self._context, self.stream_address, messages.TACTILE, timeout)
+        return Subscription(self._context, self.stream_address, schema.TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:
         """What the daemon tells: modes, faults, warnings."""
-        return Subscription(self._context, self.stream_address, messages.EVENT, timeout)
+        return Subscription(self._context, self.stream_address, schema.EVENT, timeout)
 
     def collect(self, seconds: float) -> list[HandState]:
         """All states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
@@ -192,7 +192,7 @@ class Hand:
                     if state is not None:
                         raise NotInTime(_late(state, timeout)) from None
                     raise NoStream(
-                        nothing_from(self.stream_address, messages.STATE, timeout)
+                        nothing_from(self.stream_address, schema.STATE, timeout)
                     ) from None
                 if condition(state):
                     return state

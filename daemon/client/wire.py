@@ -5,27 +5,20 @@ from __future__ import annotations
 import logging
 import warnings
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import msgpack
 import zmq
 
 from softfinger.daemon.client.patience import still_waiting
-from softfinger.daemon.client.records import read_event, read_frame, read_state
-from softfinger.daemon.wire import messages
+from softfinger.daemon.client.records import read
+from softfinger.daemon.wire import schema
 
 _QUEUE = 100_000  # messages kept for a program that is slow for a while
 _AGAIN = 1000  # messages that are known again
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 _log = logging.getLogger(__name__)
-
-READERS: dict[bytes, Callable[[dict[str, Any]], Any]] = {
-    messages.STATE: read_state,
-    messages.TACTILE: read_frame,
-    messages.EVENT: read_event,
-}
 
 
 def prepare(socket: Any, address: str, *topics: bytes) -> None:
@@ -93,7 +86,7 @@ class Decoder:
     """Turns what comes off the wire into records, counts gaps and tells a foreign schema once."""
 
     def __init__(self, topic: bytes) -> None:
-        self._read = READERS[topic]
+        self._record = schema.TOPICS[topic].record
         self.gaps = Gaps()
         self.unreadable = 0
         self._told = False
@@ -104,17 +97,17 @@ class Decoder:
             message = msgpack.unpackb(frames[-1])
             if not isinstance(message, dict):
                 raise ValueError("not a map")
-            record = self._read(message)
+            record = read(self._record, message)
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
             self.unreadable += 1
             return None
         if not self.gaps.take(message):
             return None
-        schema = message.get("schema")
-        if schema != messages.SCHEMA and not self._told:
+        found = message.get("schema")
+        if found != schema.SCHEMA and not self._told:
             self._told = True
             warnings.warn(
-                f"the stream is of schema {schema!r}, this client knows {messages.SCHEMA}; "
+                f"the stream is of schema {found!r}, this client knows {schema.SCHEMA}; "
                 "it keeps to the fields it knows",
                 stacklevel=3,
             )

@@ -26,11 +26,10 @@ from softfinger.daemon.servos import make_servos
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.tactile.base import TactileSensor
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.types import FINGERS, HandFacts
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
-from softfinger.daemon.wire.messages import Facts
-from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
 if TYPE_CHECKING:
@@ -99,7 +98,7 @@ class Daemon:
             Config(
                 stream.address,
                 commands.address,
-                TOPICS,
+                GATEWAY_TOPICS,
                 stream.queue,
                 commands.max_bytes,
                 commands.per_second,
@@ -165,7 +164,7 @@ class Daemon:
         self.close()
 
 
-def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> Facts:
+def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFacts:
     """What subscribers are told of this hand once: settings, calibrations, tables' certificates."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
@@ -180,4 +179,4 @@ def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> Facts:
         )
         for model in models
     ]
-    return Facts(version("softfinger"), settings.model_dump_json(), *calibrations, *tables)
+    return HandFacts(version("softfinger"), settings.model_dump_json(), *calibrations, *tables)

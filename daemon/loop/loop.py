@@ -25,9 +25,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import BUS, Safety
 from softfinger.daemon.safety.torque_state import Drive
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.types import State
+from softfinger.daemon.types import State, Truth
 from softfinger.daemon.wire.command_server import Handler
-from softfinger.daemon.wire.messages import Truth
 from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]

@@ -12,13 +12,13 @@ from softfinger.daemon.loop.rates import Schedule
 from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, State
-from softfinger.daemon.wire import messages
-from softfinger.daemon.wire.messages import Parts, Rates, Truth
+from softfinger.daemon.types import Frame, Parts, State, Truth
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import Publisher, bit
+from softfinger.daemon.wire.schema import Rates
 
 _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
-    bit, (messages.STATE, messages.TACTILE, messages.STATS, messages.INPUT, messages.TRUTH)
+    bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
 
 
@@ -32,6 +32,15 @@ class _Counts:
     maps: int = 0
     left: int = 0
     right: int = 0
+
+
+def parts(settings: Settings) -> Parts:
+    """What the scene of these settings has."""
+    return Parts(
+        fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
+        servos=settings.servos.backend != "none",
+        sensors=settings.tactile.backend != "none",
+    )
 
 
 class Broadcast:
@@ -49,7 +58,7 @@ class Broadcast:
         self._statistics = statistics
         self._schedule = Schedule(settings)
         self._period = 1.0 / settings.loop.rate
-        self._scene = Parts.of(settings)
+        self._scene = parts(settings)
         self.truth: Truth | None = None  # a simulated hand's
         self._numbers = [0, 0]  # frames of each finger that went out
         self._seen: list[Frame | None] = [None, None]  # newest of each finger

@@ -16,8 +16,7 @@ from softfinger.daemon.perception.contact_filter import ContactFilter
 from softfinger.daemon.profile.factory import FingerModel, make_estimator
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
-from softfinger.daemon.types import FINGERS, Event, Frame, State
-from softfinger.daemon.wire.messages import SensorFacts
+from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16

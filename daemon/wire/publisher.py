@@ -1,8 +1,8 @@
 """The publisher: messages of the stream, packed and given to the gateway.
 
 A subscriber that comes late, stops reading or dies changes nothing here: the gateway sends to all
-of them. Topics that nobody subscribes to are not packed. Late subscribers are told the settings and
-the last events again, with ``again`` true, by the gateway.
+of them, and repeats the settings and the last events, with ``again`` true, for late ones. Topics
+that nobody subscribes to are not packed.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ from numpy.typing import NDArray
 from softfinger.daemon.gateway.config import Topics
 from softfinger.daemon.gateway.link import Link
 from softfinger.daemon.loop.timing import Statistics
-from softfinger.daemon.types import Frame, State
-from softfinger.daemon.wire import messages
-from softfinger.daemon.wire.packer import InputMap, StateMap
-
-_TOPICS = (
-    messages.STATE,
-    messages.TACTILE,
-    messages.STATS,
-    messages.INPUT,
-    messages.TRUTH,
-    messages.EVENT,
-    messages.COMMAND,
-    messages.SETTINGS,
+from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State, Truth
+from softfinger.daemon.wire.packer import packer
+from softfinger.daemon.wire.schema import (
+    COMMAND,
+    EVENT,
+    INPUT,
+    SETTINGS,
+    STATE,
+    STATS,
+    TACTILE,
+    TOPICS,
+    TRUTH,
+    Rates,
 )
-_INDEX = {topic: index for index, topic in enumerate(_TOPICS)}
-TOPICS = Topics(
-    tuple(topic.decode() for topic in _TOPICS), _INDEX[messages.SETTINGS], _INDEX[messages.EVENT]
+
+_INDEX = {topic: index for index, topic in enumerate(TOPICS)}
+GATEWAY_TOPICS = Topics(
+    tuple(topic.decode() for topic in TOPICS), settings=_INDEX[SETTINGS], events=_INDEX[EVENT]
 )
 
 
@@ -40,7 +41,7 @@ def bit(topic: bytes) -> int:
     return 1 << _INDEX[topic]
 
 
-_COMMANDS = bit(messages.COMMAND)
+_COMMANDS = bit(COMMAND)
 
 
 class Publisher:
@@ -48,8 +49,8 @@ class Publisher:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._pack_state, self._pack_input = StateMap(), InputMap()
-        self._told = {messages.EVENT: 0, messages.COMMAND: 0, messages.SETTINGS: 0}
+        self._pack = {topic: packer(topic) for topic in TOPICS}
+        self._counts = {EVENT: 0, COMMAND: 0, SETTINGS: 0}
 
     @property
     def wanted(self) -> int:
@@ -60,73 +61,61 @@ class Publisher:
         """Learn who came and went. The loop does by taking in commands."""
         self._link.look()
 
-    def state(self, state: State, scene: messages.Parts, step: int = 1) -> None:
+    def state(self, state: State, scene: Parts, step: int = 1) -> None:
         """Publish ``hand/state``, every ``step`` ticks."""
-        self._send_packed(messages.STATE, self._pack_state(state, scene, step))
+        self._send(STATE, state, scene, step)
 
     def input(self, state: State, frames: tuple[Frame | None, Frame | None]) -> None:
         """Publish ``hand/input``, every tick."""
-        self._send_packed(messages.INPUT, self._pack_input(state, frames))
+        self._send(INPUT, state, frames)
 
-    def truth(self, state: State, truth: messages.Truth, step: int = 1) -> None:
+    def truth(self, state: State, truth: Truth, step: int = 1) -> None:
         """Publish ``hand/truth``, every ``step`` ticks."""
-        self._send(messages.TRUTH, messages.truth_message(state, truth, step))
+        self._send(TRUTH, state, truth, step)
 
     def tactile(
         self,
         frame: Frame,
         data: NDArray[np.uint16],
         finger: int,
-        facts: messages.SensorFacts,
+        facts: SensorFacts,
         wall: float,
         step: int = 1,
         number: int = 0,
     ) -> None:
-        """Publish one finger's frame on ``hand/tactile``, see `wire.messages.tactile_message`."""
-        message = messages.tactile_message(frame, data, finger, facts, wall, step, number)
-        self._send(messages.TACTILE, message)
+        """Publish one finger's frame on ``hand/tactile``; it was sampled at Unix time ``wall``.
+
+        ``data`` [rows, cols] is the frame's, in steps as in ``facts``; one of ``step`` frames is
+        sent, and this is the ``number``-th of the sensor.
+        """
+        self._send(TACTILE, frame, data, finger, facts, wall, step, number)
 
     def stats(
-        self,
-        state: State,
-        period: float,
-        rates: messages.Rates,
-        statistics: Statistics,
-        step: int = 1,
+        self, state: State, period: float, rates: Rates, statistics: Statistics, step: int = 1
     ) -> None:
         """Publish ``hand/stats``, every ``step`` ticks."""
-        message = messages.stats_message(state, period, rates, statistics, step)
-        self._send(messages.STATS, message)
+        self._send(STATS, state, period, rates, statistics, step)
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
-        seq = self._count(messages.EVENT)
-        message = messages.event_message(seq, wall, t, level, kind, text)
-        self._send(messages.EVENT, message)
+        packed = self._pack[EVENT](self._count(EVENT), wall, t, level, kind, text)
+        self._link.publish(_INDEX[EVENT], packed, keep=True)
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
     ) -> None:
-        """Publish ``hand/command``: what came and what became of it."""
+        """Publish ``hand/command``; ``error`` is why it was refused, or empty."""
         if self._link.wanted & _COMMANDS:
-            seq = self._count(messages.COMMAND)
-            message = messages.command_message(seq, wall, t, tick, request, error)
-            self._send(messages.COMMAND, message)
+            self._send(COMMAND, self._count(COMMAND), wall, t, tick, request, error)
 
-    def settings(self, wall: float, t: float, facts: messages.Facts) -> None:
+    def settings(self, wall: float, t: float, facts: HandFacts) -> None:
         """Publish ``hand/settings``, once."""
-        message = messages.settings_message(self._count(messages.SETTINGS), wall, t, facts)
-        self._send(messages.SETTINGS, message)
+        packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, facts)
+        self._link.publish_lasting(_INDEX[SETTINGS], packed)
 
     def _count(self, topic: bytes) -> int:
-        self._told[topic] += 1
-        return self._told[topic]
+        self._counts[topic] += 1
+        return self._counts[topic]
 
-    def _send(self, topic: bytes, message: dict[str, Any]) -> None:
-        self._send_packed(topic, messages.pack(message))
-
-    def _send_packed(self, topic: bytes, packed: bytes) -> None:
-        if topic == messages.SETTINGS:
-            self._link.publish_lasting(_INDEX[topic], packed)
-        else:
-            self._link.publish(_INDEX[topic], packed, keep=topic == messages.EVENT)
+    def _send(self, topic: bytes, *arguments: object) -> None:
+        self._link.publish(_INDEX[topic], self._pack[topic](*arguments))

@@ -12,7 +12,7 @@ from softfinger.daemon.gateway import link
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.service import open_service
 from softfinger.daemon.wire.command_server import CommandServer, Handler
-from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 
 
 class Served:
@@ -33,7 +33,9 @@ class Served:
     ) -> None:
         self.link = link.Link()
         ours, theirs = link.pair()
-        config = Config(stream, commands, TOPICS, queue, max_bytes, per_second, ipc_mode, keys)
+        config = Config(
+            stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
+        )
         try:
             self.service = open_service(theirs, config, places, now)
         except BaseException:

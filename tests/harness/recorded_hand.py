@@ -10,9 +10,11 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
+from softfinger.daemon.gateway.link import Link
 from softfinger.daemon.loop.build import Daemon, facts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire.command_server import Handler
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
 from softfinger.tools.recordings.writer import RecordingWriter
 
 Messages = list[tuple[bytes, dict[str, Any]]]
@@ -42,6 +44,20 @@ class Script:
         pass
 
 
+class Keeping(Link):
+    """Keeps what is published, in the place of the link to the gateway."""
+
+    def __init__(self, taken: Messages) -> None:
+        super().__init__()
+        self._taken = taken
+        self.wanted = -1
+
+    def publish(self, topic: int, message: bytes, keep: bool = False) -> None:
+        self._taken.append((GATEWAY_TOPICS.names[topic].encode(), msgpack.unpackb(message)))
+
+    publish_lasting = publish
+
+
 def published(
     folder: Path, script: Script, seconds: float, changes: tuple[str, ...] = ()
 ) -> Messages:
@@ -56,15 +72,10 @@ def published(
         ]
     )
     taken: Messages = []
-
-    def take(topic: bytes, packed: bytes) -> None:
-        taken.append((topic, msgpack.unpackb(packed)))
-
     with Daemon(settings) as daemon:
         publisher = daemon.publisher
         assert publisher is not None
-        publisher._send_packed = take  # type: ignore[method-assign]
-        publisher._link.wanted = -1
+        publisher._link = Keeping(taken)
         publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
         daemon.loop._server = script
         daemon.loop.advance(seconds)

@@ -13,8 +13,9 @@ import pytest
 from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame
-from softfinger.daemon.wire import messages
+from softfinger.daemon.types import Frame, HandFacts, SensorFacts
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import message_maker
 from softfinger.tools.analysis.contacts import analyse, write_csv
 from softfinger.tools.analysis.sources import open_source
 from softfinger.tools.recordings.writer import RecordingWriter
@@ -53,13 +54,13 @@ def check(path: Path) -> None:
 
 def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
     writer = RecordingWriter(path)
-    facts = messages.Facts("0.1.0", settings.model_dump_json(), "", "", "", "")
-    writer.add(messages.SETTINGS, messages.settings_message(1, 1e9, 1.0, facts))
-    sensor = messages.SensorFacts(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
+    facts = HandFacts("0.1.0", settings.model_dump_json(), "", "", "", "")
+    writer.add(schema.SETTINGS, message_maker(schema.SETTINGS)(1, 1e9, 1.0, facts))
+    sensor = SensorFacts(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
     for k, data in enumerate(counts):
         frame = Frame(k + 1, 0.01 * k, 0.01 * k, True, data)
-        message = messages.tactile_message(frame, data, 0, sensor, 1e9 + 0.01 * k)
-        writer.add(messages.TACTILE, message)
+        message = message_maker(schema.TACTILE)(frame, data, 0, sensor, 1e9 + 0.01 * k)
+        writer.add(schema.TACTILE, message)
     writer.close()
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.tables import BLOCK, CsvTable, ParquetTable, export
 from softfinger.tools.recordings.writer import RecordingWriter
@@ -28,11 +28,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_csv_has_every_field_with_all_its_digits(path: Path, tmp_path: Path) -> None:
-    export(Recording(path), tmp_path, CsvTable, [messages.STATE])
+    export(Recording(path), tmp_path, CsvTable, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == BLOCK + 50
-    expected = flat(sample(messages.STATE))
+    expected = flat(sample(schema.STATE))
     assert list(rows[0]) == list(expected)
     for name, value in expected.items():
         if name not in ("seq", "timestamp"):
@@ -44,7 +44,7 @@ def test_csv_has_every_field_with_all_its_digits(path: Path, tmp_path: Path) -> 
 def test_parquet_keeps_types_and_frames(path: Path, tmp_path: Path) -> None:
     import pyarrow.parquet
 
-    topics = [messages.STATE, messages.TACTILE]
+    topics = [schema.STATE, schema.TACTILE]
     files = export(Recording(path), tmp_path, ParquetTable, topics)
     assert {file.name for file in files} == {
         "hand-state.parquet",
@@ -56,7 +56,7 @@ def test_parquet_keeps_types_and_frames(path: Path, tmp_path: Path) -> None:
     assert table.num_rows == BLOCK + 50
     kinds = {"seq": "int64", "left.force": "double", "torque": "bool", "mode": "string"}
     assert {name: str(table.schema.field(name).type) for name in kinds} == kinds
-    assert table["left.force"][0].as_py() == sample(messages.STATE)["left"]["force"]
+    assert table["left.force"][0].as_py() == sample(schema.STATE)["left"]["force"]
     frames = pyarrow.parquet.read_table(tmp_path / "hand-tactile.parquet")
     raw = np.load(tmp_path / "tactile-left.npz")
     assert raw["frames"].shape == (103, 44, 44)
@@ -67,12 +67,12 @@ def test_parquet_keeps_types_and_frames(path: Path, tmp_path: Path) -> None:
 
 def test_numbers_that_are_none_are_empty_cells(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap")
-    message = sample(messages.STATE)
+    message = sample(schema.STATE)
     message["left"]["force"] = math.nan
     message["news"] = 3.5  # of a newer daemon
-    writer.add(messages.STATE, message)
+    writer.add(schema.STATE, message)
     writer.close()
-    export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [messages.STATE])
+    export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         [row] = csv.DictReader(file)
     assert (row["left.force"], row["news"]) == ("", "3.5")
@@ -99,7 +99,7 @@ def test_what_can_not_be_exported(tmp_path: Path) -> None:
     assert "no messages in it" in done.stderr
     (tmp_path / "file").write_text("")
     writer = RecordingWriter(tmp_path / "b.mcap")
-    writer.add(messages.STATE, sample(messages.STATE))
+    writer.add(schema.STATE, sample(schema.STATE))
     writer.close()
     done = softfinger("export", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "file"))
     assert done.returncode == 1

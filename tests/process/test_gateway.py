@@ -23,7 +23,7 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
-from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import until
 from tests.harness.daemon_process import Running, softfinger
 from tests.harness.zmtp_client import RawClient
@@ -102,7 +102,7 @@ def test_the_gateway_leaves_with_its_daemon(
 
 
 def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
-    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
+    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         first = gateway.process
         os.kill(first, signal.SIGALRM)  # as its own alarm does, which it puts off while it works
@@ -113,7 +113,7 @@ def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
 
 
 def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, str]) -> None:
-    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
+    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
         (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
@@ -126,7 +126,7 @@ def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, 
 def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(
     addresses: tuple[str, str],
 ) -> None:
-    gateway = Gateway(Config(*addresses, TOPICS, 100)).wait()
+    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         publisher = Publisher(gateway.link)
         gateway.link.look()
@@ -243,7 +243,7 @@ def is_zombie(process: int) -> bool:
 
 def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses: tuple[str, str]) -> None:
     ours, theirs = link.pair()
-    config = Config(*addresses, TOPICS, 10, 200, 10.0, 0o600, "")
+    config = Config(*addresses, GATEWAY_TOPICS, 10, 200, 10.0, 0o600, "")
     with ours, theirs:
         process = subprocess.Popen(
             [

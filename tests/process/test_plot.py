@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools import plot
 from softfinger.tools.analysis import plots, plots_model
 from softfinger.tools.analysis.plots_data import MODES, Missing, Run, load_run
@@ -245,7 +245,7 @@ def test_a_gap_in_the_stream_breaks_the_line(run: Run) -> None:
 
 def test_pages_are_left_out_with_a_word(tmp_path: Path, call: Call) -> None:
     path = tmp_path / "a.mcap"
-    record_hand(path, {50: {"command": "arm"}}, 0.5, without=(messages.TRUTH, messages.SETTINGS))
+    record_hand(path, {50: {"command": "arm"}}, 0.5, without=(schema.TRUTH, schema.SETTINGS))
     status, said = call(path, "--out", tmp_path / "out")
     assert status == 0
     drawn = sorted(each.name for each in (tmp_path / "out").iterdir())

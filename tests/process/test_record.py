@@ -21,7 +21,8 @@ import zmq
 
 from softfinger.daemon.client import Hand
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.wire import messages, schema
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recover import recover
 from softfinger.tools.recordings.writer import RecordingWriter
@@ -70,9 +71,9 @@ def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
     """A recording of ``count`` states with frames between them, and what went into it."""
     sent: list[tuple[bytes, dict[str, Any]]] = []
     for k in range(count):
-        sent.append((messages.STATE, {**sample(messages.STATE), "seq": k, "timestamp": 1e9 + k}))
+        sent.append((schema.STATE, {**sample(schema.STATE), "seq": k, "timestamp": 1e9 + k}))
         if k % 10 == 0:
-            sent.append((messages.TACTILE, {**frame(k / 25, k % 20 // 10), "timestamp": 1e9 + k}))
+            sent.append((schema.TACTILE, {**frame(k / 25, k % 20 // 10), "timestamp": 1e9 + k}))
     writer = RecordingWriter(path)
     writer.attach("settings", "application/json", b"{}")
     for topic, message in sent:
@@ -93,7 +94,7 @@ def test_what_is_read_is_what_was_published(tmp_path: Path) -> None:
         }
     assert not recording.truncated
     assert recording.duration == 399.0
-    assert recording.count(messages.STATE) == 400
+    assert recording.count(schema.STATE) == 400
     assert recording.counts["hand/tactile/left"] == 20
     assert recording.attachments == {"settings": b"{}"}
 
@@ -108,7 +109,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path: Path, topic: byt
     writer.close()
     [(told, message)] = Recording(path).messages()
     assert told == topic
-    golden = msgpack.unpackb(messages.pack(sample(topic)))
+    golden = msgpack.unpackb(pack(sample(topic)))
     assert message == golden
     with path.open("rb") as file:
         [(schema, channel, raw)] = make_reader(file).iter_messages()
@@ -121,11 +122,11 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path: Path, topic: byt
 
 def test_numbers_that_are_none_come_back_as_such(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap")
-    message = sample(messages.STATE)
+    message = sample(schema.STATE)
     message["left"]["force"] = math.nan
     message["tick_s"] = math.inf
-    writer.add(messages.STATE, message)
-    writer.add(messages.STATE, {"seq": 2**70, "left": {1, 2}})
+    writer.add(schema.STATE, message)
+    writer.add(schema.STATE, {"seq": 2**70, "left": {1, 2}})
     writer.close()
     assert writer.unfit == 1
     [(_, read)] = Recording(tmp_path / "a.mcap").messages()
@@ -140,8 +141,8 @@ def test_a_part_in_time_and_by_topic(tmp_path: Path) -> None:
     part = [each for each in sent if 499.5 <= each[1]["timestamp"] - 1e9 <= 600.5]
     assert list(recording.messages(start=499.5, end=600.5)) == part
     seen: list[int] = []
-    frames = list(recording.messages([messages.TACTILE], progress=seen.append))
-    assert frames == [each for each in sent if each[0] == messages.TACTILE]
+    frames = list(recording.messages([schema.TACTILE], progress=seen.append))
+    assert frames == [each for each in sent if each[0] == schema.TACTILE]
     assert seen == sorted(seen)
 
 
@@ -221,12 +222,12 @@ def test_recording_a_running_daemon_loses_nothing(
     assert "lost on the way: none" in out
     recording = Recording(path)
     assert not recording.truncated
-    seqs = [m["seq"] for _, m in recording.messages([messages.STATE])]
+    seqs = [m["seq"] for _, m in recording.messages([schema.STATE])]
     assert len(seqs) > 10
     assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
-    kinds = {message["kind"] for _, message in recording.messages([messages.EVENT])}
+    kinds = {message["kind"] for _, message in recording.messages([schema.EVENT])}
     assert "mode" in kinds
-    assert recording.count(messages.TACTILE) > 0
+    assert recording.count(schema.TACTILE) > 0
 
 
 def test_a_killed_recorder_leaves_a_file_that_can_be_closed(
@@ -294,10 +295,10 @@ def test_what_was_sent_before_the_end_is_written(
     process = record(path, "--address", addresses[0], "--topics", "state")
     assert publisher.poll(60_000)
     assert publisher.recv() == b"\x01hand/state"
-    message = sample(messages.STATE)
+    message = sample(schema.STATE)
     for k in range(5000):
-        publisher.send(messages.STATE, zmq.SNDMORE)
-        publisher.send(messages.pack({**message, "seq": k}))
+        publisher.send(schema.STATE, zmq.SNDMORE)
+        publisher.send(pack({**message, "seq": k}))
     context.destroy(linger=-1)  # returns when all is on its way
     process.send_signal(signal.SIGTERM)
     status, out, _ = ended(process)
@@ -313,7 +314,7 @@ def test_split_files_follow_each_other(fake: FakeDaemon, tmp_path: Path) -> None
     files = [path, tmp_path / "run-2.mcap", tmp_path / "run-3.mcap"]
     until(files[-1].exists)
     assert interrupted(process)[0] == 0
-    seqs = [m["seq"] for file in files for _, m in Recording(file).messages([messages.STATE])]
+    seqs = [m["seq"] for file in files for _, m in Recording(file).messages([schema.STATE])]
     assert seqs == list(range(seqs[0], seqs[-1] + 5, 5))
 
 
@@ -367,7 +368,7 @@ def test_a_missing_extra_is_named(tmp_path: Path, missing: str) -> None:
 
 def test_fake_states_are_of_the_contract() -> None:
     """What these tests publish is what a daemon would."""
-    assert set(flat(state(0.0, 1))) == set(flat(sample(messages.STATE)))
+    assert set(flat(state(0.0, 1))) == set(flat(sample(schema.STATE)))
 
 
 def test_topics_by_name(fake: FakeDaemon, tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ import zmq
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.types import Frame
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import Comparison, recompute
 from softfinger.tools.recordings.writer import RecordingWriter
@@ -42,7 +43,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
     )
     folder = tmp_path_factory.mktemp("sockets")
     sent = published(folder, script, 2.3, ("stream.state_rate=500",))
-    states = [message for topic, message in sent if topic == messages.STATE]
+    states = [message for topic, message in sent if topic == schema.STATE]
     assert states[-1]["mode"] == "disarmed"
     assert script.refused == 1
     return sent
@@ -57,7 +58,7 @@ def record(path: Path, taken: Messages) -> Recording:
 
 
 def _copy(message: dict[str, Any]) -> dict[str, Any]:
-    copied: dict[str, Any] = msgpack.unpackb(messages.pack(message))
+    copied: dict[str, Any] = msgpack.unpackb(pack(message))
     return copied
 
 
@@ -87,7 +88,7 @@ def test_other_settings_show_where_they_first_matter(taken: Messages, tmp_path: 
 def test_a_changed_reading_is_found(taken: Messages, tmp_path: Path) -> None:
     bent = [(topic, _copy(message)) for topic, message in taken]
     for topic, message in bent:
-        if topic == messages.INPUT and message["seq"] == 400:
+        if topic == schema.INPUT and message["seq"] == 400:
             message["left"]["q"] += 1e-9
     result = recompute(record(tmp_path / "a.mcap", bent))
     assert result.differences["left.q"].count == 1
@@ -101,19 +102,19 @@ def test_what_lacks_in_a_recording_is_told(taken: Messages, tmp_path: Path) -> N
         return record(path, [each for each in taken if each[0] != topic])
 
     with pytest.raises(RecordingError, match="no hand/settings in it"):
-        recompute(without(messages.SETTINGS))
+        recompute(without(schema.SETTINGS))
     with pytest.raises(RecordingError, match="no hand/input in it"):
-        recompute(without(messages.INPUT))
-    blind = recompute(without(messages.TACTILE))
+        recompute(without(schema.INPUT))
+    blind = recompute(without(schema.TACTILE))
     assert blind.missing_frames > 100
     assert blind.differences
     late = recompute(record(tmp_path / "late.mcap", taken[:1] + taken[2000:]))
     assert not late.from_start
-    some = [each for k, each in enumerate(taken) if each[0] != messages.INPUT or k % 7]
+    some = [each for k, each in enumerate(taken) if each[0] != schema.INPUT or k % 7]
     assert recompute(record(tmp_path / "some.mcap", some)).missing_ticks > 10
     thinned = [(topic, {**message}) for topic, message in taken]
     for topic, message in thinned:
-        if topic == messages.TACTILE:
+        if topic == schema.TACTILE:
             message["seq_step"] = 4
     with pytest.raises(RecordingError, match="one of 4 frames was published"):
         recompute(record(tmp_path / "thinned.mcap", thinned))
@@ -160,11 +161,11 @@ def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
 def played(tmp_path: Path) -> tuple[Path, Messages]:
     sent: Messages = []
     for k in range(100):
-        state = {**sample(messages.STATE), "seq": k, "timestamp": 1e9 + 0.01 * k}
-        sent.append((messages.STATE, state))
+        state = {**sample(schema.STATE), "seq": k, "timestamp": 1e9 + 0.01 * k}
+        sent.append((schema.STATE, state))
     counts = np.ones((4, 5), np.uint16)
     assert Frame(1, 0.0, 0.0, True, counts).valid
-    sent.append((messages.TACTILE, {**sample(messages.TACTILE), "timestamp": 1e9 + 0.5}))
+    sent.append((schema.TACTILE, {**sample(schema.TACTILE), "timestamp": 1e9 + 0.5}))
     path = tmp_path / "a.mcap"
     record(path, sent)
     return path, sent
@@ -185,7 +186,7 @@ def test_messages_go_out_as_they_were(
     came: list[list[bytes]] = []
     until(lambda: (socket.poll(10) and came.append(socket.recv_multipart()), len(came) == 101)[1])
     assert [(topic, msgpack.unpackb(payload)) for topic, payload in came] == sent
-    assert [payload for _, payload in came] == [messages.pack(message) for _, message in sent]
+    assert [payload for _, payload in came] == [pack(message) for _, message in sent]
     assert "101 of 101 messages published" in process.communicate(timeout=120)[0]
 
 

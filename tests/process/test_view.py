@@ -23,7 +23,8 @@ import rerun as rr
 import zmq
 from rerun.chunk import RrdReader
 
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import pack
 from softfinger.tools import cli
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.bridge import TOPICS, Bridge
@@ -101,7 +102,7 @@ class Shown:
 
 
 def recorded_states(path: Path) -> list[dict[str, Any]]:
-    return [message for _, message in Recording(path).messages([messages.STATE])]
+    return [message for _, message in Recording(path).messages([schema.STATE])]
 
 
 def test_every_state_is_in_the_plots(recorded: Path, shown: Shown) -> None:
@@ -137,7 +138,7 @@ def test_modes_and_events_in_their_order(recorded: Path, shown: Shown) -> None:
     modes = [row[0] for _, row in shown.rows["/mode", "state"]]
     assert modes[:4] == ["disarmed", "armed", "grasping", "holding"]
     assert modes[-2:] == ["releasing", "armed"] or modes[-1] == "releasing"
-    told = [message for _, message in Recording(recorded).messages([messages.EVENT])]
+    told = [message for _, message in Recording(recorded).messages([schema.EVENT])]
     logged = [
         (when, row[0])
         for (entity, component), rows in shown.rows.items()
@@ -156,7 +157,7 @@ def test_modes_and_events_in_their_order(recorded: Path, shown: Shown) -> None:
 
 
 def test_frames_are_the_boards_with_the_footprint_over_them(recorded: Path, shown: Shown) -> None:
-    frames = [message for _, message in Recording(recorded).messages([messages.TACTILE])]
+    frames = [message for _, message in Recording(recorded).messages([schema.TACTILE])]
     for finger in ("left", "right"):
         sent = {each["data"] for each in frames if each["finger"] == finger}
         cells = shown.rows[f"/pressure/{finger}/cells", "buffer"]
@@ -261,10 +262,10 @@ def test_what_comes_too_fast_is_passed_over_and_told() -> None:
     recording.memory_recording()
     bridge = Bridge(recording, keep=10)
     for seq in range(100):
-        bridge.take(messages.STATE, {**state(0.0, 5 * seq), "timestamp": 1e9 + seq})
+        bridge.take(schema.STATE, {**state(0.0, 5 * seq), "timestamp": 1e9 + seq})
         for side in (0, 1):
-            bridge.take(messages.TACTILE, frame(0.0, side))
-        bridge.take(messages.EVENT, event(seq, "late", "a tick came late"))
+            bridge.take(schema.TACTILE, frame(0.0, side))
+        bridge.take(schema.EVENT, event(seq, "late", "a tick came late"))
     bridge.draw(last=True)
     assert (bridge.shown, bridge.dropped, bridge.lost) == (10, 90, {})
     assert bridge.time == 1e9 + 99
@@ -337,13 +338,13 @@ def test_while_nothing_is_read_messages_wait_and_what_is_lost_of_them_is_told(
         until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
         big = {**frame(0.0, 0), "rows": 64, "cols": 64, "data": bytes(2 * 64 * 64)}
         for k in range(1, states + 1):
-            publisher.send_multipart([messages.STATE, messages.pack({**state(0.0, k), **EVERY})])
+            publisher.send_multipart([schema.STATE, pack({**state(0.0, k), **EVERY})])
             if k <= frames:
-                publisher.send_multipart([messages.TACTILE, messages.pack({**big, "seq": k})])
+                publisher.send_multipart([schema.TACTILE, pack({**big, "seq": k})])
             if k % 100 == 0:
                 select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
         until(lambda: stream.drain(bridge, 0.0) == 0)
-        publisher.send_multipart([messages.TACTILE, messages.pack({**big, "seq": frames + 1})])
+        publisher.send_multipart([schema.TACTILE, pack({**big, "seq": frames + 1})])
         seen = bridge.frames
         until(lambda: stream.drain(bridge, 0.0) and bridge.frames > seen)
     assert bridge.dropped == states - 100  # deliberately, and told as such

@@ -17,11 +17,14 @@ from softfinger.daemon.perception.calibration_file import (
 )
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.messages import tactile_message
+from softfinger.daemon.wire.packer import message_maker
+from softfinger.daemon.wire.schema import TACTILE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.cli import main
+
+tactile_message = message_maker(TACTILE)
 
 TIP = Fingertip(0.020)
 E = 0.25e6

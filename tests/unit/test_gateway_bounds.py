@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from softfinger.daemon.gateway.zmtp import GREETING, Broken, Parser, frame
 from softfinger.daemon.loop.clock import VirtualClock
-from softfinger.daemon.types import State
-from softfinger.daemon.wire.messages import EVENT, STATE, Parts
+from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire.publisher import bit
+from softfinger.daemon.wire.schema import EVENT, STATE
 from tests.conftest import until
 from tests.harness.gateway import Served
 from tests.harness.zmtp_client import RawClient, ready

@@ -14,11 +14,15 @@ from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.clock import HandClock
 from softfinger.daemon.loop.lateness import EVERY, FIRST, RECENT, Lateness
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
-from softfinger.daemon.wire.messages import Parts, state_message
+from softfinger.daemon.wire.packer import message_maker
+from softfinger.daemon.wire.schema import STATE
 from tests.harness.late_machine import LateMachine
 from tests.harness.loop import advance_to, grasped
+
+state_message = message_maker(STATE)
 
 MOMENT = ("timestamp", "tick_s", "compute_s", "wake_late_s", "overruns", "behind_s")
 Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
@@ -57,7 +61,7 @@ def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
 
     loop.heartbeat = end_in_time
     loop.advance()
-    message = state_message(loop.state, Parts.of(daemon.settings))
+    message = state_message(loop.state, parts(daemon.settings))
     return {key: value for key, value in message.items() if key not in MOMENT}
 
 

@@ -11,10 +11,14 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
-from softfinger.daemon.wire.messages import Parts, pack, state_message
+from softfinger.daemon.wire.packer import message_maker, pack
+from softfinger.daemon.wire.schema import STATE
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
+
+state_message = message_maker(STATE)
 
 
 def test_starts_disarmed_with_torque_off_and_does_not_move(make: Make) -> None:
@@ -240,7 +244,7 @@ def test_the_state_tells_what_the_grip_goes_to(make: Make) -> None:
     advance_to(daemon, "holding", 5.0)
     command(daemon, "rotate", angle=0.1)
     daemon.loop.advance(0.01)
-    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
+    message = state_message(daemon.loop.state, parts(daemon.settings))
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
     # More than was asked for, since a load would make the tips slip.
     assert daemon.hand is not None
@@ -282,7 +286,7 @@ def run_recorded(make: Make, seed: int) -> list[bytes]:
             name, numbers = script[tick]
             command(daemon, name, **numbers)
         daemon.loop.advance(daemon.loop.period)
-        recorded.append(pack(state_message(daemon.loop.state, Parts.of(daemon.settings))))
+        recorded.append(pack(state_message(daemon.loop.state, parts(daemon.settings))))
     return recorded
 
 

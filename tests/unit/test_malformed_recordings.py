@@ -12,7 +12,7 @@ import pytest
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.analysis.contacts import analyse
 from softfinger.tools.analysis.plots_data import load_run
 from softfinger.tools.analysis.sources import open_source
@@ -34,7 +34,7 @@ SPOILT: dict[str, Any] = {
 
 
 def frame(k: int) -> dict[str, Any]:
-    message = copy.deepcopy(sample(messages.TACTILE))
+    message = copy.deepcopy(sample(schema.TACTILE))
     data = np.zeros((44, 44), "<u2").tobytes()
     return {
         **message,
@@ -49,7 +49,7 @@ def frame(k: int) -> dict[str, Any]:
 
 
 def settings_message() -> dict[str, Any]:
-    message = copy.deepcopy(sample(messages.SETTINGS))
+    message = copy.deepcopy(sample(schema.SETTINGS))
     calibrations = {"calibration_left": "", "calibration_right": ""}
     return {**message, **calibrations, "settings": Settings().model_dump_json()}
 
@@ -57,7 +57,7 @@ def settings_message() -> dict[str, Any]:
 def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
     """Ten frames, the fifth of which is spoilt."""
     writer = RecordingWriter(path)
-    writer.add(messages.SETTINGS, settings_message())
+    writer.add(schema.SETTINGS, settings_message())
     for k in range(10):
         message = frame(k)
         if spoil is not None and k == 5:
@@ -66,8 +66,8 @@ def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
                 del message[name]
             else:
                 message[name] = value
-        writer.add(messages.TACTILE, message)
-        writer.add(messages.STATE, {**sample(messages.STATE), "seq": k})
+        writer.add(schema.TACTILE, message)
+        writer.add(schema.STATE, {**sample(schema.STATE), "seq": k})
     writer.close()
     return path
 
@@ -76,7 +76,7 @@ def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
 def test_a_frame_that_is_none_is_told_and_left_out(tmp_path: Path, spoil: tuple[str, Any]) -> None:
     path = recording(tmp_path / "a.mcap", spoil)
     told: list[str] = []
-    found = list(Recording(path, told.append).messages([messages.TACTILE]))
+    found = list(Recording(path, told.append).messages([schema.TACTILE]))
     assert len(found) == 9
     assert len(told) == 1
     assert "what is sound in it is read" in told[0]
@@ -92,7 +92,7 @@ def test_settings_without_their_text_are_told(tmp_path: Path, name: str) -> None
     writer = RecordingWriter(path)
     message = settings_message()
     del message[name]
-    writer.add(messages.SETTINGS, message)
+    writer.add(schema.SETTINGS, message)
     writer.close()
     with pytest.raises(RecordingError, match="its hand/settings lacks"):
         recorded_settings(Recording(path))

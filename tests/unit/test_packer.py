@@ -1,4 +1,4 @@
-"""Maps packed at once say what the maps told field by field say, for any state."""
+"""Messages packed by their layout say what the maps say, for any state."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ import msgpack
 import numpy as np
 import pytest
 
-from softfinger.daemon.types import Frame, State
-from softfinger.daemon.wire.messages import Parts, input_message, state_message
-from softfinger.daemon.wire.packer import InputMap, StateMap
+from softfinger.daemon.types import Frame, Parts, State
+from softfinger.daemon.wire.packer import message_maker, packer
+from softfinger.daemon.wire.schema import INPUT, STATE
+
+input_message = message_maker(INPUT)
+state_message = message_maker(STATE)
 
 ENDS: dict[type, tuple[Any, ...]] = {
     int: (0, 1, 127, 128, 2**31, 2**40),
@@ -45,7 +48,7 @@ def some(kind: type, generator: np.random.Generator) -> Any:
 @pytest.mark.parametrize("seed", range(20))
 def test_both_ways_say_the_same(seed: int) -> None:
     generator = np.random.default_rng(seed)
-    pack_state, pack_input, state = StateMap(), InputMap(), State()
+    pack_state, pack_input, state = packer(STATE), packer(INPUT), State()
     for _ in range(30):
         shake(state, generator)
         state.t = generator.uniform(0.0, 1e6)
@@ -64,14 +67,14 @@ def same(found: Any, expected: Any) -> bool:
 
 def test_what_is_no_number_yet_goes_out_as_it_is() -> None:
     state = State()  # no reading yet: its time is −∞, and a grip's goal is no number
-    told = msgpack.unpackb(InputMap()(state, (None, None)))
+    told = msgpack.unpackb(packer(INPUT)(state, (None, None)))
     assert told["reading"]["t"] == -math.inf
-    told = msgpack.unpackb(StateMap()(state, Parts((True, True), True, True)))
+    told = msgpack.unpackb(packer(STATE)(state, Parts((True, True), True, True)))
     assert math.isnan(told["goal_force"])
 
 
 def test_messages_of_one_topic_are_of_one_length_while_their_texts_stay() -> None:
-    pack, scene, state = StateMap(), Parts((True, True), True, True), State()
+    pack, scene, state = packer(STATE), Parts((True, True), True, True), State()
     first = pack(state, scene)
     state.seq, state.timing.overruns, state.torque = 2**40, 2**33, True
     assert len(pack(state, scene)) == len(first)

@@ -10,8 +10,11 @@ from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.tactile.replay import GivenFrames
-from softfinger.daemon.types import Contact, Frame, State
-from softfinger.daemon.wire.messages import Parts, state_message
+from softfinger.daemon.types import Contact, Frame, Parts, State
+from softfinger.daemon.wire.packer import message_maker
+from softfinger.daemon.wire.schema import STATE
+
+state_message = message_maker(STATE)
 
 
 def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:

@@ -14,10 +14,13 @@ from softfinger.daemon.loop.rates import Schedule
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
-from softfinger.daemon.wire.messages import SCHEMA, STATE, STATS, TACTILE, Rates, stats_message
+from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.publisher import bit
+from softfinger.daemon.wire.schema import SCHEMA, STATE, STATS, TACTILE, Rates
 from tests.conftest import until
 from tests.harness.gateway import Served
+
+stats_message = message_maker(STATS)
 
 
 class Listener:

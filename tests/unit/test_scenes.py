@@ -9,10 +9,14 @@ import pytest
 from softfinger.daemon.control.task import Task
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Reading
-from softfinger.daemon.wire.messages import Parts, state_message
+from softfinger.daemon.wire.packer import message_maker
+from softfinger.daemon.wire.schema import STATE
 from tests.harness.loop import Make, advance_to, command, grasped
+
+state_message = message_maker(STATE)
 
 
 def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
@@ -117,8 +121,8 @@ def test_every_scene_runs_and_its_messages_have_one_shape(
 ) -> None:
     daemon = make(**sections)
     daemon.loop.advance(2.0)
-    message = state_message(daemon.loop.state, Parts.of(daemon.settings))
-    reference = state_message(make().loop.state, Parts.of(daemon.settings))
+    message = state_message(daemon.loop.state, parts(daemon.settings))
+    reference = state_message(make().loop.state, parts(daemon.settings))
     assert message.keys() == reference.keys()
     for part in ("left", "right", "object"):
         assert message[part].keys() == reference[part].keys()

@@ -10,21 +10,14 @@ import numpy as np
 import pytest
 import zmq
 
-from softfinger.daemon.types import Contact, Frame, State
-from softfinger.daemon.wire.messages import (
-    COMMAND,
-    EVENT,
-    SCHEMA,
-    STATE,
-    TACTILE,
-    Facts,
-    Parts,
-    SensorFacts,
-    state_message,
-)
+from softfinger.daemon.types import Contact, Frame, HandFacts, Parts, SensorFacts, State
+from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.publisher import bit
+from softfinger.daemon.wire.schema import COMMAND, EVENT, SCHEMA, STATE, TACTILE
 from tests.conftest import until
 from tests.harness.gateway import Served
+
+state_message = message_maker(STATE)
 
 BOTH = Parts((True, True), servos=True, sensors=False)
 FINGER_FLOATS = (
@@ -236,7 +229,7 @@ def test_who_comes_late_is_told_settings_and_events_again(
 ) -> None:
     served = Served(addresses[0], queue=200)
     publisher = served.publisher
-    publisher.settings(98.0, 0.5, Facts("0.1.0", "{}", "", "", "{}", "{}"))
+    publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
     early = subscribe(context, addresses[0])
@@ -270,7 +263,7 @@ def test_all_of_many_late_subscribers_are_told_once_each(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     with Served(addresses[0]) as served:
-        served.publisher.settings(98.0, 0.5, Facts("0.1.0", "{}", "", "", "{}", "{}"))
+        served.publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
         for k in range(5):
             served.publisher.event(99.0, 1.0, "info", "mode", f"event {k}")
         sockets = [subscribe(context, addresses[0], b"hand/event") for _ in range(40)]
@@ -293,7 +286,7 @@ def test_all_of_many_late_subscribers_are_told_once_each(
 def test_a_long_message_comes_in_pieces_and_whole(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    facts = Facts("0.1.0", "x" * 150_000, "", "", "{}", "{}")
+    facts = HandFacts("0.1.0", "x" * 150_000, "", "", "{}", "{}")
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorFacts(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     with Served(addresses[0]) as served:

@@ -24,7 +24,7 @@ from softfinger.daemon.loop.process_replay import with_calibrations
 from softfinger.daemon.profile.factory import FingerModel, make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recorded_settings
 
@@ -175,11 +175,11 @@ def load_run(
     modes, faults, commands = array("q"), [], []
     stats: dict[str, Any] | None = None
     fault = ""
-    wanted = {messages.STATE, messages.TRUTH, messages.STATS}
+    wanted = {schema.STATE, schema.TRUTH, schema.STATS}
     for topic, message in recording.messages(wanted, start, end, progress):
-        if topic == messages.TRUTH:
+        if topic == schema.TRUTH:
             truth.take(message)
-        elif topic == messages.STATS:
+        elif topic == schema.STATS:
             stats = message
         elif states.take(message):
             mode = message.get("mode")
@@ -189,7 +189,7 @@ def load_run(
                 faults.append((message["timestamp"] - recording.start, said))
             fault = said
     # From the file's start on: what was asked for before a part begins still holds in it.
-    for _, message in recording.messages({messages.COMMAND}, end=end):
+    for _, message in recording.messages({schema.COMMAND}, end=end):
         if message.get("ok") is True and isinstance(message.get("tick"), int):
             commands.append(message)
     settings, models, why = _model(recording, cache)

@@ -20,7 +20,7 @@ from softfinger.daemon.profile.factory import FingerModel, make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.recording import load_recording
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import teller
 from softfinger.tools.recordings.reader import Recording
 
@@ -62,7 +62,7 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     from softfinger.tools.recordings.recomputed import recorded_settings
 
     recording = Recording(path, teller("analyse"))
-    if not recording.count(messages.TACTILE):
+    if not recording.count(schema.TACTILE):
         raise RecordingError(f"{path}: no tactile frames in it")
     if own:
         settings, calibrations = recorded_settings(recording)
@@ -73,12 +73,12 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     present = tuple(
         finger
         for finger, name in enumerate(FINGERS)
-        if f"{messages.TACTILE.decode()}/{name}" in recording.counts
+        if f"{schema.TACTILE.decode()}/{name}" in recording.counts
     )
 
     def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
         first = None
-        for _, message in recording.messages([messages.TACTILE], progress=progress):
+        for _, message in recording.messages([schema.TACTILE], progress=progress):
             if message.get("unit") != "count":
                 raise RecordingError(f"{path}: frames in {message.get('unit')!r}, expected counts")
             finger = FINGERS.index(message["finger"])

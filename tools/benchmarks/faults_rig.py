@@ -23,7 +23,7 @@ from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
-from softfinger.daemon.wire.messages import STATE
+from softfinger.daemon.wire.schema import STATE
 
 PROFILE = Path(__file__).parents[2] / "config" / "hil.toml"
 SOFTFINGER = (sys.executable, "-m", "softfinger")

@@ -25,11 +25,11 @@ import numpy as np
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
-from softfinger.daemon.wire.messages import Parts
-from softfinger.daemon.wire.publisher import TOPICS, Publisher
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.tools.benchmarks.canned import can, hold, make_noisy
 from softfinger.tools.benchmarks.wakeup import may_hurry
 
@@ -261,7 +261,7 @@ def stuck_subscriber(fill: int = _FILL, more: int = _MORE) -> Kept:
     """The gateway's memory while one subscriber never reads: bounded by its queue."""
     with tempfile.TemporaryDirectory() as folder:
         address = f"ipc://{folder}/stream"
-        gateway = Gateway(Config(address, "", TOPICS, Settings().stream.queue)).wait()
+        gateway = Gateway(Config(address, "", GATEWAY_TOPICS, Settings().stream.queue)).wait()
         publisher = Publisher(gateway.link)
         try:
             with _running([[sys.executable, "-c", _STUCK, address]]):
@@ -279,7 +279,7 @@ def stuck_subscriber(fill: int = _FILL, more: int = _MORE) -> Kept:
 
 
 def _publish(gateway: Gateway, publisher: Publisher, count: int) -> None:
-    state, scene = State(), Parts.of(Settings())
+    state, scene = State(), parts(Settings())
     for _ in range(count):
         gateway.link.wait_for_room(1.0)
         state.seq += 1

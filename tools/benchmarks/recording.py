@@ -21,8 +21,9 @@ import numpy as np
 
 from softfinger.daemon.client import Hand
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame
-from softfinger.daemon.wire import messages
+from softfinger.daemon.types import Frame, HandFacts, SensorFacts
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import message_maker
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -99,7 +100,7 @@ def _live(folder: Path, seconds: float) -> list[Row]:
 def _publishing(name: str, file: Path) -> Row:
     """The publish step [µs], median and 99 %, as the daemon told it last."""
     recording = Recording(file)
-    (*_, told) = (message["publish"] for _, message in recording.messages([messages.STATS]))
+    (*_, told) = (message["publish"] for _, message in recording.messages([schema.STATS]))
     return Row(name, "µs", 1e6 * told["p50"], 1e6 * told["p99"], recording.total, 15.0)
 
 
@@ -179,16 +180,16 @@ def _analysis(folder: Path) -> list[Row]:
     noise = np.random.default_rng(1)
     press = [grid.pressure(tip, Material.table_i(), d, 0.1, 0.0) for d in np.linspace(0, 5e-3, 50)]
     writer = RecordingWriter(path)
-    facts = messages.Facts("", Settings().model_dump_json(), "", "", "", "")
-    writer.add(messages.SETTINGS, messages.settings_message(1, 1e9, 1.0, facts))
-    sensor = messages.SensorFacts(pitch, pitch, 0.0, 0.0, 0.0, "count", 4.0, False, "")
+    facts = HandFacts("", Settings().model_dump_json(), "", "", "", "")
+    writer.add(schema.SETTINGS, message_maker(schema.SETTINGS)(1, 1e9, 1.0, facts))
+    sensor = SensorFacts(pitch, pitch, 0.0, 0.0, 0.0, "count", 4.0, False, "")
+    tactile = message_maker(schema.TACTILE)
     for k in range(_FRAMES):
         pressure = press[abs(k // 5 % 98 - 49)]
         counts = np.clip(pressure / 4.0 + noise.normal(0.0, 380.0, pressure.shape), 0.0, 65535.0)
         data = counts.astype(np.uint16)
         frame = Frame(k + 1, 0.01 * k, 0.01 * k, True, data)
-        message = messages.tactile_message(frame, data, 0, sensor, 1e9 + 0.01 * k)
-        writer.add(messages.TACTILE, message)
+        writer.add(schema.TACTILE, tactile(frame, data, 0, sensor, 1e9 + 0.01 * k))
     writer.close()
     times = []
     source = open_source(path, Settings(), None, own=True)
@@ -205,7 +206,7 @@ def _summary(folder: Path, hour: float) -> list[Row]:
     writer = RecordingWriter(path)
     state = {"schema": 1, "seq": 0, "timestamp": 0.0, "padding": "x" * 1200}  # as long as a state
     for k in range(count):
-        writer.add(messages.STATE, {**state, "seq": k, "timestamp": 1e9 + 1e-3 * k})
+        writer.add(schema.STATE, {**state, "seq": k, "timestamp": 1e9 + 1e-3 * k})
         if k % 500 == 0:
             writer.flush()  # as `record` does twice a second
     writer.close()

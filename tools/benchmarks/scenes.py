@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.table import ContactTable, lookup
@@ -137,7 +137,7 @@ def _always_predicted(daemon: Daemon) -> None:
 def _always_packed(daemon: Daemon) -> None:
     broadcast = daemon.loop._broadcast
     assert broadcast is not None
-    broadcast._publisher._link.wanted = bit(messages.STATE) | bit(messages.TACTILE)
+    broadcast._publisher._link.wanted = bit(schema.STATE) | bit(schema.TACTILE)
 
 
 def _tabulated(daemon: Daemon) -> None:

@@ -12,7 +12,7 @@ import zmq
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.canned import can, hold
 from softfinger.tools.benchmarks.report import Row, row
 
@@ -20,8 +20,8 @@ _TICKS = 20_000
 _SECONDS = 20  # of virtual time
 _SUBSCRIBERS: dict[tuple[bytes, ...], str] = {
     (): "nobody subscribed",
-    (messages.STATE, messages.TACTILE): "state and frames subscribed",
-    (messages.STATE, messages.TACTILE, messages.INPUT): "every tick's input, too",
+    (schema.STATE, schema.TACTILE): "state and frames subscribed",
+    (schema.STATE, schema.TACTILE, schema.INPUT): "every tick's input, too",
 }
 
 

@@ -8,14 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire import messages, schema
+from softfinger.daemon.wire import schema, schema_docs
 
 ENCODING = "json"
 SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 _IMAGE = "foxglove.RawImage"
-_TACTILE = tuple(field.name for field in schema.TOPICS[messages.TACTILE])  # in their order
+_TACTILE = tuple(field.name for field in schema.TOPICS[schema.TACTILE].fields)  # in their order
 
 _MOST_CELLS = 4096  # in a row or column
 
@@ -24,23 +24,23 @@ Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
     """The channel of a message: its topic, for frames with the finger's name behind it."""
-    if topic == messages.TACTILE:
+    if topic == schema.TACTILE:
         return f"{topic.decode()}/{message.get('finger')}"
     return topic.decode()
 
 
 def topic_of(channel: str) -> bytes:
     """The topic whose messages a channel holds."""
-    topic = messages.TACTILE.decode()
-    return messages.TACTILE if channel.startswith(f"{topic}/") else channel.encode()
+    topic = schema.TACTILE.decode()
+    return schema.TACTILE if channel.startswith(f"{topic}/") else channel.encode()
 
 
 def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
     """Name and JSON schema of a topic's channels; anything is an object where we know no more."""
     if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
-    told = schema.json_schema(topic)
-    if topic != messages.TACTILE:
+    told = schema_docs.json_schema(topic)
+    if topic != schema.TACTILE:
         return topic.decode().replace("/", "."), told
     own = told["properties"]
     stamp = {
@@ -61,15 +61,14 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
 
 def to_json(topic: bytes) -> Converter:
     """What makes a map fit for JSON. The map may be changed."""
-    return _image if topic == messages.TACTILE else _as_it_is
+    return _image if topic == schema.TACTILE else _as_it_is
 
 
 def from_json(topic: bytes) -> Converter:
     """What makes the map of the wire from a channel's JSON."""
-    floats = [
-        field.name.split(".") for field in schema.TOPICS.get(topic, ()) if field.kind == "float"
-    ]
-    return _Restored(floats, topic == messages.TACTILE)
+    fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
+    floats = [field.name.split(".") for field in fields if field.kind == "float"]
+    return _Restored(floats, topic == schema.TACTILE)
 
 
 def _as_it_is(message: dict[str, Any]) -> dict[str, Any]:

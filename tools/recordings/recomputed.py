@@ -14,9 +14,11 @@ import numpy as np
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.loop.process_replay import Recomputation
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import packer
 from softfinger.tools.recordings.reader import Recording
 
 # What depends on the machine and the moment, and not on what the loop took in.
@@ -53,7 +55,7 @@ class Comparison:
 
 def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
     """Settings and calibrations (JSON) that the recording holds. Raises RecordingError."""
-    message = next((each for _, each in recording.messages([messages.SETTINGS])), None)
+    message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
         raise RecordingError(f"{recording.path}: no hand/settings in it")
     text, *calibrations = (message.get(name) for name in _SETTINGS)
@@ -80,11 +82,12 @@ def recompute(
     recording lacks what is needed.
     """
     own, calibrations = recorded_settings(recording)
-    if not recording.count(messages.INPUT):
+    if not recording.count(schema.INPUT):
         raise RecordingError(f"{recording.path}: no hand/input in it: record with --topics all")
     used = settings or own
     machine = Recomputation(used, calibrations, cache)
-    scene = messages.Parts.of(used)
+    scene = parts(used)
+    pack_state = packer(schema.STATE)
     result = Comparison()
     newest = [0, 0]
     last = 0
@@ -122,7 +125,7 @@ def recompute(
         if state is not None:
             step = state.get("seq_step", 1)
             # Through the packer, as the recorded one went: the same types and roundings.
-            again = msgpack.unpackb(messages.pack(messages.state_message(now, scene, step)))
+            again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
     return result
 
@@ -141,12 +144,12 @@ def _ticks(
 
     A tick's frames and commands come before its input, its state behind it.
     """
-    wanted = (messages.INPUT, messages.TACTILE, messages.COMMAND, messages.STATE)
+    wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}
     waiting: dict[str, Any] | None = None
     for topic, message in recording.messages(wanted, progress=progress):
-        if topic == messages.TACTILE:
+        if topic == schema.TACTILE:
             if message.get("unit") != "count":
                 raise RecordingError(
                     f"{recording.path}: frames in {message.get('unit')!r}, expected counts: "
@@ -161,10 +164,10 @@ def _ticks(
             counts = np.frombuffer(message["data"], "<u2").reshape(message["rows"], message["cols"])
             frames[finger, message["seq"]] = counts
             frames.pop((finger, message["seq"] - 2), None)
-        elif topic == messages.COMMAND:
+        elif topic == schema.COMMAND:
             if message["ok"]:
                 commands.setdefault(message["tick"], []).append(json.loads(message["request"]))
-        elif topic == messages.INPUT:
+        elif topic == schema.INPUT:
             if waiting is not None:
                 yield waiting, frames, commands.pop(waiting["seq"], []), None
             waiting = message

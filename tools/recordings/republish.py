@@ -10,8 +10,9 @@ from softfinger.daemon.errors import AddressError, RecordingError
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.validation import address_fault
-from softfinger.daemon.wire import messages
-from softfinger.daemon.wire.publisher import TOPICS
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
 
 _QUEUE = 10_000  # messages that wait for a subscriber; what it does not take by then it misses
 _PATIENCE = 1.0  # s for the gateway to take a message
@@ -28,7 +29,7 @@ class Wire:
         if fault:
             raise RecordingError(f"--address: {fault}")
         folder = "" if keys is None else str(keys)
-        config = Config(address, "", TOPICS, _QUEUE, keys=folder, stream_key="--address")
+        config = Config(address, "", GATEWAY_TOPICS, _QUEUE, keys=folder, stream_key="--address")
         self._gateway = Gateway(config)
         try:
             self._gateway.wait()
@@ -45,13 +46,13 @@ class Wire:
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
         """Publish one message, as soon as the gateway has room for it."""
-        index = TOPICS.names.index(topic.decode())
-        packed = messages.pack(message)
-        if topic == messages.SETTINGS:
+        index = GATEWAY_TOPICS.names.index(topic.decode())
+        packed = pack(message)
+        if topic == schema.SETTINGS:
             self._link.publish_lasting(index, packed)
             return
         self._link.wait_for_room(_PATIENCE)
-        self._link.publish(index, packed, keep=topic == messages.EVENT)
+        self._link.publish(index, packed, keep=topic == schema.EVENT)
 
     def __enter__(self) -> Wire:
         return self

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.wire import messages, schema
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.own_files import write_bytes, write_text
 from softfinger.tools.recordings.reader import Recording
 
@@ -103,7 +103,8 @@ class ParquetTable:
 
 
 def _columns(topic: bytes, first: Row) -> list[tuple[str, str]]:
-    known = [(field.name, str(field.kind)) for field in schema.TOPICS.get(topic, ())]
+    fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
+    known = [(field.name, field.kind) for field in fields]
     names = {name for name, _ in known}
     kinds = {bool: "bool", int: "int", float: "float", str: "str", bytes: "bin"}
     return known + [
@@ -142,7 +143,7 @@ def export(
                 tables[topic] = kind(path, topic, row)
                 blocks[topic] = []
                 files.append(path)
-            if topic == messages.TACTILE:
+            if topic == schema.TACTILE:
                 times, frames = grids.setdefault(message["finger"], ([], []))
                 shape = message["rows"], message["cols"]
                 times.append(message["timestamp"])

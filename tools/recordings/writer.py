@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.container import Container
 from softfinger.tools.recordings.errors import require_packages
 from softfinger.tools.recordings.layout import (
@@ -93,7 +93,7 @@ class RecordingWriter:
             self._write(topic, message, when)
 
     def _write(self, topic: bytes, message: dict[str, Any], when: float) -> None:
-        key = channel_name(topic, message) if topic == messages.TACTILE else topic
+        key = channel_name(topic, message) if topic == schema.TACTILE else topic
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = self._open(channel_name(topic, message), topic)

@@ -17,7 +17,7 @@ import rerun as rr
 
 from softfinger.daemon.client.wire import Gaps
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.tools.terminal.feed import number, printable, text
 from softfinger.tools.viewing import layout
 from softfinger.tools.viewing.drawing import Drawing
@@ -25,13 +25,13 @@ from softfinger.tools.viewing.known import Hand, Wanted, read_settings
 from softfinger.tools.viewing.statistics import table
 
 TOPICS = (
-    messages.SETTINGS,
-    messages.COMMAND,
-    messages.EVENT,
-    messages.STATE,
-    messages.TRUTH,
-    messages.TACTILE,
-    messages.STATS,
+    schema.SETTINGS,
+    schema.COMMAND,
+    schema.EVENT,
+    schema.STATE,
+    schema.TRUTH,
+    schema.TACTILE,
+    schema.STATS,
 )
 _EVENTS = 500  # events that wait to be drawn
 _PATIENCE = 100  # states that the layout waits for the settings
@@ -97,23 +97,23 @@ class Bridge:
         when = number(message, "timestamp")
         if not math.isfinite(when) or not 0.0 <= when < 2.0**33:
             self.unreadable += 1
-        elif topic == messages.STATE:
+        elif topic == schema.STATE:
             self._take_state(message, when)
-        elif topic == messages.TACTILE:
+        elif topic == schema.TACTILE:
             finger = text(message, "finger")
             if finger in FINGERS:
                 self._frames[finger] = message
                 self.frames += 1
-        elif topic == messages.EVENT:
+        elif topic == schema.EVENT:
             self.swamped += len(self._events) == _EVENTS
             self._events.append(message)
-        elif topic == messages.STATS:
+        elif topic == schema.STATS:
             self._statistics = message
-        elif topic == messages.TRUTH:
+        elif topic == schema.TRUTH:
             self._truth = message
-        elif topic == messages.COMMAND:
+        elif topic == schema.COMMAND:
             self._wanted.take(message, self._hand)
-        elif topic == messages.SETTINGS:
+        elif topic == schema.SETTINGS:
             self._take_settings(message)
 
     def _take_state(self, message: dict[str, Any], when: float) -> None:
@@ -146,11 +146,11 @@ class Bridge:
         self._drawing = None
 
     def _check_schema(self, message: dict[str, Any]) -> None:
-        schema = message.get("schema")
-        if schema != messages.SCHEMA and not self._schema_told:
+        found = message.get("schema")
+        if found != schema.SCHEMA and not self._schema_told:
             self._schema_told = True
             self.notes.append(
-                f"the stream is of schema {schema!r:.20}, this viewer knows {messages.SCHEMA}; "
+                f"the stream is of schema {found!r:.20}, this viewer knows {schema.SCHEMA}; "
                 "it keeps to the fields it knows"
             )
 

@@ -14,8 +14,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.records import read_frame
+from softfinger.daemon.client.records import read
 from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.terminal.feed import field, number
 from softfinger.tools.viewing import layout
 from softfinger.tools.viewing.footprint import Footprint, footprint, grid_of, tip_circle
@@ -214,7 +215,7 @@ class Drawing:
 
     def frame(self, message: dict[str, Any], state: dict[str, Any] | None) -> None:
         """One frame with its footprint. Raises ValueError when it is none of this hand's."""
-        frame = read_frame(message)
+        frame = read(TactileFrame, message)
         name = frame.finger
         if name not in self._hand.fingers:
             raise ValueError(f"a frame of finger {name!r}")

@@ -14,7 +14,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from softfinger.daemon.wire import messages
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.tools.viewing.bridge import TOPICS, Bridge
 from softfinger.tools.viewing.errors import ViewError
@@ -33,11 +33,11 @@ class LiveStream:
         self._context: zmq.Context[Any] = zmq.Context()
         self._sockets: list[zmq.Socket[Any]] = []
         self._poller = zmq.Poller()
-        small = [topic for topic in TOPICS if topic != messages.TACTILE]
+        small = [topic for topic in TOPICS if topic != schema.TACTILE]
         try:
             if keys is not None:
                 keys.guard(self._context)
-            for topics, queue in ((small, _QUEUE), ([messages.TACTILE], _FRAMES)):
+            for topics, queue in ((small, _QUEUE), ([schema.TACTILE], _FRAMES)):
                 socket = self._context.socket(zmq.SUB)
                 self._sockets.append(socket)
                 self._poller.register(socket, zmq.POLLIN)
