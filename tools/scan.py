@@ -7,8 +7,8 @@ import sys
 
 from softfinger.daemon.diagnosis.ports import serial_ports
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.servos.registers import BAUD_RATES
-from softfinger.daemon.servos.scanning import ALONE, FoundServo, search
+from softfinger.daemon.servos.control_table import BAUD_RATES
+from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, search
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--wait",
         type=float,
-        default=0.8,
+        default=SEARCH_TIME,
         metavar="S",
         help="how long to listen at each rate (0.8: 253 servos at 1 Mbaud)",
     )
@@ -47,17 +47,10 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"scan: {error}", file=sys.stderr)
             continue
         for servo in found.servos:
-            print(_line(path, servo), flush=True)
+            print(f"{path}: {servo}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ALONE}", flush=True)
         if not found.servos and not found.garbled:
             print(f"{path}: no servo answers at any of these rates", flush=True)
         count += len(found.servos)
     return 0 if count else 1
-
-
-def _line(path: str, servo: FoundServo) -> str:
-    return (
-        f"{path}: ID {servo.id} at {servo.baud} baud: {servo.model} (number {servo.number}), "
-        f"firmware {servo.firmware}"
-    )

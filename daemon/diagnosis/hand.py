@@ -8,16 +8,12 @@ from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.checks import check_angle
-from softfinger.daemon.servos.examine import Examined, examine, servo_name
-from softfinger.daemon.servos.identity import plan
-from softfinger.daemon.servos.line import ServoLine
-from softfinger.daemon.servos.models import ServoModel, by_name
-from softfinger.daemon.servos.packets import PacketHandler
-from softfinger.daemon.servos.port import SerialPort
-from softfinger.daemon.servos.scanning import ALONE, FoundServo, search
-from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.checks import Examined, check_angle, examine
+from softfinger.daemon.servos.control_table import JointScale, ServoModel, by_name
+from softfinger.daemon.servos.protocol import open_line
+from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, search
 from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.types import FINGERS
 
@@ -35,14 +31,10 @@ def check_servos(
     """
     servos = settings.servos
     model = by_name(servos.model)
-    # The adapter's low-latency mode would be a change, so it is not asked for.
-    port = SerialPort(servos.port, servos.baud, patience, low_latency=False)
     try:
-        port.openPort()
-        try:
-            found = examine(ServoLine(port, PacketHandler()), settings, model)
-        finally:
-            port.closePort()
+        # The adapter's low-latency mode would be a change, so it is not asked for.
+        with open_line(servos.port, servos.baud, patience, low_latency=False) as line:
+            found = examine(line, settings, model)
         results = [line for each in found for line in _judge(each, settings, model)]
         if not all(each.answers for each in found):
             results += _search(settings, model, wait)
@@ -54,30 +46,23 @@ def check_servos(
 def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Result]:
     name = servo.name
     if not servo.answers:
-        return [
-            Result(
-                "FAIL",
-                name,
-                f"no answer at {settings.servos.baud} baud",
-                "check its power and cable, then see what was found below",
-            )
-        ]
-    results = [_result("FAIL", name, text) for text in servo.findings.errors]
-    results += [_result("warn", name, text) for text in servo.findings.notices]
-    if servo.table and not servo.findings.errors:
-        hand = settings.hand
-        low, high = hand.q_min[servo.finger], hand.q_max[servo.finger]
-        angle = JointScale.of(settings.servos, servo.finger, model).angle(servo.position)
-        strayed = check_angle(name, angle, low, high)
-        if strayed:
-            results.append(_result("FAIL", name, strayed))
-        else:
-            results.append(Result("pass", name, _described(servo, model)))
+        problem = f"no answer at {settings.servos.baud} baud"
+        fix = "check its power and cable, then see what was found below"
+        return [Result("FAIL", name, problem, fix)]
+    results = [_result("FAIL", each) for each in servo.errors]
+    results += [_result("warn", each) for each in servo.notices]
+    if servo.table and not servo.errors:
+        low, high = settings.hand.q_min[servo.finger], settings.hand.q_max[servo.finger]
+        position = servo.table.long(reg.PRESENT_POSITION)
+        angle = JointScale.of(settings.servos, servo.finger, model).angle(position)
+        stray = check_angle(name, angle, low, high)
+        described = Result("pass", name, _described(servo, model))
+        results.append(described if stray is None else _result("FAIL", stray))
     return results
 
 
 def _described(servo: Examined, model: ServoModel) -> str:
-    volts = servo.word(reg.PRESENT_INPUT_VOLTAGE) * reg.VOLTAGE_UNIT
+    volts = servo.table.word(reg.PRESENT_INPUT_VOLTAGE) * reg.VOLTAGE_UNIT
     mode = reg.MODE_NAMES[servo.table[reg.OPERATING_MODE]]
     return (
         f"{model.name}, firmware {servo.table[reg.FIRMWARE_VERSION]}, {mode} mode, {volts:.1f} V, "
@@ -85,43 +70,28 @@ def _described(servo: Examined, model: ServoModel) -> str:
     )
 
 
-def _result(status: Status, name: str, text: str) -> Result:
-    """A finding's line, ``what is wrong: what mends it`` behind the servo's name, taken apart."""
-    what, colon, mend = text.removeprefix(f"{name}: ").rpartition(": ")
-    if not colon:
-        return Result(status, name, mend)
-    return Result(status, name, what, mend.replace("`", ""))
+def _result(status: Status, finding: Finding) -> Result:
+    return Result(status, finding.subject, finding.problem, finding.fix.replace("`", ""))
 
 
 def _search(settings: Settings, model: ServoModel, wait: float) -> list[Result]:
     """What answers on the port at any rate that the model has, and what is to be done about it."""
     servos = settings.servos
-    found = search(servos.port, model.baud_rates, wait, {1, *servos.ids})
+    found = search(servos.port, model.baud_rates, wait, {FACTORY_ID, *servos.ids})
     if not found.servos and not found.garbled:
-        return [
-            Result(
-                "FAIL",
-                "servos",
-                f"nothing answers on {servos.port} at any rate",
-                "check the bus's power and cable",
-            )
-        ]
+        problem = f"nothing answers on {servos.port} at any rate"
+        return [Result("FAIL", "servos", problem, "check the bus's power and cable")]
     what = plan(found, settings, model, model.baud_rates)
     lines = [Result("FAIL", "servos", str(each), ALONE) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id
         other = f"servos.baud = {change.servo.baud}" if same else "servos.ids as it is"
-        name = servo_name(change.id, change.finger)
-        fix = f"softfinger doctor --fix makes it {name}: {change}; or set {other}"
-        lines.append(Result("note", "found", _told(change.servo), fix))
+        fix = f"softfinger doctor --fix makes it {change.name}: {change}; or set {other}"
+        lines.append(Result("note", "found", str(change.servo), fix))
     for each in what.strangers:
         mend = ALONE if what.missing and each.number == model.number else ""
-        lines.append(Result("note", "found", _told(each), mend))
+        lines.append(Result("note", "found", str(each), mend))
     return lines or [Result("note", "found", "no other servo answers at any rate")]
-
-
-def _told(servo: FoundServo) -> str:
-    return f"ID {servo.id} at {servo.baud} baud: {servo.model}, firmware {servo.firmware}"
 
 
 def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Result:

@@ -11,7 +11,7 @@ from softfinger.daemon.diagnosis.ports import check_latency_timer, latency_file
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.mend import mend
+from softfinger.daemon.servos.provisioning import provision
 
 
 def mend_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
@@ -37,15 +37,11 @@ def mend_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
 def mend_servos(settings: Settings) -> list[Result]:
     """Set the scene's servos up as the daemon needs them; one line for each thing done."""
     try:
-        done = mend(settings)
+        result = provision(settings)
     except ServoError as error:
-        return [_line(text) for text in str(error).splitlines()]
-    return [_line(f"(done: {text})") for text in done]
-
-
-def _line(text: str) -> Result:
-    done = text.removeprefix("(done: ")
-    name, _, what = done.partition(": ")
-    if done == text:
-        return Result("warn", name, f"not mended: {what}")
-    return Result("fixed", name, what.removesuffix(")"))
+        return [Result("warn", "servos", f"not mended: {error}")]
+    problems = [
+        Result("warn", each.subject, f"not mended: {each.problem}", each.fix.replace("`", ""))
+        for each in result.problems
+    ]
+    return problems + [Result("fixed", name, change) for name, change in result.done]

@@ -39,7 +39,7 @@ SIMULATED = ("simulated", "replay", "none")  # backends behind which there is no
 
 
 def _known(name: str) -> str:
-    from softfinger.daemon.servos.models import MODELS, by_name
+    from softfinger.daemon.servos.control_table import MODELS, by_name
 
     try:
         by_name(name)

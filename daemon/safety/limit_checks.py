@@ -17,8 +17,7 @@ from softfinger.daemon.perception.contact_filter import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion
-from softfinger.daemon.servos.models import by_name
-from softfinger.daemon.servos.registers import VOLTAGE_UNIT, hardware_error_names
+from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Frame, State
 
 PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint

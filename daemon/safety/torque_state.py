@@ -16,7 +16,7 @@ from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.safety.safety import BUS, TORQUE_OFF, Safety
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.servos.registers import WATCHDOG_UNIT
+from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
 _TRY = 0.5  # of the watchdog's time in which torque off is tried before the bus falls silent

@@ -1,27 +1,46 @@
-"""The interface of every servo backend, and its errors."""
+"""What every servo backend offers the loop, and what it reports."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from softfinger.daemon.types import Goal, Reading
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something wrong with, or worth saying about, one part of the hand."""
+
+    subject: str  # as ``servo 1 (left)``
+    problem: str  # what was found, and what was expected
+    fix: str = ""  # a command or an action; empty when nothing is to be done
+
+    def __str__(self) -> str:
+        text = f"{self.subject}: {self.problem}"
+        return f"{text}: {self.fix}" if self.fix else text
 
 
 class Servos(Protocol):
     """Joints of the hand, in one of three operating modes (``servos.mode``).
 
-    In each of them ``goal.q`` is the angle a joint is drawn to:
+    In each of them ``goal.q`` is the goal angle of a joint:
 
-    - *current-based position* (5): the servo's own loop, with the motor's current within
+    - *current-based position* (5): the servo's own position loop, with the motor's current within
       ± ``goal.current``.
     - *current* (0): the same meaning, but the loop runs here, once a tick, on the newest reading:
       ``servos.stiffness`` and ``servos.damping`` within ± ``goal.current``. Without readings the
       current stays what it was, until the servo's bus watchdog ends it.
-    - *position* (3): the servo's own loop with all the current it has. ``goal.current`` is not
-      looked at, and torque on holds at once; it suits moving and no grasp.
+    - *position* (3): the servo's own loop with all the current it has. ``goal.current`` is
+      ignored, and torque on holds at once; it suits moving and no grasp.
 
     ``connect`` checks and never stiffens or moves the hand. ``read`` and ``write`` are called
-    once a tick; a failed exchange is told by ``valid`` and the counters, not by an exception,
+    once a tick; a failed exchange shows in ``valid`` and in the counters and raises nothing,
     unless the port itself is gone.
     """
 
@@ -31,7 +50,7 @@ class Servos(Protocol):
     def read(self, reading: Reading) -> None:
         """Fill ``reading`` in place.
 
-        After a failed exchange ``valid`` is False and all else but ``seq`` keeps, so that
+        After a failed exchange ``valid`` is False and everything but ``seq`` stays, so that
         ``reading.t`` is the time of the last good one.
         Temperature and voltage need not be fresher than a second.
         """
@@ -43,7 +62,7 @@ class Servos(Protocol):
         """
 
     def torque_off(self, reading: Reading) -> bool:
-        """Ask once for torque off and read, as `read` does; whether the servos say that it is off.
+        """Ask once for torque off and read, as `read` does; True once all servos confirm it.
 
         It waits no longer than `read`, so that the loop can ask at every tick until it is True.
         Raises ServoError when the port is gone.
@@ -57,3 +76,34 @@ class Servos(Protocol):
 
     def close(self) -> None:
         """Torque off as far as the bus allows, then close. Never raises."""
+
+
+class JointPlant(Protocol):
+    """Simulated joints with their motors, behind the simulated and the emulated servos.
+
+    Index 0 is the left finger's joint; positive closes.
+    """
+
+    @property
+    def q(self) -> FloatArray:
+        """True joint angles [rad] at the time last advanced to."""
+
+    @property
+    def dq(self) -> FloatArray:
+        """True joint velocities [rad/s]."""
+
+    @property
+    def current(self) -> FloatArray:
+        """True motor currents [A]."""
+
+    def advance(self, t: float) -> None:
+        """Advance to time t [s]; a time that is past does nothing."""
+
+    def drive(
+        self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
+    ) -> None:
+        """Command of a joint's servo from now on.
+
+        ``mode`` is 5 (current-based position: ``goal_current`` bounds the magnitude), 3 (position:
+        likewise, with the model's own limit) or 0 (current: ``goal_current`` is signed).
+        """

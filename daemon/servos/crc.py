@@ -1,4 +1,4 @@
-"""CRC-16 of Protocol 2.0 as the client needs it: two bytes a step. Nothing else lives here."""
+"""CRC-16 of Protocol 2.0, two bytes a step, for the client and the emulated servos."""
 
 from __future__ import annotations
 

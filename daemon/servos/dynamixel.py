@@ -22,18 +22,14 @@ from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.checks import check_latency
-from softfinger.daemon.servos.examine import examine
-from softfinger.daemon.servos.groups import GroupRead
-from softfinger.daemon.servos.joints import Joint
-from softfinger.daemon.servos.line import ServoLine
-from softfinger.daemon.servos.models import ServoModel, by_name
-from softfinger.daemon.servos.modes import mode_number
-from softfinger.daemon.servos.packets import PacketHandler
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.checks import check_latency, examine
+from softfinger.daemon.servos.control_table import JointScale, ServoModel, by_name
+from softfinger.daemon.servos.joint import Joint
 from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
+from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.servos.torque import Torque
-from softfinger.daemon.servos.units import JointScale
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _log = logging.getLogger(__name__)
@@ -50,12 +46,12 @@ _ENABLED = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 _HEALTH_EVERY = 0.25  # s
 _CHECK_EVERY = 0.01  # s
 _CHECK_SHARE = 0.05  # of the line's time that checks may take
-_KEPT = 0.035  # s for which a goal counts as sent lately
-_FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must go on
-# A reply may come after its deadline, and be taken for the next question's. So after a question
-# without an answer the next ones ask for spans of different lengths, which tell replies apart.
-_MARKS = 11  # lengths of each span: as much as is needed, and up to ten registers before it
-_DOUBTFUL = 32  # questions
+_SENT_LATELY = 0.035  # s for which a goal counts as sent lately
+_FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
+# A reply may come after its deadline, and be taken for the next request's. So after a request
+# without a reply the next ones ask for spans of different lengths, which tell replies apart.
+_LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
+_DOUBTFUL = 32  # requests
 _PATIENCE = 0.02  # s that a reply may take while the servos are checked: nothing hurries there
 _LAST_TRIES = 10  # of torque off, at the end
 
@@ -67,26 +63,25 @@ class DynamixelServos:
     """
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
-        self.notices: tuple[str, ...] = ()
+        self.notices: tuple[Finding, ...] = ()
         self._clock = clock
         self._settings = settings.servos
         self._profile = settings
-        self._mode = mode_number(settings.servos)
+        self._mode = reg.MODE_NUMBERS[settings.servos.mode]
         self._handler = PacketHandler()
         self._joints: list[Joint] = []
         self._line: ServoLine | None = None
+        self._torque: Torque | None = None
         self._spans: dict[tuple[int, int], list[GroupRead]] = {}
         self._errors: GroupRead | None = None
-        self._turn = 0
-        self._doubtful = 0  # questions to come whose replies may be mistaken for each other's
+        self._turn = 0  # which length was read last
+        self._doubtful = 0  # requests to come whose replies may be mistaken for each other's
         self._next_health = self._next_check = -math.inf  # time.monotonic()
         self._check_every = _CHECK_EVERY
-        self._torque: Torque | None = None
-        self._fast = False
         self._retries = 0
         self._alerts = 0
 
-    # --- connect -----------------------------------------------------------------------------
+    # --- connect ---------------------------------------------------------------------------------
 
     def connect(self) -> None:
         """Open the port, again if it is open, and check every servo; changes nothing in them.
@@ -95,84 +90,82 @@ class DynamixelServos:
             ServoError: all that is wrong, one line each. The port is closed again.
         """
         self.close()
-        servos = self._settings
+        servos, profile = self._settings, self._profile
         model = by_name(servos.model)
-        fingers = [FINGERS.index(name) for name in self._profile.scene.fingers]
-        kept = max(2, round(_KEPT * self._profile.loop.rate))
+        kept = max(2, round(_SENT_LATELY * profile.loop.rate))
         self._joints = [
-            Joint(
-                finger,
-                servos.ids[finger],
-                JointScale.of(servos, finger, model),
-                sent=deque(maxlen=kept),
-            )
-            for finger in fingers
+            Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=kept))
+            for f in map(FINGERS.index, profile.scene.fingers)
         ]
         port = SerialPort(servos.port, servos.baud, servos.reply_timeout)
         port.openPort()
         line = ServoLine(port, self._handler)
-        torque = Torque(line, model, servos, self._profile.hand, self._joints, self._mode)
+        torque = Torque(line, model, servos, profile.hand, self._joints)
         try:
-            self._check(line, model, torque)
+            fast = self._check(line, model, torque)
         except BaseException:
             port.closePort()
             raise
         ids = [joint.id for joint in self._joints]
+        read = FastGroupRead if fast else GroupRead
         for span in (_PRESENT, _CHECK, _HEALTH, _ENABLED):
             first, last = span
             self._spans[span] = [
-                GroupRead(port, self._handler, first - mark, last + 1 - first + mark, ids)
-                for mark in range(_MARKS)
+                read(port, self._handler, first - more, last + 1 - first + more, ids)
+                for more in range(_LENGTHS)
             ]
-        self._errors = GroupRead(port, self._handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
+        self._errors = read(port, self._handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
         more = len(ids) * (_PRESENT[0] - _CHECK[0]) * BITS_PER_BYTE / servos.baud
         self._check_every = max(_CHECK_EVERY, more / _CHECK_SHARE)
         self._doubtful = 0
         self._next_health = self._next_check = -math.inf
-        self._torque = torque
-        self._line = line
+        self._line, self._torque = line, torque
 
-    def _check(self, line: ServoLine, model: ServoModel, torque: Torque) -> None:
+    def _check(self, line: ServoLine, model: ServoModel, torque: Torque) -> bool:
+        """Whether all servos answer fast sync reads; sets the joints' own limits."""
         port = line.port
-        latency = check_latency(port.port_name, port.latency_timer(), port.reply_timeout)
-        errors, notices = list(latency.errors), list(latency.notices)
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
         try:
             found = examine(line, self._profile, model)
         finally:
             port.reply_timeout = allowed
-        silent = []
-        self._fast = True
-        for joint, each in zip(self._joints, found, strict=True):
-            errors += each.findings.errors
-            notices += each.findings.notices
-            if not each.answers:
-                silent.append(joint.name)
-            if each.table:
-                self._fast = self._fast and model.fast_read(each.table[reg.FIRMWARE_VERSION])
-                limit = self._settings.current_limit[joint.finger]
-                joint.bound = min(each.word(reg.CURRENT_LIMIT), joint.scale.bound_counts(limit))
-                joint.ends = each.long(reg.MIN_POSITION_LIMIT), each.long(reg.MAX_POSITION_LIMIT)
-        if silent and len(silent) == len(self._joints):
+        if not any(each.answers for each in found):
             raise ServoError(
                 f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
-                f"{', '.join(str(joint.id) for joint in self._joints)}): check power and wiring; "
+                f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
                 "`softfinger doctor` looks for them at every rate"
             )
-        for name in silent:
-            errors.append(
-                f"{name}: no answer at {port.baudrate} baud: check its cable and ID; "
-                "`softfinger doctor` looks for it at every rate"
-            )
+        latency = port.latency_timer()
+        slow = check_latency(port.port_name, latency)
+        adapter = [] if slow is None else [slow]
+        errors = adapter if latency >= allowed else []
+        notices = [] if latency >= allowed else adapter
+        for each in found:
+            errors += each.errors
+            notices += each.notices
+            if not each.answers:
+                fix = "check its cable and ID; `softfinger doctor` looks for it at every rate"
+                errors.append(Finding(each.name, f"no answer at {port.baudrate} baud", fix))
         if errors:
-            raise ServoError("\n".join(errors))
-        strayed = torque.strayed({each.id: each.position for each in found})
-        notices += [f"{text}; torque is refused there" for text in strayed if text]
+            raise ServoError("\n".join(map(str, errors)))
+        for joint, each in zip(self._joints, found, strict=True):
+            limit = self._settings.current_limit[joint.finger]
+            joint.bound = min(each.table.word(reg.CURRENT_LIMIT), joint.scale.bound_counts(limit))
+            joint.ends = (
+                each.table.long(reg.MIN_POSITION_LIMIT),
+                each.table.long(reg.MAX_POSITION_LIMIT),
+            )
+        positions = {each.id: each.table.long(reg.PRESENT_POSITION) for each in found}
+        for stray in torque.strayed(positions):
+            notices.append(
+                Finding(stray.subject, stray.problem, f"{stray.fix}; torque is refused there")
+            )
         self.notices = tuple(notices)
         for notice in notices:
             _log.warning(notice)
+        return all(model.fast_read(each.table[reg.FIRMWARE_VERSION]) for each in found)
 
-    # --- the tick ----------------------------------------------------------------------------
+    # --- the tick --------------------------------------------------------------------------------
 
     def read(self, reading: Reading) -> None:
         """Fill ``reading`` from one group read; a damaged reply is asked for once more in time.
@@ -195,39 +188,38 @@ class DynamixelServos:
             self._exchange(_PRESENT, reading)
 
     def _exchange(self, span: tuple[int, int], reading: Reading) -> GroupRead | None:
-        """Read a span that ends with or has the joints' motion in it, and fill ``reading``."""
+        """Read a span that has the joints' motion in it, and fill ``reading``."""
         if not self._spans:
             raise ServoError("servos: not connected")
         reading.seq += 1
-        mark = 0
+        turn = 0
         if self._doubtful:
             self._doubtful -= 1
-            mark = self._turn = self._turn % (_MARKS - 1) + 1
-        group = self._spans[span][mark]
-        result = group.exchange(self._fast)
+            turn = self._turn = self._turn % (_LENGTHS - 1) + 1
+        group = self._spans[span][turn]
+        result = group.exchange()
         if result == COMM_RX_CORRUPT:
             # Once more, with what is left of the first exchange's deadline.
-            port = group.port
-            port.not_after = port.deadline
-            if time.monotonic() < port.deadline:
+            deadline = group.port.deadline
+            if time.monotonic() < deadline:
                 self._retries += 1
-                result = group.exchange(self._fast)
-            port.not_after = math.inf
+                result = group.exchange(deadline)
         reading.valid = result == COMM_SUCCESS
         if not reading.valid:
             self._doubtful = _DOUBTFUL
             return None
         reading.t = self._clock.now()
-        at = reg.PRESENT_CURRENT - group.start_address
+        at = reg.PRESENT_CURRENT - group.start
         alert = 0
         for joint in self._joints:
-            finger, scale = joint.finger, joint.scale
-            current, velocity, position = _MOTION(group.data_dict[joint.id], at)
-            reading.q[finger] = joint.q = scale.angle(position)
-            reading.dq[finger] = joint.dq = scale.rate(velocity)
-            reading.current[finger] = scale.amperes(current)
+            f, scale = joint.finger, joint.scale
+            sign = scale.direction
+            current, velocity, position = _MOTION(group.data[joint.id], at)
+            reading.q[f] = joint.q = sign * (position - scale.zero) * scale.radian
+            reading.dq[f] = joint.dq = sign * velocity * scale.velocity
+            reading.current[f] = sign * current * scale.current_unit
             if group.errors[joint.id] & 0x80:
-                alert |= 1 << finger
+                alert |= 1 << f
         if alert:
             self._alerts += 1
             if alert != reading.alert:
@@ -236,19 +228,19 @@ class DynamixelServos:
         return group
 
     def _take_health(self, group: GroupRead, reading: Reading) -> None:
-        at = reg.PRESENT_INPUT_VOLTAGE - group.start_address
+        at = reg.PRESENT_INPUT_VOLTAGE - group.start
         for joint in self._joints:
-            voltage, temperature = _SUPPLY(group.data_dict[joint.id], at)
+            voltage, temperature = _SUPPLY(group.data[joint.id], at)
             reading.voltage[joint.finger] = voltage * reg.VOLTAGE_UNIT
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Whether each servo's own clock goes on, and whether it holds what it was told."""
-        start, torque = group.start_address, self._torque
+        """Whether each servo's own clock advances, and whether it holds a goal that was sent."""
+        start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
         for joint in self._joints:
-            table = group.data_dict[joint.id]
+            table = group.data[joint.id]
             (ticks,) = _CLOCK(table, reg.REALTIME_TICK - start)
             if ticks != joint.ticks:
                 joint.ticks, joint.ticked = ticks, now
@@ -258,11 +250,11 @@ class DynamixelServos:
                 reading.lost |= 1 << joint.finger
 
     def _ask_errors(self, reading: Reading) -> None:
-        """Learn what the servos' alert means, once."""
+        """Read what the servos' alert means, once."""
         errors = self._errors
-        if errors is not None and errors.exchange(self._fast) == COMM_SUCCESS:
+        if errors is not None and errors.exchange() == COMM_SUCCESS:
             for joint in self._joints:
-                reading.hardware[joint.finger] = errors.data_dict[joint.id][0]
+                reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
         """Send goal angles and current bounds; nothing while torque was not switched on here.
@@ -282,7 +274,7 @@ class DynamixelServos:
         torque.goals.send(values)
 
     def torque_on(self) -> None:
-        """Switch torque on and make sure of it: from the present angle, with no current yet.
+        """Switch torque on and verify it: at the present angle, with no current yet.
 
         Raises:
             ServoError: it could not be done or not be verified, and may be on.
@@ -292,7 +284,7 @@ class DynamixelServos:
         self._torque.on()
 
     def torque_off(self, reading: Reading) -> bool:
-        """Ask for torque off, and read; whether every servo's register says that it is off.
+        """Ask for torque off, and read; whether every servo's register confirms it.
 
         Raises:
             ServoError: the port is gone.
@@ -304,14 +296,14 @@ class DynamixelServos:
         found = self._exchange(_ENABLED, reading)
         if found is None:
             return False
-        at = reg.TORQUE_ENABLE - found.start_address
-        if any(found.data_dict[joint.id][at] for joint in self._joints):
+        at = reg.TORQUE_ENABLE - found.start
+        if any(found.data[joint.id][at] for joint in self._joints):
             return False
-        torque.off()
+        torque.confirmed_off()
         reading.lost = 0
         return True
 
-    # --- the end -----------------------------------------------------------------------------
+    # --- the end ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
         """Exchanges that went wrong since connect, by kind."""

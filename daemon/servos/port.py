@@ -1,8 +1,6 @@
-"""The SDK's port over pyserial, with its traps closed; nothing about packets' meaning.
+"""The SDK's port over pyserial, exclusive, with a monotonic deadline for each exchange.
 
-The SDK's own port handler spins on non-blocking reads, measures its deadline on the wall clock,
-adds 34 ms to it, and opens a port that another process already uses. Here a read blocks until
-bytes come or a monotonic deadline of a few milliseconds is over, and the port is exclusive.
+What the SDK's own port would cost stands in :mod:`servos.protocol`.
 """
 
 from __future__ import annotations
@@ -14,7 +12,6 @@ import select
 import termios
 import time
 from pathlib import Path
-from typing import Any
 
 import serial
 from dynamixel_sdk.port_handler import PortHandler
@@ -31,10 +28,11 @@ class PortGone(ServoError):
 
 
 class SerialPort(PortHandler):  # type: ignore[misc]
-    """An exclusive serial port with a deadline for each exchange.
+    """An exclusive serial port for one thread.
 
-    The deadline is ``reply_timeout`` seconds, and more only where the bytes alone take longer on
-    the wire. One owner, one thread; the SDK's ``is_using`` flag stays False.
+    A reply may take ``reply_timeout`` seconds, and more only where the bytes alone take longer on
+    the wire. ``received`` holds bytes that came and are not taken as a packet yet, ``deadline``
+    the time.monotonic() at which the exchange under way ends.
     """
 
     def __init__(
@@ -45,27 +43,13 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         self._low_latency = low_latency
         self.baudrate = baud
         self.reply_timeout = reply_timeout
-        self.received = bytearray()  # bytes that came and were not yet taken as a packet
+        self.received = bytearray()
+        self.deadline = 0.0
         self._descriptor = -1
-        self.deadline = 0.0  # of the exchange under way, time.monotonic()
-        self.not_after = math.inf  # no deadline is set later than this
         self._sent = 0
 
-    # --- opening -----------------------------------------------------------------------------
-
     def openPort(self) -> bool:
-        """Open the port exclusively. Raises ServoError with the reason and what mends it."""
-        return self.setupPort(self.baudrate)
-
-    def setBaudRate(self, baudrate: int) -> bool:
-        """Set the rate, any that the port takes, without closing an open port."""
-        self.baudrate = baudrate
-        if self.ser is not None and self.ser.is_open:
-            self.ser.baudrate = baudrate
-            return True
-        return self.setupPort(baudrate)
-
-    def setupPort(self, cflag_baud: int) -> bool:
+        """Open the port exclusively. Raises ServoError with the reason and its fix."""
         path = self.port_name
         try:
             self.ser = serial.Serial(path, self.baudrate, timeout=0, exclusive=True)
@@ -97,37 +81,35 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         except (OSError, ValueError):
             return 0.0
 
-    # --- bytes -------------------------------------------------------------------------------
+    def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
+        """Send a packet; whether all of it went out.
 
-    def clearPort(self) -> None:
-        """Throw away what came unasked, so that an old reply is not taken for a new one."""
-        self.received.clear()
+        With ``reply`` bytes to come, older input is dropped first, so that it isn't taken for the
+        answer, and their deadline starts, not later than ``until`` [s, time.monotonic()].
+        """
+        rest = packet
         try:
-            termios.tcflush(self._descriptor, termios.TCIFLUSH)
-        except (termios.error, OSError, ValueError) as error:
-            raise self._gone(error) from None
-
-    def writePort(self, packet: Any) -> int:
-        """Send a packet; the number of its bytes."""
-        data = bytes(packet)
-        rest = data
-        try:
+            if reply:
+                self.received.clear()
+                termios.tcflush(self._descriptor, termios.TCIFLUSH)
             while rest:
                 rest = rest[os.write(self._descriptor, rest) :]
         except BlockingIOError:
-            return len(data) - len(rest)
-        except OSError as error:
+            return False
+        except (termios.error, OSError, ValueError) as error:
             raise self._gone(error) from None
-        self._sent = len(data)
-        return len(data)
+        if reply:
+            self._sent = len(packet)
+            self.setPacketTimeout(reply)
+            if self.deadline > until:
+                self.deadline = until
+        return True
 
-    def readPort(self, length: int) -> bytes:
-        """Up to ``length`` bytes, at once as many as there are; none once the deadline is over."""
-        if not self.received:
-            self.fill()
-        taken = bytes(self.received[:length])
-        del self.received[: len(taken)]
-        return taken
+    def setPacketTimeout(self, packet_length: int) -> None:
+        """Start the deadline of a reply of so many bytes."""
+        wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
+        # Where a slow rate alone eats the deadline: twice the wire's time and the return delays.
+        self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)
 
     def fill(self) -> bool:
         """Wait for bytes into ``received``; False when the deadline came first."""
@@ -142,31 +124,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             raise self._gone(OSError(errno.EIO, "hung up"))
         self.received += data
         return True
-
-    def getBytesAvailable(self) -> int:
-        """How many bytes wait."""
-        return len(self.received) + int(self.ser.in_waiting)
-
-    # --- deadline ----------------------------------------------------------------------------
-
-    def getCurrentTime(self) -> float:
-        """Monotonic milliseconds, the SDK's unit."""
-        return time.monotonic() * 1000.0
-
-    def setPacketTimeout(self, packet_length: int) -> None:
-        """Start the deadline of a reply of so many bytes."""
-        wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
-        # Where a slow rate alone eats the deadline: twice the wire's time and the return delays.
-        allowed = max(self.reply_timeout, 2.0 * wire + 0.001)
-        self.deadline = min(time.monotonic() + allowed, self.not_after)
-
-    def setPacketTimeoutMillis(self, msec: float) -> None:
-        """Start a deadline of so many milliseconds."""
-        self.deadline = time.monotonic() + msec / 1000.0
-
-    def isPacketTimeout(self) -> bool:
-        """Whether the deadline is over."""
-        return time.monotonic() >= self.deadline
 
     def _gone(self, error: object) -> PortGone:
         return PortGone(

@@ -3,65 +3,62 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.checks import check_model
-from softfinger.daemon.servos.models import by_name
-from softfinger.daemon.servos.modes import current_toward, mode_number
-from softfinger.daemon.servos.units import JointScale
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
-from softfinger.daemon.simulation.servo_model.servo_health import (
-    AMBIENT,
-    THERMAL_RISE,
-    THERMAL_TIME,
-)
+from softfinger.daemon.servos.control_table import JointScale, by_name
+from softfinger.daemon.servos.joint import current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
-_HEALTH_EVERY = 0.25  # s between two looks at temperature and supply
+_HEALTH_EVERY = 0.25  # s between two readings of temperature and supply
+
+
+class HandPlant(JointPlant, Protocol):
+    """The joints of the simulated hand, which knows of the servos' watchdog."""
+
+    def hold_torque_until(self, t: float) -> None:
+        """Torque ends by itself at time t [s]."""
 
 
 class SimulatedServos:
-    """The joints of a :class:`SimulatedHand`, read and told in the configured model's counts.
+    """The joints of a simulated hand, in the configured model's counts.
 
     Every exchange brings the hand to the clock's time first. With a watchdog set, torque goes off
-    by itself that long after the last exchange, and only :meth:`set_torque` brings it back.
+    by itself that long after the last exchange, and only :meth:`torque_on` brings it back.
     """
 
-    def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock) -> None:
-        self._settings = settings
-        self._mode = mode_number(settings.servos)
+    def __init__(self, settings: Settings, hand: HandPlant, clock: Clock) -> None:
+        self._settings = settings.servos
+        self._mode = reg.MODE_NUMBERS[settings.servos.mode]
+        self._model = by_name(settings.servos.model)
         self._hand = hand
         self._clock = clock
         self._joints = sorted(FINGERS.index(name) for name in settings.scene.fingers)
-        self._scales: list[JointScale] = []
+        self._scales = [JointScale.of(settings.servos, i, self._model) for i in range(2)]
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False
         self._torque = False
-        self._last = -math.inf
+        self._tripped = False  # the watchdog took the torque that was switched on here
+        self._trips = 0
+        self._last = -math.inf  # time of the last exchange
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
         self._q = [0.0, 0.0]  # of the last reading [rad, rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
-        self._temperature = [AMBIENT, AMBIENT]  # °C, warming as the emulated servo's does
-        self._voltage = 0.0
-        self._stall_current = 1.0
-        self._looked = -math.inf
-        self._trips = 0
-        self._tripped = False  # the watchdog took the torque that was switched on here
+        self._temperature = [reg.AMBIENT, reg.AMBIENT]  # °C
+        self._health_read = -math.inf
 
     def connect(self) -> None:
         """Take the servos, torque off. Raises ServoError when the model can't do the job."""
-        model = by_name(self._settings.servos.model)
-        unfit = check_model(model, self._mode)
-        if unfit:
-            raise ServoError(f"servos.model: {unfit}")
-        self._scales = [JointScale.of(self._settings.servos, joint, model) for joint in range(2)]
-        self._voltage = 0.5 * (model.voltage_min + model.voltage_max) * reg.VOLTAGE_UNIT
-        self._stall_current = model.stall_current
+        unfit = check_model("servos.model", self._model, self._mode)
+        if unfit is not None:
+            raise ServoError(str(unfit))
         self._connected = True
         self._exchange()
         self._switch(False)
@@ -79,22 +76,22 @@ class SimulatedServos:
             reading.q[joint] = self._q[joint] = scale.angle(scale.position_counts(q[joint]))
             reading.dq[joint] = self._dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
             reading.current[joint] = scale.amperes(scale.current_counts(current[joint]))
-        if reading.t - self._looked >= _HEALTH_EVERY:
-            self._look_at_health(reading, current)
+        if reading.t - self._health_read >= _HEALTH_EVERY:
+            self._read_health(reading, current)
         self._seq += 1
         reading.seq = self._seq
         reading.alert = reading.lost = reading.frozen = 0
         reading.valid = True
 
-    def _look_at_health(self, reading: Reading, current: list[float]) -> None:
-        passed = min(reading.t - self._looked, _HEALTH_EVERY * 2.0)
-        self._looked = reading.t
+    def _read_health(self, reading: Reading, current: list[float]) -> None:
+        passed = min(reading.t - self._health_read, _HEALTH_EVERY * 2.0)
+        self._health_read = reading.t
         for joint in self._joints:
-            share = current[joint] / self._stall_current
-            warm = AMBIENT + THERMAL_RISE * share * share
-            self._temperature[joint] += (warm - self._temperature[joint]) * passed / THERMAL_TIME
+            settled = self._model.settled_temperature(current[joint])
+            warmer = settled - self._temperature[joint]
+            self._temperature[joint] += warmer * passed / reg.THERMAL_TIME
             reading.temperature[joint] = float(round(self._temperature[joint]))
-            reading.voltage[joint] = self._voltage
+            reading.voltage[joint] = self._model.supply
 
     def torque_on(self) -> None:
         """Torque on, with the goal at the present count and no current until a goal is written."""
@@ -108,7 +105,7 @@ class SimulatedServos:
         self._switch(True)
 
     def torque_off(self, reading: Reading) -> bool:
-        """Torque off, which nothing can keep from arriving here, and a reading."""
+        """Torque off, which is certain here, and a reading."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -129,21 +126,16 @@ class SimulatedServos:
         for joint in self._joints:
             scale = self._scales[joint]
             self._goal_q[joint] = scale.angle(scale.position_counts(goal.q[joint]))
-            limit = self._settings.servos.current_limit[joint]
+            limit = self._settings.current_limit[joint]
             bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
-            if self._mode == reg.CURRENT_MODE:
-                self._goal_current[joint] = self._loop(joint, goal.q[joint], bound)
-            else:
-                self._goal_current[joint] = bound * scale.current_unit
+            current = bound * scale.current_unit
+            if self._mode == reg.CURRENT_MODE:  # the daemon's own position loop
+                q, dq = self._q[joint], self._dq[joint]
+                current = current_toward(self._settings, goal.q[joint], current, q, dq)
+                counts = min(max(scale.current_counts(current), -bound), bound)
+                current = scale.amperes(counts)
+            self._goal_current[joint] = current
         self._drive()
-
-    def _loop(self, joint: int, goal_q: float, bound: int) -> float:
-        """Current [A] of the daemon's own position loop, to the register's count."""
-        scale = self._scales[joint]
-        q, dq = self._q[joint], self._dq[joint]
-        current = current_toward(self._settings.servos, goal_q, bound * scale.current_unit, q, dq)
-        counts = min(max(scale.current_counts(current), -bound), bound)
-        return scale.amperes(counts)
 
     def counters(self) -> dict[str, int]:
         """``timeouts`` and ``crc`` stay 0; ``watchdog`` counts how often torque went off by it."""
@@ -157,7 +149,7 @@ class SimulatedServos:
             self._connected = False
 
     def _exchange(self) -> float:
-        """Bring the hand to now, letting the watchdog act on the way, and start it anew."""
+        """Bring the hand to now, with the watchdog's stop on the way, and restart the watchdog."""
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False
@@ -177,10 +169,5 @@ class SimulatedServos:
 
     def _drive(self) -> None:
         for joint in self._joints:
-            self._hand.drive(
-                joint,
-                self._mode,
-                self._torque,
-                self._goal_q[joint],
-                self._goal_current[joint],
-            )
+            goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
+            self._hand.drive(joint, self._mode, self._torque, goal_q, goal_current)

@@ -1,6 +1,6 @@
 """Torque on, each step verified, torque off, and the servos' own bus watchdog behind both.
 
-Torque goes on from the present angle with no current; goal current and goal position are put side
+Torque goes on at the present angle with no current. Goal current and goal position are put side
 by side through indirect addresses, which live in RAM and so are set each time.
 """
 
@@ -9,34 +9,30 @@ from __future__ import annotations
 import math
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Hand, ServoSettings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.checks import check_angle
-from softfinger.daemon.servos.groups import GroupWrite
-from softfinger.daemon.servos.joints import GOAL_SIZE, Joint, goal_in, pack_goal
-from softfinger.daemon.servos.line import ServoLine
-from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.checks import REBOOT_FIX, check_angle
+from softfinger.daemon.servos.control_table import ServoModel
+from softfinger.daemon.servos.joint import GOAL_SIZE, Joint, goal_in, pack_goal
+from softfinger.daemon.servos.protocol import GroupWrite, ServoLine
 
 _GOAL_BYTES = (
-    reg.GOAL_CURRENT,
-    reg.GOAL_CURRENT + 1,
-    reg.GOAL_POSITION,
-    reg.GOAL_POSITION + 1,
-    reg.GOAL_POSITION + 2,
-    reg.GOAL_POSITION + 3,
+    *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
+    *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_COPIES = 2  # of each packet of torque off: what one loses the next may bring
+_COPIES = 2  # of each packet of torque off, since nothing is answered
 _ON_WITHIN = 50  # reply timeouts in which torque must be on: the loop stands still meanwhile
 
 
 class Torque:
-    """The torque of all joints on one line. ``goals`` takes goals while it is on, else None.
+    """The torque of all joints on one line.
 
-    ``may_be_on`` from before it is switched on until the servos have said that it is off.
+    ``goals`` takes goals while it is on and is None else. ``may_be_on`` is True from before it is
+    switched on until the servos have confirmed that it is off.
     """
 
     def __init__(
@@ -46,7 +42,6 @@ class Torque:
         servos: ServoSettings,
         hand: Hand,
         joints: Sequence[Joint],
-        mode: int,
     ) -> None:
         self.goals: GroupWrite | None = None
         self.may_be_on = False
@@ -54,63 +49,35 @@ class Torque:
         self._model = model
         self._hand = hand
         self._joints = {joint.id: joint for joint in joints}
-        self._mode = mode
-        ticks = 0
-        if servos.watchdog > 0.0:
-            ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
-            ticks = min(max(ticks, 1), reg.WATCHDOG_MAX)
-        self._ticks = ticks
+        self._mode = reg.MODE_NUMBERS[servos.mode]
+        ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
+        self._ticks = min(ticks, reg.WATCHDOG_MAX)
         self._not_after = math.inf  # time.monotonic() at which switching on is given up
         ids = list(self._joints)
-        self._offs = [self._zero(reg.TORQUE_ENABLE, each) for each in (ids, *([i] for i in ids))]
-        self._watchdog_off = self._zero(reg.BUS_WATCHDOG, ids)
+        self._offs = [
+            GroupWrite(line.port, reg.TORQUE_ENABLE, 1, each) for each in (ids, *([i] for i in ids))
+        ]
+        self._watchdog_off = GroupWrite(line.port, reg.BUS_WATCHDOG, 1, ids)
 
-    def _zero(self, address: int, ids: Sequence[int]) -> Callable[[], int]:
-        """What writes 0 into a register of these servos; it is not answered."""
-        group = GroupWrite(self._line.port, self._line.handler, address, 1, ids)
-        return partial(group.send, [b"\x00"] * len(ids))
-
-    # --- on and off --------------------------------------------------------------------------
+    # --- on and off ------------------------------------------------------------------------------
 
     def on(self) -> None:
-        """Torque on from the present angle, with no current yet.
+        """Torque on at the present angle, with no current yet.
 
         Raises:
             ServoError: it could not be done or not be verified, and may be on.
         """
         self._not_after = time.monotonic() + _ON_WITHIN * self._line.port.reply_timeout
-        try:
-            self._refuse_hardware_errors()
-            self._switch_on()
-        finally:
-            self._not_after = math.inf
-
-    def ask_off(self) -> None:
-        """Tell the servos to switch torque off: all in one packet, and each in one of its own.
-
-        Nothing is answered and so nothing waited for; whoever asks looks at the registers.
-        """
-        self.goals = None
-        for _ in range(_COPIES):
-            for send in self._offs:
-                send()
-
-    def off(self) -> None:
-        """The servos have said that torque is off: their watchdogs have nothing to stop."""
-        if self.may_be_on:
-            self._watchdog_off()
-        self.may_be_on = False
-
-    def _switch_on(self) -> None:
+        self._refuse_hardware_errors()
         # Writing 0 ends a watchdog's stop, in which goals are read-only.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
         positions = self._positions()
-        strayed = [text for text in self.strayed(positions) if text]
+        strayed = self.strayed(positions)
         if strayed:
-            raise ServoError("\n".join(strayed))
+            raise ServoError("\n".join(map(str, strayed)))
         if self._mode != reg.CURRENT_MODE:
             packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
             self._store(reg.GOAL_POSITION, packed, "goal position")
@@ -124,6 +91,22 @@ class Torque:
             joint.sent.append(pack_goal(self._mode, 0, positions[servo_id]))
         self.goals = goals
 
+    def ask_off(self) -> None:
+        """Ask the servos to switch torque off: all in one packet, and each in one of its own.
+
+        Nothing is answered; whoever asks reads the registers.
+        """
+        self.goals = None
+        for _ in range(_COPIES):
+            for group in self._offs:
+                group.send([b"\x00"] * len(group.ids))
+
+    def confirmed_off(self) -> None:
+        """The servos have confirmed that torque is off: their watchdogs have nothing to stop."""
+        if self.may_be_on:
+            self._watchdog_off.send([b"\x00"] * len(self._joints))
+        self.may_be_on = False
+
     def _choose_goals(self) -> GroupWrite:
         """The one sync write of a tick: goal current, goal position, or both side by side."""
         address = {
@@ -132,8 +115,7 @@ class Torque:
         }.get(self._mode)
         if address is None:
             address = self._map_goals()
-        line, size = self._line, GOAL_SIZE[self._mode]
-        return GroupWrite(line.port, line.handler, address, size, list(self._joints))
+        return GroupWrite(self._line.port, address, GOAL_SIZE[self._mode], list(self._joints))
 
     def _map_goals(self) -> int:
         """Put goal current and goal position side by side in the indirect data; its address."""
@@ -154,23 +136,20 @@ class Torque:
         self._store_all(address, pointers, "indirect addresses")
         return data
 
-    # --- what may stand against it -----------------------------------------------------------
+    # --- what forbids it -------------------------------------------------------------------------
 
-    def strayed(self, positions: Mapping[int, int]) -> list[str]:
-        """What is wrong with the joints' angles; torque there would swing them back at once.
+    def strayed(self, positions: Mapping[int, int]) -> list[Finding]:
+        """Joints whose angle can't be right; torque there would swing them back at once.
 
-        ``positions`` in counts, by ID; one text for each, empty where all is well.
+        ``positions`` in counts, by ID.
         """
-        hand = self._hand
-        return [
-            check_angle(
-                joint.name,
-                joint.scale.angle(positions[servo_id]),
-                hand.q_min[joint.finger],
-                hand.q_max[joint.finger],
-            )
-            for servo_id, joint in self._joints.items()
+        q_min, q_max = self._hand.q_min, self._hand.q_max
+        found = [
+            check_angle(joint.name, joint.scale.angle(positions[i]), q_min[f], q_max[f])
+            for i, joint in self._joints.items()
+            for f in (joint.finger,)
         ]
+        return [each for each in found if each is not None]
 
     def _positions(self) -> dict[int, int]:
         positions = {}
@@ -182,25 +161,22 @@ class Torque:
         return positions
 
     def _refuse_hardware_errors(self) -> None:
-        lines = []
+        found = []
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
-                lines.append(f"{joint.name}: no answer: check its cable and power")
+                found.append(Finding(joint.name, "no answer", "check its cable and power"))
             elif raw[0]:
-                lines.append(
-                    f"{joint.name}: hardware error: {reg.hardware_error_names(raw[0])}: remove the "
-                    "cause, then `softfinger doctor --fix` reboots it"
-                )
-        if lines:
-            raise ServoError("\n".join(lines))
+                error = f"hardware error: {reg.hardware_error_names(raw[0])}"
+                found.append(Finding(joint.name, error, REBOOT_FIX))
+        if found:
+            raise ServoError("\n".join(map(str, found)))
 
-    # --- while it is on ----------------------------------------------------------------------
+    # --- while it is on --------------------------------------------------------------------------
 
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
-        """Whether a servo holds a goal that it was sent lately, by its registers from ``start`` on.
-
-        True while torque was not switched on here.
+        """Whether a servo holds a goal that was sent lately; ``table`` has its registers from
+        ``start`` on. True while torque was not switched on here.
 
         Raises:
             ServoError: its bus watchdog has stopped it, or is no longer armed.
@@ -220,7 +196,7 @@ class Torque:
             )
         return goal_in(self._mode, table, start) in joint.sent
 
-    # --- verified writes ---------------------------------------------------------------------
+    # --- verified writes -------------------------------------------------------------------------
 
     def _store_all(self, address: int, data: bytes, what: str) -> None:
         self._store(address, dict.fromkeys(self._joints, data), what)

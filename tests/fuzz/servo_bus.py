@@ -12,7 +12,7 @@ import sys
 import time
 from typing import NamedTuple
 
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.simulation.servo_model import protocol
 from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, Parser, frame

@@ -5,6 +5,7 @@ The thread serves tests of behaviour; what is timed runs the bus in a process of
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import select
@@ -14,15 +15,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.models import by_name
-from softfinger.daemon.servos.registers import COUNTS_PER_TURN, VELOCITY_UNIT
-from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.servos.control_table import (
+    COUNTS_PER_TURN,
+    VELOCITY_UNIT,
+    JointScale,
+    by_name,
+)
+from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
-RADIAN = 2.0 * 3.141592653589793 / COUNTS_PER_TURN
+RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
 def plain_scale(model: str, zero: int = 0) -> JointScale:
@@ -58,6 +63,36 @@ def make_bus(
         for joint, servo_id in enumerate(ids)
     ]
     return ServoBus(servos, plant, **options)
+
+
+class DirectPort(SerialPort):
+    """A port whose other end is a bus in this thread: a reply is there at once or never comes.
+
+    ``t`` is the bus's time, set by hand; waiting for a reply that does not come takes its deadline.
+    ``baud`` 0 is heard at every rate.
+    """
+
+    def __init__(
+        self, bus: ServoBus, baud: int = 2_000_000, timeout: float = 0.01, t: float = 0.0
+    ) -> None:
+        super().__init__("direct", baud or 2_000_000, timeout)
+        self._heard_at = baud
+        self.bus = bus
+        self.t = t
+
+    def openPort(self) -> bool:
+        return True
+
+    def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
+        if reply:
+            self.received.clear()
+        self.received += self.bus.feed(packet, self.t, self._heard_at)
+        return True
+
+    def fill(self) -> bool:
+        self.t += self.reply_timeout
+        self.deadline = -math.inf
+        return False
 
 
 class RunningBus:

@@ -9,8 +9,8 @@ import threading
 import pytest
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model import protocol

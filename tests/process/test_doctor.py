@@ -20,8 +20,8 @@ from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.scanning import scan
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos import provisioning
 from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.tools import doctor
 from softfinger.tools.cli import main
@@ -79,7 +79,9 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UPS", 5)
     whole = hand.check_servos
-    monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.1, 0.05))
+    monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.5, 0.5))
+    # The emulator shares this process's interpreter lock.
+    monkeypatch.setattr(provisioning, "PING_TIMEOUT", 0.5)
 
 
 def with_status(lines: list[str], status: str) -> list[str]:
@@ -143,16 +145,35 @@ def test_servos_at_another_rate_are_found(emulated, capsys):
         "or set servos.baud = 1000000"
     ) in lines
     path = str(hand.folder / "servos")
-    arguments = ["scan", path, "--baud", "2000000", "--baud", "1000000", "--wait", "0.1"]
+    arguments = ["scan", path, "--baud", "2000000", "--baud", "1000000", "--wait", "0.5"]
     assert main(arguments) == 0
     out = capsys.readouterr().out.splitlines()
     assert [line.split(": ", 1)[1] for line in out] == [
-        f"ID {servo} at 1000000 baud: XM430-W350 (number 1020), firmware 48" for servo in (1, 2)
+        f"ID {servo} at 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
     ]
-    assert main(["scan", path, "--baud", "57600", "--wait", "0.05"]) == 1
+    assert main(["scan", path, "--baud", "57600", "--wait", "0.5"]) == 1
     assert "no servo answers" in capsys.readouterr().out
     assert main(["scan", "/dev/does-not-exist"]) == 1
     assert "no such port" in capsys.readouterr().err
+
+
+def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(emulated, capsys):
+    hand = emulated(ids=(1, 7))
+    servo = hand.emulator._servos.bus.servos[1]
+    status, lines = hand.doctor(capsys)
+    assert (status, servo.id) == (1, 7)
+    assert "note   found: ID 7 at 2000000 baud: XM430-W350, firmware 48" in lines
+    fix = "softfinger doctor --fix makes it servo 2 (right): ID 7 → 2; or set servos.ids as it is"
+    assert f"       → {fix}" in lines
+    status, lines = hand.doctor(capsys, "--fix")
+    assert (status, servo.id) == (0, 2)
+    assert "fixed  servo 2 (right): ID 7 → 2" in lines
+    servo.table.set(reg.ID, 1)
+    status, lines = hand.doctor(capsys)
+    assert status == 1
+    (garbled,) = [line for line in with_status(lines, "FAIL") if "come damaged" in line]
+    assert garbled.startswith("servos: replies of ID 1 at 2000000 baud come damaged: several ser")
+    assert [line for line in lines if line.startswith("       → connect one servo alone, then")]
 
 
 def test_the_built_in_hand_has_nothing_to_ask(capsys):
@@ -168,12 +189,6 @@ def test_wrong_settings_are_told(tmp_path, capsys):
     path.write_text("servos.speed = 3\n")
     assert main(["doctor", "--config", str(path)]) == 2
     assert "unknown key" in capsys.readouterr().err
-
-
-def test_a_rate_that_the_port_has_not_is_passed_over(emulated):
-    hand = emulated(baud=1_000_000)
-    found = scan(str(hand.folder / "servos"), (-1, 1_000_000), wait=0.1)
-    assert [servo.id for servo in found] == [1, 2]
 
 
 # Ports.

@@ -12,7 +12,7 @@ import pytest
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.emulator import Emulator
 from tests.conftest import until
 

@@ -15,10 +15,10 @@ from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.clock import Clock, VirtualClock
 from softfinger.daemon.profile.settings import ServoSettings, Settings
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import make_servos
-from softfinger.daemon.servos import registers as reg
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.servos.modes import NUMBERS, current_toward
+from softfinger.daemon.servos.joint import current_toward
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.physics.hand import SimulatedHand
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
@@ -31,7 +31,7 @@ from tests.harness.servos import RunningBus
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
 TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
-MODES = tuple(NUMBERS)
+MODES = ("current-based position", "current", "position")
 BOUNDED = ("current-based position", "current")
 
 
@@ -312,7 +312,7 @@ def test_position_limits_that_the_joint_does_not_fit_in_are_told():
             rig.servos.connect()
         rig._running.call(lambda: rig._running.servo(1).table.set(reg.MAX_POSITION_LIMIT, 4095))
         rig.servos.connect()
-        assert sum("nothing bounds its current" in n for n in rig.servos.notices) == 2
+        assert sum("nothing bounds its current" in n for n in map(str, rig.servos.notices)) == 2
     finally:
         rig.close()
 

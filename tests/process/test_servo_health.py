@@ -13,9 +13,8 @@ from softfinger.daemon.loop.clock import RealClock, VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import dynamixel, make_servos
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos.control_table import AMBIENT, THERMAL_TIME, by_name
 from softfinger.daemon.servos.simulated import SimulatedServos
-from softfinger.daemon.simulation.servo_model.servo_health import THERMAL_RISE, THERMAL_TIME
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.servos import RunningBus
@@ -101,7 +100,7 @@ def test_simulated_servos_warm_with_their_current() -> None:
     for _ in range(2000):
         clock.sleep_until(clock.now() + 0.1)
         servos.read(reading)
-    share = 2.0 / by_name(Settings().servos.model).stall_current
-    risen = THERMAL_RISE * share**2 * (1.0 - math.exp(-clock.now() / THERMAL_TIME))
+    settled = by_name(Settings().servos.model).settled_temperature(2.0)
+    risen = (settled - AMBIENT) * (1.0 - math.exp(-clock.now() / THERMAL_TIME))
     assert reading.temperature[0] == pytest.approx(25.0 + risen, abs=1.0)
     assert reading.temperature[1] == 25.0

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.trajectory import Profile
 

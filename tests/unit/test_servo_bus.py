@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import MODELS, by_name
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import MODELS, by_name
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model import protocol
 from softfinger.daemon.simulation.servo_model.bus_faults import FaultError

@@ -7,32 +7,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.groups import GroupRead
-from softfinger.daemon.servos.packets import PacketHandler
-from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from tests.harness.servos import RADIAN, make_bus
-
-
-class DirectPort(SerialPort):
-    """A port whose other end is a bus in this thread, at a time that is set by hand."""
-
-    def __init__(self, bus: ServoBus) -> None:
-        super().__init__("direct", 2_000_000, 0.01)
-        self.bus = bus
-        self.t = 0.0
-
-    def clearPort(self) -> None:
-        self.received.clear()
-
-    def writePort(self, packet: bytes) -> int:
-        self.received += self.bus.feed(bytes(packet), self.t)
-        return len(packet)
-
-    def fill(self) -> bool:
-        return False
-
+from tests.harness.servos import RADIAN, DirectPort, make_bus
 
 ADDRESSES = st.one_of(
     st.sampled_from([7, 11, 64, 65, 98, 100, 102, 104, 108, 116, 126, 132, 168, 224, 578, 634]),
@@ -79,7 +57,7 @@ def out_of_reach(address: int, data: bytes) -> bool:
 def test_any_instruction_equals_direct_access(
     steps: list[tuple[str, int, int, bytes | int]], angles: tuple[float, float]
 ) -> None:
-    port, twin = DirectPort(placed(angles)), placed(angles)
+    port, twin = DirectPort(placed(angles), baud=0), placed(angles)
     handler = PacketHandler()
     servos = {servo.id: servo for servo in twin.servos}
     for number, (kind, servo_id, address, what) in enumerate(steps):
@@ -132,9 +110,10 @@ def test_any_instruction_equals_direct_access(
                 result = bulk.fastBulkRead() if "fast" in kind else bulk.txRxPacket()
                 got = {each: bytes(bulk.data_dict[each][0]) for each in servos}
             else:
-                group_read = GroupRead(port, handler, address, what, list(servos))
-                result = group_read.exchange("fast" in kind)
-                got = {each: bytes(group_read.data_dict[each]) for each in servos}
+                make = FastGroupRead if "fast" in kind else GroupRead
+                group_read = make(port, handler, address, what, list(servos))
+                result = group_read.exchange()
+                got = group_read.data
             if None not in expect.values():
                 assert result == sdk.COMM_SUCCESS
                 assert got == expect

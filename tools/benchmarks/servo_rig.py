@@ -16,7 +16,7 @@ import dynamixel_sdk as sdk
 from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.types import Goal, Reading
 
@@ -102,11 +102,11 @@ class OurCycle:
         port = line.port
         sent: list[int] = []
         received = 0
-        write, fill = port.writePort, port.fill
+        send, fill = port.send, port.fill
 
-        def counted_write(packet: Any) -> int:
+        def counted_send(packet: bytes, *reply: Any) -> bool:
             sent.append(len(packet))
-            return int(write(packet))
+            return send(packet, *reply)
 
         def counted_fill() -> bool:
             nonlocal received
@@ -115,11 +115,11 @@ class OurCycle:
             received += len(port.received) - before
             return came
 
-        port.writePort, port.fill = counted_write, counted_fill  # type: ignore[method-assign]
+        port.send, port.fill = counted_send, counted_fill  # type: ignore[assignment, method-assign]
         try:
             self()
         finally:
-            del port.writePort, port.fill
+            del port.send, port.fill
         request, goals = sent
         return Traffic(request, received, goals)
 

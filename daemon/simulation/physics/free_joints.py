@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.servos.registers import CURRENT_MODE
+from softfinger.daemon.servos.control_table import CURRENT_MODE
 from softfinger.kinematics.compiled.kernel import kernel
 
 FloatArray = NDArray[np.float64]

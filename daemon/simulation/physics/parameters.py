@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.models import by_name
+from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
 from softfinger.daemon.simulation.physics.shapes import shape_of

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model.servo_joint import POSITION_MODES, ServoJoint
 
 FAR = 0.05  # rad between goal and present angle at torque on that count as far

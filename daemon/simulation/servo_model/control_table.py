@@ -9,8 +9,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.simulation.servo_model import protocol
 
 _GAIN_MAX = 16_383

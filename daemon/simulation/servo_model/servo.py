@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import ServoModel
-from softfinger.daemon.servos.units import JointScale
-from softfinger.daemon.simulation.physics.joint_plant import JointPlant
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import JointPlant
+from softfinger.daemon.servos.control_table import JointScale, ServoModel
 from softfinger.daemon.simulation.servo_model import protocol
 from softfinger.daemon.simulation.servo_model.bus_recorder import WireWatch
 from softfinger.daemon.simulation.servo_model.control_table import ControlTable, Item

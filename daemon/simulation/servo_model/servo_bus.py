@@ -13,12 +13,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import JointPlant
+from softfinger.daemon.servos.control_table import MODE_NUMBERS, JointScale, ServoModel, by_name
 from softfinger.daemon.servos.crc import crc16
-from softfinger.daemon.servos.models import ServoModel, by_name
-from softfinger.daemon.servos.modes import mode_number
-from softfinger.daemon.servos.units import JointScale
-from softfinger.daemon.simulation.physics.joint_plant import JointPlant
 from softfinger.daemon.simulation.servo_model import protocol
 from softfinger.daemon.simulation.servo_model.bus_faults import (
     LINE_FAULTS,
@@ -119,7 +117,7 @@ class ServoBus:
                 joint,
                 JointScale.of(settings.servos, joint, chosen),
                 prepared=prepared,
-                mode=mode_number(settings.servos),
+                mode=MODE_NUMBERS[settings.servos.mode],
                 baud_index=chosen.baud_rates.index(rate),
                 t=t,
             )

@@ -6,15 +6,12 @@ of the current, overload after OVERLOAD_TIME of current at the configured limit.
 
 from __future__ import annotations
 
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.simulation.servo_model.control_table import ControlTable
 
 OVERLOAD_TIME = 2.0  # s at the current limit
 SENSE = 0.010  # s between two looks
-AMBIENT = 25.0  # °C
-THERMAL_TIME = 120.0  # s
-THERMAL_RISE = 90.0  # °C over ambient at stall current, in the long run
 _VOLTAGE, _HEAT, _OVERLOAD = 0, 2, 5  # bits of the hardware error status
 
 
@@ -22,16 +19,14 @@ class ServoHealth:
     """``voltage`` [V] and ``temperature`` [°C] may be set from outside."""
 
     def __init__(self, model: ServoModel) -> None:
-        self.temperature = AMBIENT
-        self.voltage = 0.0
         self._model = model
         self._overload = 0.0  # s
         self.recover()
 
     def recover(self) -> None:
         """Cool, and the supply as it should be."""
-        self.temperature = AMBIENT
-        self.voltage = (self._model.voltage_min + self._model.voltage_max) / 2 * reg.VOLTAGE_UNIT
+        self.temperature = reg.AMBIENT
+        self.voltage = self._model.supply
 
     def restart(self) -> None:
         """As after a power-up: what was warm stays warm."""
@@ -42,9 +37,8 @@ class ServoHealth:
 
         ``current`` [A] flows; ``pressed``: it is at the configured limit.
         """
-        share = current / self._model.stall_current
-        warm = AMBIENT + THERMAL_RISE * share * share
-        self.temperature += (warm - self.temperature) * SENSE / THERMAL_TIME
+        warmer = self._model.settled_temperature(current) - self.temperature
+        self.temperature += warmer * SENSE / reg.THERMAL_TIME
         self._overload = self._overload + SENSE if pressed else 0.0
         errors = []
         if self.temperature > table.get(reg.TEMPERATURE_LIMIT):

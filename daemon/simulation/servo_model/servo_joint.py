@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 import struct
 
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import ServoModel
-from softfinger.daemon.servos.units import JointScale
-from softfinger.daemon.simulation.physics.joint_plant import JointPlant
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import JointPlant
+from softfinger.daemon.servos.control_table import JointScale, ServoModel
 from softfinger.daemon.simulation.servo_model.control_table import ControlTable
 from softfinger.daemon.simulation.servo_model.trajectory import Profile
 

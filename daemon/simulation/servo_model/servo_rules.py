@@ -6,8 +6,8 @@ is written here.
 
 from __future__ import annotations
 
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.models import ServoModel
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.simulation.servo_model import protocol
 from softfinger.daemon.simulation.servo_model.control_table import ControlTable, Item
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softfinger.daemon.servos import registers as reg
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model.control_table import ControlTable
 
 

@@ -1,7 +1,4 @@
-"""One joint as the tick sees its servo: scale, bounds, and goals as the registers take them.
-
-Numbers only; nothing is sent from here.
-"""
+"""One joint and its servo: scale, bounds, last reading, and goals as the registers hold them."""
 
 from __future__ import annotations
 
@@ -12,12 +9,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from softfinger.daemon.profile.settings import ServoSettings
-from softfinger.daemon.servos import registers as reg
-from softfinger.daemon.servos.examine import servo_name
-from softfinger.daemon.servos.modes import current_toward
-from softfinger.daemon.servos.units import JointScale
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import JointScale
+from softfinger.daemon.types import FINGERS
 
-_CURRENT_AT, _POSITION_AT = reg.GOAL_CURRENT, reg.GOAL_POSITION
 _CURRENT_AND_POSITION = struct.Struct("<hi")
 _CURRENT = struct.Struct("<h")
 _POSITION = struct.Struct("<i")
@@ -28,9 +23,26 @@ GOAL_SIZE: Final = {
 }
 
 
+def servo_name(servo_id: int, finger: int) -> str:
+    """``servo 1 (left)``, as reports call it."""
+    return f"servo {servo_id} ({FINGERS[finger]})"
+
+
+def current_toward(
+    servos: ServoSettings, goal_q: float, bound: float, q: float, dq: float
+) -> float:
+    """Current [A], positive closing, that draws a joint to its goal: current mode's position loop.
+
+    stiffness · (goal_q − q) − damping · dq, within ± ``bound``.
+    """
+    bound = abs(bound)
+    current = servos.stiffness * (goal_q - q) - servos.damping * dq
+    return min(max(current, -bound), bound)
+
+
 @dataclass(slots=True)
 class Joint:
-    """Finger, servo and what was last read of it."""
+    """A finger's joint on the bus."""
 
     finger: int
     id: int
@@ -39,17 +51,17 @@ class Joint:
     ends: tuple[int, int] = (0, 0)  # position limits in counts
     q: float = 0.0  # of the last good reading [rad]
     dq: float = 0.0  # [rad/s]
-    sent: deque[bytes] = field(default_factory=deque)  # the last goals, as registers take them
-    ticks: int = -1  # of its own clock, when that was last looked at
-    ticked: float = math.inf  # when that was last seen to go on, time.monotonic()
+    sent: deque[bytes] = field(default_factory=deque)  # the last goals, as registers hold them
+    ticks: int = -1  # of the servo's own clock, when that was last read
+    ticked: float = math.inf  # when that was last seen to advance, time.monotonic()
 
     @property
     def name(self) -> str:
-        """How it is called in reports."""
+        """How reports call its servo."""
         return servo_name(self.id, self.finger)
 
     def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
-        """A goal [rad, A] as the registers of this mode take it."""
+        """A goal [rad, A] as the registers of this mode hold it."""
         scale = self.scale
         if mode == reg.POSITION_MODE:
             low, high = self.ends
@@ -62,7 +74,7 @@ class Joint:
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:
-    """A goal in counts as the registers of this mode take it."""
+    """A goal in counts as the registers of this mode hold it."""
     if mode == reg.POSITION_MODE:
         return _POSITION.pack(position)
     if mode == reg.CURRENT_MODE:
@@ -71,9 +83,9 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """The goal that a servo's registers hold; ``table`` has them from ``start`` on."""
-    current = table[_CURRENT_AT - start : _CURRENT_AT - start + _CURRENT.size]
-    position = table[_POSITION_AT - start : _POSITION_AT - start + _POSITION.size]
+    """The goal that a servo holds; ``table`` has its registers from ``start`` on."""
+    current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
+    position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:
         return position
     return current if mode == reg.CURRENT_MODE else current + position

@@ -1,0 +1,382 @@
+"""The Dynamixel X series' control table: addresses, units, operating modes and models.
+
+Plain data from the servo maker's manuals, and the mapping between counts and a joint's SI units.
+The client and the emulated servos both read it; nothing here talks to a servo.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from softfinger.daemon.profile.settings import ServoSettings
+
+# --- addresses -----------------------------------------------------------------------------------
+
+# EEPROM: kept over a reboot, writable only while torque is off.
+MODEL_NUMBER: Final = 0
+MODEL_INFORMATION: Final = 2
+FIRMWARE_VERSION: Final = 6
+ID: Final = 7
+BAUD_RATE: Final = 8
+RETURN_DELAY_TIME: Final = 9
+DRIVE_MODE: Final = 10
+OPERATING_MODE: Final = 11
+SHADOW_ID: Final = 12
+PROTOCOL_TYPE: Final = 13
+HOMING_OFFSET: Final = 20
+MOVING_THRESHOLD: Final = 24
+TEMPERATURE_LIMIT: Final = 31
+MAX_VOLTAGE_LIMIT: Final = 32
+MIN_VOLTAGE_LIMIT: Final = 34
+PWM_LIMIT: Final = 36
+CURRENT_LIMIT: Final = 38
+VELOCITY_LIMIT: Final = 44
+MAX_POSITION_LIMIT: Final = 48
+MIN_POSITION_LIMIT: Final = 52
+STARTUP_CONFIGURATION: Final = 60
+PWM_SLOPE: Final = 62
+SHUTDOWN: Final = 63
+
+# RAM: reset at every reboot.
+RAM: Final = 64
+TORQUE_ENABLE: Final = 64
+LED: Final = 65
+STATUS_RETURN_LEVEL: Final = 68
+REGISTERED_INSTRUCTION: Final = 69
+HARDWARE_ERROR_STATUS: Final = 70
+VELOCITY_I_GAIN: Final = 76
+VELOCITY_P_GAIN: Final = 78
+POSITION_D_GAIN: Final = 80
+POSITION_I_GAIN: Final = 82
+POSITION_P_GAIN: Final = 84
+FEEDFORWARD_2ND_GAIN: Final = 88
+FEEDFORWARD_1ST_GAIN: Final = 90
+BUS_WATCHDOG: Final = 98
+GOAL_PWM: Final = 100
+GOAL_CURRENT: Final = 102
+GOAL_VELOCITY: Final = 104
+PROFILE_ACCELERATION: Final = 108
+PROFILE_VELOCITY: Final = 112
+GOAL_POSITION: Final = 116
+REALTIME_TICK: Final = 120
+MOVING: Final = 122
+MOVING_STATUS: Final = 123
+PRESENT_PWM: Final = 124
+PRESENT_CURRENT: Final = 126
+PRESENT_VELOCITY: Final = 128
+PRESENT_POSITION: Final = 132
+VELOCITY_TRAJECTORY: Final = 136
+POSITION_TRAJECTORY: Final = 140
+PRESENT_INPUT_VOLTAGE: Final = 144
+PRESENT_TEMPERATURE: Final = 146
+BACKUP_READY: Final = 147
+
+# --- units ---------------------------------------------------------------------------------------
+
+BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+COUNTS_PER_TURN: Final = 4096
+VELOCITY_UNIT: Final = 0.229 * 2.0 * math.pi / 60.0  # rad/s a count
+ACCELERATION_UNIT: Final = 214.577 * 2.0 * math.pi / 3600.0  # rad/s² a count
+VOLTAGE_UNIT: Final = 0.1  # V a count
+RETURN_DELAY_UNIT: Final = 2e-6  # s a count
+WATCHDOG_UNIT: Final = 0.020  # s a count
+WATCHDOG_MAX: Final = 127
+WATCHDOG_ERROR: Final = 0xFF  # register 98 reads -1: goals are refused until 0 is written there
+
+# --- operating modes, register 11 ----------------------------------------------------------------
+
+CURRENT_MODE: Final = 0
+VELOCITY_MODE: Final = 1
+POSITION_MODE: Final = 3
+EXTENDED_POSITION_MODE: Final = 4
+CURRENT_BASED_POSITION_MODE: Final = 5
+PWM_MODE: Final = 16
+MODE_NAMES: Final = {
+    CURRENT_MODE: "current",
+    VELOCITY_MODE: "velocity",
+    POSITION_MODE: "position",
+    EXTENDED_POSITION_MODE: "extended position",
+    CURRENT_BASED_POSITION_MODE: "current-based position",
+    PWM_MODE: "PWM",
+}
+MODE_NUMBERS: Final = {name: number for number, name in MODE_NAMES.items()}
+
+# --- hardware errors, registers 70 and 63 --------------------------------------------------------
+
+HARDWARE_ERRORS: Final = {
+    0: "input voltage out of limits",
+    2: "overheating",
+    3: "motor encoder",
+    4: "electrical shock",
+    5: "overload",
+}
+
+
+def hardware_error_names(status: int) -> str:
+    """What the bits of the hardware error register mean, joined by commas."""
+    names = [name for bit, name in HARDWARE_ERRORS.items() if status >> bit & 1]
+    return ", ".join(names) or f"unknown error bits 0x{status:02X}"
+
+
+# --- models --------------------------------------------------------------------------------------
+
+# Our own choice for the simulated servos, where the manuals say nothing: one thermal time constant.
+AMBIENT: Final = 25.0  # °C
+THERMAL_TIME: Final = 120.0  # s
+_THERMAL_RISE = 90.0  # °C over ambient at stall current, in the long run
+
+
+@dataclass(frozen=True, slots=True)
+class ServoModel:
+    """One model, in the registers' counts where no unit is given; defaults are factory values."""
+
+    name: str
+    number: int
+    firmware: int  # the version the emulated servo reports
+    highest_baud: int  # index into BAUD_RATES
+    current_unit: float  # A a count; 0 without a current sensor
+    current_limit: int  # default and upper bound
+    velocity_limit: int  # default
+    velocity_max: int  # upper bound of the velocity limit
+    temperature_limit: int  # °C, default
+    voltage_min: int  # 0.1 V, default and lower bound of the voltage limits
+    voltage_max: int  # 0.1 V, default and upper bound
+    velocity_gains: tuple[int, int]  # I, P
+    position_gains: tuple[int, int, int]  # D, I, P
+    shutdown: int
+    drive_mode_max: int
+    fast_read_firmware: int  # first version that answers fast sync and fast bulk read
+    modes: tuple[int, ...] = tuple(MODE_NAMES)
+    pwm_slope: int | None = None  # default of register 62, where the model has it
+    small: bool = False  # X330 frame: its indirect map moved with firmware 53
+
+    @property
+    def senses_current(self) -> bool:
+        """Whether the model measures and bounds motor current."""
+        return self.current_unit > 0.0
+
+    @property
+    def baud_rates(self) -> tuple[int, ...]:
+        """The rates that register 8 can choose."""
+        return BAUD_RATES[: self.highest_baud + 1]
+
+    @property
+    def stall_current(self) -> float:
+        """A: the greatest current the model allows (1 A where it can't sense current)."""
+        return self.current_limit * self.current_unit if self.senses_current else 1.0
+
+    @property
+    def no_load_speed(self) -> float:
+        """rad/s at the shaft with full PWM and no load; the default velocity limit is about it."""
+        return self.velocity_limit * VELOCITY_UNIT
+
+    @property
+    def supply(self) -> float:
+        """V: the middle of the supply's range."""
+        return (self.voltage_min + self.voltage_max) / 2.0 * VOLTAGE_UNIT
+
+    def settled_temperature(self, current: float) -> float:
+        """°C that a simulated motor reaches in the long run with this current [A] through it."""
+        share = current / self.stall_current
+        return AMBIENT + _THERMAL_RISE * share * share
+
+    def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
+        """(first address register, first data register, entries) of each indirect block."""
+        if not self.small:
+            return ((168, 224, 28), (578, 634, 28))
+        if firmware <= 52:
+            return ((168, 208, 20),)
+        return ((168, 224, 28),)
+
+    def fast_read(self, firmware: int) -> bool:
+        """Whether this firmware answers fast sync read and fast bulk read."""
+        return firmware >= self.fast_read_firmware
+
+    def highest_address(self, firmware: int) -> int:
+        """The last address of the control table."""
+        return max(data + entries for _, data, entries in self.indirect_blocks(firmware)) - 1
+
+
+_XM430_W350 = ServoModel(
+    name="XM430-W350",
+    number=1020,
+    firmware=48,
+    highest_baud=7,
+    current_unit=2.69e-3,
+    current_limit=1193,
+    velocity_limit=200,
+    velocity_max=1023,
+    temperature_limit=80,
+    voltage_min=95,
+    voltage_max=160,
+    velocity_gains=(1920, 100),
+    position_gains=(0, 0, 800),
+    shutdown=52,
+    drive_mode_max=5,
+    fast_read_firmware=45,
+)
+_XL330_M288 = ServoModel(
+    name="XL330-M288",
+    number=1200,
+    firmware=53,
+    highest_baud=6,
+    current_unit=1e-3,
+    current_limit=1750,
+    velocity_limit=445,
+    velocity_max=2047,
+    temperature_limit=70,
+    voltage_min=35,
+    voltage_max=70,
+    velocity_gains=(1600, 180),
+    position_gains=(0, 0, 400),
+    shutdown=53,
+    drive_mode_max=5,
+    fast_read_firmware=46,
+    pwm_slope=140,
+    small=True,
+)
+_XC330_M288 = replace(
+    _XL330_M288,
+    name="XC330-M288",
+    number=1240,
+    current_limit=2352,
+    velocity_limit=350,
+    velocity_gains=(1600, 50),
+    position_gains=(500, 0, 1100),
+    shutdown=52,
+    drive_mode_max=13,
+)
+MODELS: Final = {
+    model.name: model
+    for model in (
+        _XM430_W350,
+        replace(_XM430_W350, name="XM430-W210", number=1030, velocity_limit=330),
+        replace(
+            _XM430_W350, name="XM540-W270", number=1120, current_limit=2047, velocity_limit=128
+        ),
+        _XL330_M288,
+        replace(
+            _XL330_M288,
+            name="XL330-M077",
+            number=1190,
+            velocity_limit=1620,
+            velocity_gains=(400, 40),
+            position_gains=(0, 400, 400),
+        ),
+        replace(
+            _XC330_M288,
+            name="XC330-T288",
+            number=1220,
+            current_limit=910,
+            velocity_limit=320,
+            voltage_min=55,
+            voltage_max=140,
+            velocity_gains=(1200, 40),
+            position_gains=(0, 0, 900),
+            pwm_slope=255,
+        ),
+        _XC330_M288,
+        replace(
+            _XM430_W350,
+            name="XL430-W250",
+            number=1060,
+            current_unit=0.0,
+            current_limit=0,
+            velocity_limit=265,
+            temperature_limit=72,
+            voltage_min=60,
+            voltage_max=140,
+            velocity_gains=(1000, 100),
+            position_gains=(4000, 0, 640),
+            drive_mode_max=13,
+            modes=(VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE),
+        ),
+    )
+}
+
+
+def by_name(name: str) -> ServoModel:
+    """The model of that name; a connector suffix (``-T``, ``-R``) is not needed.
+
+    Raises:
+        KeyError: no such model; the message names the known ones.
+    """
+    plain = name.upper().removesuffix("-T").removesuffix("-R")
+    model = MODELS.get(plain)
+    if model is None:
+        raise KeyError(f"unknown servo model {name!r}; known: {', '.join(MODELS)}")
+    return model
+
+
+def name_of(number: int) -> str:
+    """The name of the model that answers a ping with ``number``; the number if it is unknown."""
+    names = [model.name for model in MODELS.values() if model.number == number]
+    return names[0] if names else f"model number {number}"
+
+
+# --- a joint's SI units --------------------------------------------------------------------------
+
+_GOAL_LIMIT = 1_048_575  # counts: the furthest goal the multi-turn modes take
+
+
+@dataclass(frozen=True, slots=True)
+class JointScale:
+    """How one joint's counts map to rad, rad/s and A.
+
+    q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and likewise for velocity. Currents
+    keep the motor's own ampere; only the sign follows the joint, so that positive closes.
+    """
+
+    direction: int  # +1 or -1: sign of the counts when the joint closes
+    zero: int  # counts at q = 0
+    radian: float  # rad of the joint a position count, always > 0
+    velocity: float  # rad/s of the joint a velocity count, always > 0
+    current_unit: float  # A a current count
+
+    @classmethod
+    def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
+        """The scale of joint 0 (left) or 1 (right) under the settings.
+
+        Raises:
+            KeyError: the settings name a model that is not in the table.
+        """
+        model = by_name(servos.model) if model is None else model
+        return cls(
+            direction=servos.direction[joint],
+            zero=servos.zero[joint],
+            radian=2.0 * math.pi / COUNTS_PER_TURN / servos.gear_ratio,
+            velocity=VELOCITY_UNIT / servos.gear_ratio,
+            current_unit=model.current_unit,
+        )
+
+    def angle(self, counts: float) -> float:
+        """Joint angle [rad] of a position in counts."""
+        return self.direction * (counts - self.zero) * self.radian
+
+    def rate(self, counts: float) -> float:
+        """Joint velocity [rad/s] of a velocity in counts."""
+        return self.direction * counts * self.velocity
+
+    def amperes(self, counts: float) -> float:
+        """Motor current [A], positive closing, of a signed current in counts."""
+        return self.direction * counts * self.current_unit
+
+    def position_counts(self, q: float) -> int:
+        """Position in counts nearest to the joint angle q [rad], kept inside what a goal takes."""
+        counts = self.zero + self.direction * q / self.radian
+        return round(min(max(counts, -_GOAL_LIMIT), _GOAL_LIMIT))
+
+    def velocity_counts(self, dq: float) -> int:
+        """Velocity in counts nearest to dq [rad/s]."""
+        return round(self.direction * dq / self.velocity)
+
+    def current_counts(self, current: float) -> int:
+        """Signed current in counts nearest to a motor current [A] that is positive closing."""
+        return round(self.direction * current / self.current_unit) if self.current_unit else 0
+
+    def bound_counts(self, current: float) -> int:
+        """Counts of a bound on the current's magnitude [A], rounded down so that it stays one."""
+        return int(abs(current) / self.current_unit + 1e-9) if self.current_unit else 0

@@ -1,0 +1,335 @@
+"""Protocol 2.0 as the client speaks it: the SDK's packet handler, group exchanges, single servos.
+
+What the SDK (4.1.0) does otherwise than the daemon needs, with its consequence; each is overridden
+here or in :mod:`servos.port`, and everything else of the SDK is used as it is:
+
+- ``txPacket`` drops the stuffed packet: FF FF FD within goals is sent unstuffed and misread.
+- ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD: up to 8 % of group reads fail.
+- ``rxPacket`` spins on non-blocking reads: a processor is busy for the whole wire's time.
+- ``txPacket`` leaves ``is_using`` set after a failure: every later call returns −1000.
+- ``updateCRC`` builds its table at each call: 50 µs a packet.
+- ``readTxRx`` takes a reply of another length: an old reply's CRC is returned as data.
+- ``GroupSyncRead`` drops the servos' error bytes and reads 0 after a failure: an alert is lost,
+  and a joint seems to be at 0.
+- ``broadcastPing`` always waits for 253 servos: 0.8 s at 1 Mbaud.
+- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms: a missing servo costs 35 ms,
+  a clock that is set any time. It also opens a port that another process already uses.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
+from dynamixel_sdk.robotis_def import (
+    BROADCAST_ID,
+    COMM_NOT_AVAILABLE,
+    COMM_RX_CORRUPT,
+    COMM_RX_TIMEOUT,
+    COMM_SUCCESS,
+    COMM_TX_ERROR,
+    COMM_TX_FAIL,
+    INST_FAST_SYNC_READ,
+    INST_PING,
+    INST_READ,
+    INST_STATUS,
+    INST_SYNC_READ,
+    INST_SYNC_WRITE,
+    MAX_ID,
+)
+
+from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.port import SerialPort
+
+TRIES = 3  # of an exchange outside the tick
+_HEADER = b"\xff\xff\xfd"
+_PREFIX = _HEADER + b"\x00"
+_STUFFED = _HEADER + b"\xfd"
+_MAX_PACKET = 1024
+_STATUS_SIZE = 11  # bytes of a status packet without data
+_ERROR = 0x7F  # of a servo's error byte; the bit above is the alert
+
+
+def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """A whole packet: stuffed, and closed with the CRC."""
+    body = bytes((instruction,)) + parameters
+    if _HEADER in body:
+        body = body.replace(_HEADER, _STUFFED)
+    packet = _PREFIX + struct.pack("<BH", packet_id, len(body) + 2) + body
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
+    """The SDK's packet handler with its traps closed, counting what went wrong."""
+
+    def __init__(self) -> None:
+        self.timeouts = 0  # replies that did not come at all
+        self.crc_errors = 0  # replies that came damaged
+        self.torn = 0  # replies of which only a part came
+        self.late = 0  # replies to an earlier question
+        self.refused = 0  # readings answered with an error
+        self.skipped_bytes = 0  # bytes that belonged to no reply
+
+    @property
+    def damaged(self) -> int:
+        """How often bytes came that were no whole reply."""
+        return self.crc_errors + self.torn + self.skipped_bytes
+
+    def updateCRC(self, crc_accum: int, data_blk_ptr: Sequence[int], data_blk_size: int) -> int:
+        """The SDK's name for :func:`crc16`."""
+        return crc16(bytes(data_blk_ptr[:data_blk_size]), crc_accum)
+
+    def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
+        """Stuff, close with the CRC and send the packet that ``txpacket`` holds unstuffed."""
+        packet = packed(txpacket[4], txpacket[7], bytes(txpacket[8:-2]))
+        if len(packet) > _MAX_PACKET:
+            return int(COMM_TX_ERROR)
+        return int(COMM_SUCCESS if port.send(packet, _STATUS_SIZE) else COMM_TX_FAIL)
+
+    def readTxRx(
+        self, port: SerialPort, dxl_id: int, address: int, length: int
+    ) -> tuple[list[int], int, int]:
+        """Read a span: (data, result code, error byte). With an error the data are zeros.
+
+        A reply of another length is an old one (the SDK does not wait for an action's) and is
+        skipped.
+        """
+        if dxl_id >= BROADCAST_ID:
+            return [], int(COMM_NOT_AVAILABLE), 0
+        request = packed(dxl_id, INST_READ, struct.pack("<HH", address, length))
+        if not port.send(request, _STATUS_SIZE + length):
+            return [], int(COMM_TX_FAIL), 0
+        while True:
+            packet, result = self.rxPacket(port, False)
+            if result != COMM_SUCCESS:
+                return [], result, 0
+            if packet[4] != dxl_id:
+                continue
+            if len(packet) == _STATUS_SIZE + length:
+                return list(packet[9:-2]), result, packet[8]
+            if packet[8] & _ERROR:
+                return [0] * length, result, packet[8]
+
+    def rxPacket(self, port: SerialPort, fast_option: bool) -> tuple[Any, int]:
+        """The next status packet, unstuffed, and the result code.
+
+        A fast reply is not stuffed and comes from the broadcast ID. A damaged packet ends the
+        wait at once: what was lost does not come again.
+        """
+        buffer = port.received
+        while True:
+            start = buffer.find(_PREFIX)
+            skipped = start if start >= 0 else max(len(buffer) - 3, 0)
+            if skipped:
+                self.skipped_bytes += skipped
+                del buffer[:skipped]
+            if start >= 0 and len(buffer) >= 8:
+                sender, length = buffer[4], buffer[5] | buffer[6] << 8
+                known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
+                if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
+                    self.skipped_bytes += 1
+                    del buffer[0]  # an echo of what we sent, or noise
+                    continue
+                end = 7 + length
+                if len(buffer) >= end:
+                    break
+            if not port.fill():
+                if buffer:
+                    self.torn += 1
+                    return b"", int(COMM_RX_CORRUPT)
+                self.timeouts += 1
+                return b"", int(COMM_RX_TIMEOUT)
+        packet = bytes(buffer[:end])
+        del buffer[:end]
+        if crc16(packet[:-2]) != packet[-2] | packet[-1] << 8:
+            self.crc_errors += 1
+            return packet, int(COMM_RX_CORRUPT)
+        if not fast_option and _STUFFED in packet[7:-2]:
+            body = packet[7:-2].replace(_STUFFED, _HEADER)
+            packet = packet[:5] + struct.pack("<H", len(body) + 2) + body + packet[-2:]
+        return packet, int(COMM_SUCCESS)
+
+
+# --- the tick's exchanges ------------------------------------------------------------------------
+
+
+class GroupRead:
+    """A sync read of one span of several servos.
+
+    After :meth:`exchange` returned success, ``data[id]`` has the span's bytes and ``errors[id]``
+    the servo's error byte; after a failure neither is to be used.
+    """
+
+    instruction = INST_SYNC_READ
+
+    def __init__(
+        self,
+        port: SerialPort,
+        handler: PacketHandler,
+        address: int,
+        length: int,
+        ids: Sequence[int],
+    ) -> None:
+        self.start = address
+        self.data = dict.fromkeys(ids, b"")
+        self.errors = dict.fromkeys(ids, 0)
+        self.port = port
+        self._handler = handler
+        self._length = length
+        span = struct.pack("<HH", address, length)
+        self._request = packed(BROADCAST_ID, self.instruction, span + bytes(ids))
+        self._reply = (_STATUS_SIZE + length) * len(ids)
+
+    def exchange(self, until: float = math.inf) -> int:
+        """Ask, and wait at most ``until`` [s, time.monotonic()]; a result code of the SDK."""
+        if not self.port.send(self._request, self._reply, until):
+            return int(COMM_TX_FAIL)
+        handler = self._handler
+        for servo_id in self.data:  # each answers for itself, in their order
+            while True:
+                packet, result = handler.rxPacket(self.port, False)
+                if result != COMM_SUCCESS:
+                    return result
+                if packet[8] & _ERROR:  # its data are no reading
+                    handler.refused += 1
+                    return int(COMM_RX_CORRUPT)
+                if len(packet) != _STATUS_SIZE + self._length:
+                    handler.late += 1
+                elif packet[4] == servo_id:
+                    break
+            self.errors[servo_id] = packet[8]
+            self.data[servo_id] = packet[9:-2]
+        return int(COMM_SUCCESS)
+
+
+class FastGroupRead(GroupRead):
+    """The same as a fast sync read: one reply of all, whose last CRC covers every byte of it."""
+
+    instruction = INST_FAST_SYNC_READ
+
+    def exchange(self, until: float = math.inf) -> int:
+        """Ask, and wait at most ``until`` [s, time.monotonic()]; a result code of the SDK."""
+        if not self.port.send(self._request, self._reply, until):
+            return int(COMM_TX_FAIL)
+        handler, length = self._handler, self._length
+        while True:
+            packet, result = handler.rxPacket(self.port, True)
+            if result != COMM_SUCCESS:
+                return result
+            if len(packet) == 8 + len(self.data) * (length + 4):
+                break
+            handler.late += 1
+        at = 8
+        for servo_id in self.data:
+            if packet[at + 1] != servo_id:
+                return int(COMM_RX_CORRUPT)
+            if packet[at] & _ERROR:  # its data are no reading
+                handler.refused += 1
+                return int(COMM_RX_CORRUPT)
+            self.errors[servo_id] = packet[at]
+            self.data[servo_id] = packet[at + 2 : at + 2 + length]
+            at += length + 4
+        return int(COMM_SUCCESS)
+
+
+class GroupWrite:
+    """A sync write of one span of several servos, whose packet's beginning is built once."""
+
+    def __init__(self, port: SerialPort, address: int, length: int, ids: Sequence[int]) -> None:
+        self._port = port
+        self._span = struct.pack("<HH", address, length)
+        size = 7 + len(ids) * (1 + length)  # instruction, span, values, CRC
+        self._head = _PREFIX + struct.pack("<BHB", BROADCAST_ID, size, INST_SYNC_WRITE) + self._span
+        self._crc = crc16(self._head)
+        self.ids = [bytes((servo_id,)) for servo_id in ids]
+
+    def send(self, values: Sequence[bytes]) -> None:
+        """Write each servo's bytes, in the order of their IDs; nothing is answered."""
+        body = b""
+        for name, value in zip(self.ids, values, strict=True):
+            body += name + value
+        if _HEADER in body:  # to be stuffed, which changes the length
+            packet = packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body)
+        else:
+            packet = self._head + body + crc16(body, self._crc).to_bytes(2, "little")
+        self._port.send(packet)
+
+
+# --- single servos, outside the tick -------------------------------------------------------------
+
+
+class ServoLine:
+    """Exchanges with single servos on an open port, each tried a few times."""
+
+    def __init__(self, port: SerialPort, handler: PacketHandler | None = None) -> None:
+        self.port = port
+        self.handler = handler or PacketHandler()
+
+    def ping(self, servo_id: int, tries: int = TRIES) -> int | None:
+        """The servo's model number, None when it does not answer."""
+        for _ in range(tries):
+            number, result, _ = self.handler.ping(self.port, servo_id)
+            if result == COMM_SUCCESS:
+                return int(number)
+        return None
+
+    def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
+        """(model number, firmware) of every servo that answers a broadcast ping within ``wait`` s.
+
+        Servos answer one after the other in the order of their IDs; 253 of them need 0.8 s.
+        """
+        found: dict[int, tuple[int, int]] = {}
+        port = self.port
+        port.send(packed(BROADCAST_ID, INST_PING), _STATUS_SIZE)
+        port.deadline = time.monotonic() + wait
+        while time.monotonic() < port.deadline:
+            packet, result = self.handler.rxPacket(port, False)
+            if result == COMM_SUCCESS and len(packet) == _STATUS_SIZE + 3:
+                found[packet[4]] = (packet[9] | packet[10] << 8, packet[11])
+        return found
+
+    def read(self, servo_id: int, address: int, length: int) -> bytes | None:
+        """A span of registers, None when no sound answer came."""
+        for _ in range(TRIES):
+            data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
+            if result == COMM_SUCCESS:
+                return None if error & _ERROR else bytes(data)
+        return None
+
+    def write(self, address: int, values: Mapping[int, bytes]) -> None:
+        """Write each servo's bytes, all of one length, unanswered and unverified.
+
+        As a sync write, which works at any status return level.
+        """
+        length = len(next(iter(values.values())))
+        GroupWrite(self.port, address, length, list(values)).send(list(values.values()))
+
+    def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
+        """Write each servo's bytes and read them back; the IDs where that did not succeed."""
+        waiting = dict(values)
+        for _ in range(TRIES):
+            self.write(address, waiting)
+            for servo_id, data in list(waiting.items()):
+                if self.read(servo_id, address, len(data)) == data:
+                    del waiting[servo_id]
+            if not waiting:
+                break
+        return list(waiting)
+
+
+@contextlib.contextmanager
+def open_line(
+    path: str, baud: int, reply_timeout: float, low_latency: bool = True
+) -> Iterator[ServoLine]:
+    """A line on a port of its own, closed at the end. Raises ServoError when it can't be opened."""
+    port = SerialPort(path, baud, reply_timeout, low_latency)
+    port.openPort()
+    try:
+        yield ServoLine(port)
+    finally:
+        port.closePort()

@@ -1,0 +1,349 @@
+"""Finding servos on a port, and setting up those of the settings: ID, rate, mode, return delay.
+
+:func:`provision` is the one place that writes a servo's EEPROM, and only when it is asked to
+(`softfinger doctor --fix`); the hand lets go meanwhile. IDs and rates are written only where there
+is no doubt which servo is meant (:func:`plan`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.checks import CHECKED, DRIVE_UNFIT, RETURN_DELAY_MAX
+from softfinger.daemon.servos.control_table import ServoModel, by_name
+from softfinger.daemon.servos.joint import servo_name
+from softfinger.daemon.servos.protocol import ServoLine, open_line
+from softfinger.daemon.types import FINGERS
+
+PING_TIMEOUT = 0.02  # s, for factory-new servos with their return delay, behind slow adapters
+SEARCH_TIME = 0.8  # s to listen at each rate: 253 servos at 1 Mbaud
+FACTORY_ID = 1
+ALONE = (
+    "connect one servo alone, then `softfinger doctor --fix`; then the next one beside it, and the "
+    "same again"
+)
+_PROBES = 8  # reads of the whole table
+_REBOOT_LIMIT = 2.0  # s that a servo may take to answer again
+_WRITTEN = 0.05  # s in which a packet has left an adapter and is in a servo's EEPROM
+
+
+# --- finding servos ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class FoundServo:
+    """A servo that answered a search."""
+
+    id: int
+    baud: int
+    number: int
+    firmware: int
+
+    def __str__(self) -> str:
+        name = reg.name_of(self.number)
+        return f"ID {self.id} at {self.baud} baud: {name}, firmware {self.firmware}"
+
+
+@dataclass(frozen=True, slots=True)
+class Garbled:
+    """An ID whose replies come damaged: several servos have it, or the line is bad."""
+
+    id: int
+    baud: int
+
+    def __str__(self) -> str:
+        factory = ", as all have from the factory" if self.id == FACTORY_ID else ""
+        return (
+            f"replies of ID {self.id} at {self.baud} baud come damaged: several servos have that "
+            f"ID{factory}, or the line is bad"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """All that a port has. A servo may be in ``servos`` and its ID in ``garbled``."""
+
+    servos: tuple[FoundServo, ...]
+    garbled: tuple[Garbled, ...]
+
+
+def search(
+    path: str,
+    bauds: Iterable[int] = reg.BAUD_RATES,
+    wait: float = SEARCH_TIME,
+    ids: Iterable[int] = (FACTORY_ID,),
+) -> Found:
+    """Every servo on the port, at each of the rates, ``wait`` s for each; changes nothing.
+
+    Rates that the adapter has not are skipped. Where damaged bytes came, ``ids`` are asked one by
+    one.
+
+    Raises:
+        ServoError: the port can't be opened at any of the rates.
+    """
+    found: list[FoundServo] = []
+    garbled: list[Garbled] = []
+    opened, refusal = False, None
+    for baud in bauds:
+        try:
+            with open_line(path, baud, PING_TIMEOUT) as line:
+                opened = True
+                answers = line.ping_all(wait)
+                asked = {*answers, *(ids if line.handler.damaged else ())}
+                found += [FoundServo(each, baud, *what) for each, what in answers.items()]
+                garbled += [Garbled(i, baud) for i in sorted(asked) if is_garbled(line, i)]
+        except ServoError as error:
+            refusal = refusal or error
+    if refusal is not None and not opened:
+        raise refusal
+    return Found(tuple(found), tuple(garbled))
+
+
+def is_garbled(line: ServoLine, servo_id: int) -> bool:
+    """Whether several servos answer to this ID at once, as far as their registers differ.
+
+    Supply voltage, position and running time do, a reply of a ping does not.
+    """
+    handler, damaged = line.handler, 0
+    for _ in range(_PROBES):
+        before = handler.damaged
+        handler.readTxRx(line.port, servo_id, 0, CHECKED)
+        damaged += handler.damaged > before
+    return damaged > 1  # one alone may be a disturbance
+
+
+# --- which servo is meant ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A servo that is to get the ID and rate of a finger's."""
+
+    servo: FoundServo
+    finger: int
+    id: int
+    baud: int
+
+    @property
+    def name(self) -> str:
+        """How reports call it afterwards."""
+        return servo_name(self.id, self.finger)
+
+    def __str__(self) -> str:
+        changes = []
+        if self.servo.id != self.id:
+            changes.append(f"ID {self.servo.id} → {self.id}")
+        if self.servo.baud != self.baud:
+            changes.append(f"{self.servo.baud} → {self.baud} baud")
+        return ", ".join(changes)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """``changes`` that leave no doubt, and what else differs from the settings."""
+
+    changes: tuple[Change, ...]
+    missing: tuple[int, ...]  # fingers whose servo is not known yet
+    strangers: tuple[FoundServo, ...]  # that answer and are nobody's
+
+
+def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
+    """Which servo is which, of those found at ``rates``.
+
+    A servo of the settings' model that has a missing servo's ID, at another rate, is that servo.
+    Failing that, one single servo that is nobody's is the single missing one. Whatever is garbled
+    stays as it is.
+    """
+    servos = settings.servos
+    ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
+    seen = Counter(each.id for each in found.servos)
+    # An unpaced emulator answers at whatever rate it is asked.
+    anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
+    home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
+    bad = {(each.id, each.baud) for each in found.garbled}
+    strangers = [
+        each
+        for each in found.servos
+        if (each.baud != servos.baud or each.id not in ids)
+        and not (each.id in anywhere and each.baud != servos.baud)
+        and (each.id, each.baud) not in bad
+    ]
+    # At the settings' rate an ID of theirs is that finger's, although the scene leaves it out.
+    others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
+    fit = [each for each in strangers if each.number == model.number and each not in others]
+    missing = [servo_id for servo_id in ids if servo_id not in home]
+    changes = []
+    for servo_id in list(missing):
+        same = [each for each in fit if each.id == servo_id]
+        if len(same) == 1 and (servo_id, servos.baud) not in bad:
+            changes.append(Change(same[0], ids[servo_id], servo_id, servos.baud))
+            fit.remove(same[0])
+            missing.remove(servo_id)
+    if len(fit) == len(missing) == 1 and (missing[0], servos.baud) not in bad:
+        changes.append(Change(fit[0], ids[missing[0]], missing[0], servos.baud))
+        missing.clear()
+    taken = [change.servo for change in changes]
+    return Plan(
+        tuple(changes),
+        tuple(ids[servo_id] for servo_id in missing),
+        tuple(each for each in strangers if each not in taken),
+    )
+
+
+# --- setting them up -----------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Provisioned:
+    """What was changed, and what could not be: (servo, change) and findings."""
+
+    done: list[tuple[str, str]] = field(default_factory=list)
+    problems: list[Finding] = field(default_factory=list)
+
+
+def provision(settings: Settings, search_time: float = SEARCH_TIME) -> Provisioned:
+    """Set each servo of the scene up: ID, rate, mode, no return delay, reads answered, no errors.
+
+    ``search_time`` [s] is given to each rate where a servo has to be searched for.
+
+    Raises:
+        ServoError: the port can't be opened.
+    """
+    servos, result = settings.servos, Provisioned()
+    model = by_name(servos.model)
+    names = {
+        servos.ids[finger]: servo_name(servos.ids[finger], finger)
+        for finger in map(FINGERS.index, settings.scene.fingers)
+    }
+    with open_line(servos.port, servos.baud, PING_TIMEOUT) as line:
+        complete = all(line.ping(servo_id) is not None for servo_id in names)
+    if not complete:
+        found = search(servos.port, model.baud_rates, search_time, {FACTORY_ID, *servos.ids})
+        what = plan(found, settings, model, model.baud_rates)
+        for change in what.changes:
+            _identify(servos.port, change, model, result)
+        result.problems += _unknown(settings, found, what)
+    with open_line(servos.port, servos.baud, PING_TIMEOUT) as line:
+        for servo_id, name in names.items():
+            number = line.ping(servo_id)
+            if number is None:
+                if name not in [each.subject for each in result.problems]:
+                    result.problems.append(Finding(name, f"no answer at {servos.baud} baud"))
+            elif number != model.number:
+                problem = Finding(name, f"is not an {model.name}", "set servos.model")
+                result.problems.append(problem)
+            elif is_garbled(line, servo_id):
+                result.problems.append(Finding(name, "its replies come damaged", ALONE))
+            else:
+                mode = reg.MODE_NUMBERS[servos.mode]
+                _set_up(line, servo_id, name, mode if mode in model.modes else None, result)
+    return result
+
+
+def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
+    """Why servos that are still missing are not known."""
+    if found.garbled:
+        return [Finding("servos", str(each), ALONE) for each in found.garbled]
+    names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
+    fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
+    if not fit:
+        fix = "check its power and cable"
+        return [Finding(name, "no answer at any rate", fix) for name in names]
+    return [Finding(name, f"may be any of {fit}", ALONE) for name in names]
+
+
+def _identify(path: str, change: Change, model: ServoModel, result: Provisioned) -> None:
+    """Give a servo its ID and rate."""
+    old, new, name = change.servo.id, change.id, change.name
+
+    def failed(problem: str, fix: str = "") -> None:
+        result.problems.append(Finding(name, problem, fix))
+
+    if change.baud not in model.baud_rates:
+        return failed(f"an {model.name} has no {change.baud} baud", "set servos.baud")
+    with open_line(path, change.servo.baud, PING_TIMEOUT) as line:
+        if line.store(reg.STATUS_RETURN_LEVEL, {old: b"\x02"}):
+            return failed("answers a ping but no read")
+        if new != old and line.ping(new) is not None:
+            return failed(f"ID {new} at {change.servo.baud} baud is taken by another servo")
+        if line.read(old, reg.TORQUE_ENABLE, 1) != b"\x00" and not _torque_off(
+            line, old, name, result
+        ):
+            return None
+        if new != old:
+            line.write(reg.ID, {old: bytes((new,))})
+            if line.ping(new) != model.number:
+                return failed(f"ID {old} could not be set to {new}")
+        if change.baud != change.servo.baud:
+            index = model.baud_rates.index(change.baud)
+            line.write(reg.BAUD_RATE, {new: bytes((index,))})
+            time.sleep(_WRITTEN)
+    with open_line(path, change.baud, PING_TIMEOUT) as line:
+        if line.ping(new) != model.number:
+            return failed(f"no answer after its rate was set to {change.baud} baud")
+    result.done.append((name, str(change)))
+    return None
+
+
+def _set_up(
+    line: ServoLine, servo_id: int, name: str, mode: int | None, result: Provisioned
+) -> None:
+    """Everything but ID and rate."""
+
+    def failed(problem: str) -> None:
+        result.problems.append(Finding(name, problem))
+
+    # A level of 0 leaves reads unanswered, so it is set before anything is read.
+    if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
+        return failed("answers a ping but no read")
+    table = line.read(servo_id, 0, CHECKED)
+    if table is None:
+        return failed("its registers could not be read")
+    if table[reg.HARDWARE_ERROR_STATUS]:
+        error = reg.hardware_error_names(table[reg.HARDWARE_ERROR_STATUS])
+        if not _reboot(line, servo_id):
+            return failed(f"no answer after a reboot ({error})")
+        result.done.append((name, f"rebooted, since it had a hardware error: {error}"))
+    elif table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
+        return None
+    now, drive, delay = (
+        table[at] for at in (reg.OPERATING_MODE, reg.DRIVE_MODE, reg.RETURN_DELAY_TIME)
+    )
+    wanted = [
+        (reg.OPERATING_MODE, now if mode is None else mode, f"operating mode {now}"),
+        (reg.DRIVE_MODE, drive & ~DRIVE_UNFIT, f"drive mode {drive}"),
+        (reg.RETURN_DELAY_TIME, 0 if delay > RETURN_DELAY_MAX else delay, f"return delay {delay}"),
+    ]
+    for address, value, text in wanted:
+        if value == table[address]:
+            continue
+        if line.store(address, {servo_id: bytes((value,))}):
+            failed(f"{text} could not be set to {value}")
+        else:
+            result.done.append((name, f"{text} → {value}"))
+    return None
+
+
+def _torque_off(line: ServoLine, servo_id: int, name: str, result: Provisioned) -> bool:
+    if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
+        result.problems.append(Finding(name, "torque could not be switched off"))
+        return False
+    result.done.append((name, "torque off, since EEPROM is locked while it is on"))
+    return True
+
+
+def _reboot(line: ServoLine, servo_id: int) -> bool:
+    line.handler.reboot(line.port, servo_id)
+    end = time.monotonic() + _REBOOT_LIMIT
+    while time.monotonic() < end:
+        # Each ping waits for its deadline, and so paces this.
+        if line.ping(servo_id, tries=1) is not None:
+            return line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1) == b"\x00"
+    return False

@@ -1,0 +1,238 @@
+"""Finding servos, telling which is which, and setting them up, over a line without a port."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos import provisioning
+from softfinger.daemon.servos.control_table import by_name
+from softfinger.daemon.servos.protocol import ServoLine
+from softfinger.daemon.servos.provisioning import (
+    Found,
+    FoundServo,
+    Garbled,
+    plan,
+    provision,
+    search,
+)
+from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from tests.harness.servos import DirectPort
+
+MODEL = by_name("XM430-W350")
+RATES = MODEL.baud_rates
+HOME = 2_000_000
+
+
+# --- which servo is meant ----------------------------------------------------------------------
+
+
+def servo(servo_id: int, baud: int = HOME, number: int = MODEL.number) -> FoundServo:
+    return FoundServo(servo_id, baud, number, 48)
+
+
+BOTH: dict[str, Any] = {}
+ONLY_LEFT = {"scene": {"fingers": ("left",)}}
+ONLY_RIGHT = {"scene": {"fingers": ("right",)}}
+OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
+
+
+@pytest.mark.parametrize(
+    ("settings", "found", "told"),
+    [
+        # At home.
+        (BOTH, [servo(1), servo(2)], []),
+        (BOTH, [servo(1), servo(2), servo(9)], ["stranger 9@2000000"]),
+        # The right ID at another rate is that servo.
+        (
+            BOTH,
+            [servo(1, 57600), servo(2, 57600)],
+            ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
+        ),
+        # A single servo is the single missing one.
+        (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
+        (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
+        (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
+        # The servo of a finger that the scene leaves out is not the missing one; from the
+        # factory, at another rate, it is nobody's.
+        (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
+        (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
+        (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
+        # What would be a guess.
+        (BOTH, [servo(7)], ["missing 0", "missing 1", "stranger 7@2000000"]),
+        (
+            BOTH,
+            [servo(1), servo(7), servo(8)],
+            ["missing 1", "stranger 7@2000000", "stranger 8@2000000"],
+        ),
+        (BOTH, [servo(1), servo(7, number=1200)], ["missing 1", "stranger 7@2000000"]),
+        (
+            BOTH,
+            [servo(1, 57600), servo(1, 1_000_000), servo(2)],
+            ["missing 0", "stranger 1@57600", "stranger 1@1000000"],
+        ),
+        # An emulator without pace answers at every rate.
+        (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
+        # What is garbled stays, and no servo may get an ID that is garbled.
+        (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
+        (
+            BOTH,
+            [servo(2), servo(9, 57600), Garbled(1, HOME)],
+            ["missing 0", "stranger 9@57600"],
+        ),
+    ],
+)
+def test_which_servo_is_which(settings: dict, found: list, told: list[str]) -> None:
+    servos = tuple(each for each in found if isinstance(each, FoundServo))
+    garbled = tuple(each for each in found if isinstance(each, Garbled))
+    what = plan(Found(servos, garbled), Settings.model_validate(settings), MODEL, RATES)
+    changes = [f"{each.finger}: {each}" for each in what.changes]
+    missing = [f"missing {finger}" for finger in what.missing]
+    assert changes + missing + [f"stranger {s.id}@{s.baud}" for s in what.strangers] == told
+
+
+# --- searching and setting up ------------------------------------------------------------------
+
+
+class Bus:
+    """The settings' servos on free joints; ``silent`` ones are unplugged."""
+
+    def __init__(self, baud: int = HOME, **options: Any) -> None:
+        self.settings = Settings.model_validate({"servos": {"backend": "dynamixel"}})
+        self.bus = ServoBus.from_settings(self.settings, FreeJoints(2), baud=baud, **options)
+        self.servos = self.bus.servos
+        self.t = 0.0
+
+    @contextlib.contextmanager
+    def line(self, path: str, baud: int, timeout: float) -> Iterator[ServoLine]:
+        if baud < 0:
+            raise ServoError("no such rate")
+        port = DirectPort(self.bus, baud, timeout, self.t)
+        yield ServoLine(port)
+        self.t = port.t
+
+    def provision(self, **servos: Any) -> tuple[list[str], list[str]]:
+        changed = self.settings.servos.model_copy(update=servos)
+        result = provision(self.settings.model_copy(update={"servos": changed}))
+        done = [f"{name}: {change}" for name, change in result.done]
+        return done, [str(each) for each in result.problems]
+
+    def addresses(self) -> list[tuple[int, int]]:
+        return [(each.id, each.baud) for each in self.servos]
+
+
+@pytest.fixture
+def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
+    """Makes buses that the lines of this test lead to."""
+
+    def make(**options: Any) -> Bus:
+        bus = Bus(**options)
+        monkeypatch.setattr(provisioning, "open_line", bus.line)
+        return bus
+
+    return make
+
+
+MODE_AND_DELAY = ["operating mode 3 → 5", "return delay 250 → 0"]
+LEFT, RIGHT = "servo 1 (left)", "servo 2 (right)"
+
+
+def named(name: str, *changes: str) -> list[str]:
+    return [f"{name}: {change}" for change in changes]
+
+
+def test_a_search_finds_servos_at_their_rate(wired: Callable[..., Bus]) -> None:
+    wired(baud=1_000_000)
+    found = search("line", (-1, 57600, 1_000_000, 2_000_000))  # the port has no rate of -1
+    assert found.servos == tuple(FoundServo(i, 1_000_000, 1020, 48) for i in (1, 2))
+    assert str(found.servos[0]) == "ID 1 at 1000000 baud: XM430-W350, firmware 48"
+    with pytest.raises(ServoError, match="no such rate"):
+        search("line", (-1,))
+
+
+def test_factory_modes_are_changed(wired: Callable[..., Bus]) -> None:
+    bus = wired(prepared=False)
+    done = named(LEFT, *MODE_AND_DELAY) + named(RIGHT, *MODE_AND_DELAY)
+    assert bus.provision() == (done, [])
+    assert bus.provision() == ([], [])
+
+
+def test_two_factory_servos_are_set_up_one_after_the_other(wired: Callable[..., Bus]) -> None:
+    bus = wired(baud=57600, ids=(1, 1), prepared=False)
+    bus.servos[1].silent = True
+    assert bus.provision() == (
+        named(LEFT, "57600 → 2000000 baud", *MODE_AND_DELAY),
+        [f"{RIGHT}: no answer at any rate: check its power and cable"],
+    )
+    assert bus.addresses() == [(1, HOME), (1, 57600)]
+    bus.servos[1].silent = False
+    done = named(RIGHT, "ID 1 → 2, 57600 → 2000000 baud", *MODE_AND_DELAY)
+    assert bus.provision() == (done, [])
+    assert bus.addresses() == [(1, HOME), (2, HOME)]
+    assert bus.provision() == ([], [])
+    assert not any(each.torque_on for each in bus.servos)
+
+
+def test_factory_servos_together_are_reported_and_not_changed(wired: Callable[..., Bus]) -> None:
+    bus = wired(baud=57600, ids=(1, 1), prepared=False)
+    before = [bytes(each.table.memory[: reg.RAM]) for each in bus.servos]
+    assert search("line", (57600, HOME)).garbled == (Garbled(1, 57600),)
+    done, problems = bus.provision()
+    assert done == []
+    assert "several servos have that ID, as all have from the factory" in problems[0]
+    assert [bytes(each.table.memory[: reg.RAM]) for each in bus.servos] == before
+
+
+@pytest.mark.parametrize("spoil", ["torque", "mute"])
+def test_a_servo_that_holds_or_is_mute_is_set_too(wired: Callable[..., Bus], spoil: str) -> None:
+    bus = wired(ids=(1, 7))
+    stray = bus.servos[1].table
+    if spoil == "torque":
+        stray.set(reg.TORQUE_ENABLE, 1)
+    else:
+        stray.set(reg.STATUS_RETURN_LEVEL, 0)
+    done, problems = bus.provision()
+    assert problems == []
+    assert f"{RIGHT}: ID 7 → 2" in done
+    assert (spoil == "torque") == any("torque off" in line for line in done)
+    assert not bus.servos[1].torque_on
+    assert stray.get(reg.STATUS_RETURN_LEVEL) == 2
+
+
+@pytest.mark.parametrize(
+    ("fault", "register", "value", "done"),
+    [
+        ("overload=2", None, 0, f"{RIGHT}: rebooted, since it had a hardware error: overload"),
+        ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque off, since EEPROM is locked while it is on"),
+        ("", reg.DRIVE_MODE, 0b1001, f"{LEFT}: drive mode 9 → 1"),
+        ("", reg.STATUS_RETURN_LEVEL, 0, ""),
+    ],
+)
+def test_what_is_set_up(
+    wired: Callable[..., Bus], fault: str, register: int | None, value: int, done: str
+) -> None:
+    bus = wired()
+    if fault:
+        bus.bus.fault(fault, 0.0)
+    if register is not None:
+        bus.servos[0].table.set(register, value)
+    assert bus.provision() == ([done] if done else [], [])
+    assert bus.servos[1].table.get(reg.HARDWARE_ERROR_STATUS) == 0
+    assert not bus.servos[0].torque_on
+    assert bus.servos[0].table.get(reg.STATUS_RETURN_LEVEL) == 2
+
+
+def test_what_can_not_be_set_up_is_reported_beside_what_was(wired: Callable[..., Bus]) -> None:
+    bus = wired(prepared=False)
+    bus.bus.fault("silent=2", 0.0)
+    missing = f"{RIGHT}: no answer at any rate: check its power and cable"
+    assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
+    _, problems = bus.provision(model="XL330-M288")
+    assert f"{LEFT}: is not an XL330-M288: set servos.model" in problems
