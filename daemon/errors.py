@@ -10,6 +10,7 @@ from softfinger import SoftfingerError
 
 __all__ = [
     "AddressError",
+    "HandClosed",
     "HandFault",
     "KeyFileError",
     "NoStream",
@@ -60,6 +61,10 @@ class NoStream(SoftfingerError):
 
 class NotInTime(SoftfingerError, TimeoutError):
     """A condition did not come about in time. The message gives the last state."""
+
+
+class HandClosed(SoftfingerError):
+    """A `Hand` or a subscription was used after it had been closed."""
 
 
 class HandFault(SoftfingerError):

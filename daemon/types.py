@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FINGERS = ("left", "right")
+STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # unless settings or a client say otherwise
+COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
 Event = tuple[str, str, str]  # level, kind, text
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import zmq
 
-from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
 from softfinger.tools.arguments import add_keys, client_keys, nothing
 from softfinger.tools.terminal.feed import FINGERS, Feed, number, text

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Stream
 from softfinger.tools.arguments import (
@@ -110,7 +110,7 @@ class _Recorder:
     """One call of ``record``: the socket, the files one after the other, and the account."""
 
     def __init__(self, arguments: argparse.Namespace, ending: _Ending) -> None:
-        from softfinger.daemon.client.wire import Gaps
+        from softfinger.daemon.client.stream import Gaps
         from softfinger.tools.recordings.writer import RecordingWriter
 
         self._arguments = arguments
@@ -134,15 +134,14 @@ class _Recorder:
         """Take messages until the end."""
         import zmq
 
-        from softfinger.daemon.client.wire import prepare
+        from softfinger.daemon.client.connection import subscribe
 
         arguments = self._arguments
         context: zmq.Context[Any] = zmq.Context()
-        socket = context.socket(zmq.SUB)
         try:
             if self._keys is not None:
-                self._keys.guard(socket)
-            prepare(socket, arguments.address, *_topics(arguments.topics))
+                self._keys.guard(context)
+            socket = subscribe(context, arguments.address, *_topics(arguments.topics))
             failure = self._take_all(socket)
             self._writer.close()
         except zmq.ZMQError as error:

@@ -9,7 +9,7 @@ import sys
 from typing import Any
 
 from softfinger.daemon.client.command_client import NoAnswer, send
-from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.profile.settings import CommandSettings
 from softfinger.tools.arguments import add_keys, client_keys, seconds

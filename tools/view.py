@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from softfinger.daemon.client.patience import PATIENCE
+from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.profile.settings import Stream
 from softfinger.tools.arguments import (
     add_keys,

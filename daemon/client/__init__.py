@@ -2,7 +2,7 @@
 
 ::
 
-    from softfinger.daemon.client import Hand
+    from softfinger import Hand
 
     with Hand() as hand:
         hand.arm()
@@ -12,15 +12,14 @@
         for state in hand.stream():
             ...
 
-`AsyncHand` is the same for asyncio. Everything here is the subscriber's side of the public wire and
-needs no more than its two addresses; nothing in it touches the daemon's own state.
+`AsyncHand` is the same for asyncio. Nothing here needs more of a daemon than its two addresses.
 """
 
 from softfinger.daemon.client.asynchronous import AsyncHand
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.records import to_columns
-from softfinger.daemon.errors import HandFault, NoStream, NotInTime, Refused
+from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime, Refused
 from softfinger.daemon.wire.schema import Event, FingerState, HandState, ObjectState, TactileFrame
 
 __all__ = [
@@ -28,6 +27,7 @@ __all__ = [
     "Event",
     "FingerState",
     "Hand",
+    "HandClosed",
     "HandFault",
     "HandState",
     "NoAnswer",

@@ -3,88 +3,109 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from pathlib import Path
-from typing import Any
+import math
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any, TypeVar
 
-import msgpack
 import zmq
 import zmq.asyncio
 
-from softfinger.daemon.client.command_client import LOCALLY, NoAnswer
-from softfinger.daemon.client.hand import COMMANDS, STREAM, accepted
-from softfinger.daemon.client.patience import PATIENCE, SILENCE, answer_to, still_waiting
-from softfinger.daemon.client.wire import Decoder, nothing_from, prepare, silent
-from softfinger.daemon.errors import HandFault, NoStream, NotInTime
-from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.keys import load_client
-from softfinger.daemon.wire.local_stop import stop_locally
-from softfinger.daemon.wire.packer import pack
-from softfinger.daemon.wire.schema import Event, HandState, TactileFrame
+from softfinger.daemon.client.command_client import HandClient, accepted, send, stands_already
+from softfinger.daemon.client.connection import SILENCE
+from softfinger.daemon.client.stream import Subscriber, Wait
+from softfinger.daemon.errors import NoStream, Refused
+from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
-_log = logging.getLogger(__name__)
+_Record = TypeVar("_Record")
 
 
-class AsyncHand:
-    """A hand by its two addresses, in one event loop: ``async with AsyncHand() as hand: …``."""
+class AsyncSubscription(Subscriber[_Record]):
+    """As `client.hand.Subscription`: ``async for record in hand.stream(): …``."""
 
-    def __init__(
-        self,
-        stream: str = STREAM,
-        commands: str = COMMANDS,
-        *,
-        client: str = "",
-        timeout: float = PATIENCE,
-        keys: Path | None = None,
-    ) -> None:
-        self.stream_address = stream
-        self.command_address = commands
-        self.client = client
-        self.timeout = timeout
-        self._context = zmq.asyncio.Context()
-        if keys is not None:
-            load_client(keys).guard(self._context)
+    def __aiter__(self) -> AsyncIterator[_Record]:
+        return self
+
+    async def __anext__(self) -> _Record:
+        return await self.next(self._timeout)
+
+    async def next(self, timeout: float | None) -> _Record:
+        """The next record. Raises NoStream when none comes within ``timeout`` s."""
+        deadline = math.inf if timeout is None else time.monotonic() + timeout
+        while True:
+            left = max(deadline - time.monotonic(), 0.0)
+            come = await self._poll(left if timeout is None else min(left, SILENCE))
+            if not come and timeout is not None and left > SILENCE:
+                self._decoder.warn_of_silence(timeout)
+                come = await self._poll(left - SILENCE)
+            if not come:
+                raise self._decoder.no_stream(timeout or 0.0)
+            record = self._decoder.take(await self._socket.recv_multipart())
+            if record is not None:
+                return record
+
+    async def _poll(self, seconds: float) -> Any:
+        self._require_open()
+        return await self._socket.poll(math.ceil(seconds * 1e3) if seconds < math.inf else None)
+
+    async def skip(self) -> None:
+        """Drop what waits: the next record is one that is still to come."""
+        while await self._poll(0.0):
+            self._decoder.take(await self._socket.recv_multipart())
+
+    async def __aenter__(self) -> AsyncSubscription[_Record]:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
+    """As `client.hand.Hand`, in one event loop: ``async with AsyncHand() as hand: …``."""
+
+    _CONTEXT = zmq.asyncio.Context
+    _states: AsyncSubscription[HandState] | None = None
 
     async def __aenter__(self) -> AsyncHand:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._context.destroy(linger=0)
+        self.close()
 
-    def stream(self) -> AsyncIterator[HandState]:
+    async def state(self, timeout: float | None = None) -> HandState:
+        """The next state to come, never one that has been waiting. Raises NoStream."""
+        if self._states is None:
+            self._states = self.stream()
+        else:
+            await self._states.skip()
+        return await self._states.next(self.timeout if timeout is None else timeout)
+
+    def stream(self, timeout: float | None = None) -> AsyncSubscription[HandState]:
         """States one after the other, every one that is published."""
-        return self._records(schema.STATE)
+        return self._subscription(STATE, timeout)
 
-    def frames(self) -> AsyncIterator[TactileFrame]:
-        """Tactile frames of both fingers."""
-        return self._records(schema.TACTILE)
+    def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
+        """Tactile frames of both fingers; `TactileFrame.finger` says whose."""
+        return self._subscription(TACTILE, timeout)
 
-    def events(self) -> AsyncIterator[Event]:
-        """What the daemon tells: modes, faults, warnings."""
-        return self._records(schema.EVENT)
+    def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:
+        """The daemon's events: modes, faults, warnings."""
+        return self._subscription(EVENT, timeout)
 
-    async def _records(self, topic: bytes) -> AsyncIterator[Any]:
-        decoder = Decoder(topic)
-        async with self._socket(zmq.SUB) as socket:
-            prepare(socket, self.stream_address, topic)
-            while True:
-                record = decoder.take(await socket.recv_multipart())
-                if record is not None:
-                    yield record
+    def _subscription(self, topic: bytes, timeout: float | None) -> AsyncSubscription[Any]:
+        self._require_open()
+        return AsyncSubscription(self._context, self.stream_address, topic, timeout)
 
-    @asynccontextmanager
-    async def _socket(self, kind: int) -> AsyncIterator[Any]:
-        socket = self._context.socket(kind)
-        try:
-            yield socket
-        finally:
-            socket.close(linger=0)
-
-    async def state(self) -> HandState:
-        """The next state to come. Raises NoStream."""
-        return await self.wait_for(lambda _: True, self.timeout)
+    async def collect(self, seconds: float) -> list[HandState]:
+        """All states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
+        async with self.stream(self.timeout) as states:
+            collected = [await anext(states)]
+            end = collected[0].mono_ns + round(seconds * 1e9)
+            async for state in states:
+                if state.mono_ns >= end:
+                    break
+                collected.append(state)
+        return collected
 
     async def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
@@ -93,51 +114,31 @@ class AsyncHand:
 
         Raises as `client.hand.Hand.wait_for` does.
         """
-        last: HandState | None = None
-        states = self.stream()
-        told = asyncio.get_running_loop().call_later(
-            SILENCE, silent, self.stream_address, schema.STATE, timeout
-        )
-        try:
-            async with asyncio.timeout(timeout):
-                async for last in states:
-                    told.cancel()
-                    if condition(last):
-                        return last
-                    if last.fault:
-                        raise HandFault(last.fault)
-        except TimeoutError:
-            pass
-        finally:
-            told.cancel()
-            await states.aclose()  # type: ignore[attr-defined]
-        if last is None:
-            raise NoStream(nothing_from(self.stream_address, schema.STATE, timeout))
-        raise NotInTime(f"not within {timeout:g} s; the last state: mode {last.mode}")
+        wait = Wait(condition, timeout)
+        async with self.stream() as states:
+            while True:
+                try:
+                    state = await states.next(wait.left())
+                except NoStream:
+                    raise wait.over(self.stream_address) from None
+                if wait.ends_with(state):
+                    return state
 
     async def command(self, name: str, **numbers: float) -> dict[str, Any]:
         """Send one command and return the reply. Raises Refused with the reason, and NoAnswer."""
-        request: dict[str, Any] = {"command": name, **numbers}
-        if self.client:
-            request["client"] = self.client
-        if name == "stop":  # past all other clients, where the daemon is this user's
-            stopped = await asyncio.to_thread(
-                stop_locally, self.command_address, min(self.timeout, LOCALLY)
-            )
-            if stopped is not None:
-                return accepted(stopped)
-        async with self._socket(zmq.REQ) as socket:
-            socket.connect(self.command_address)
-            await socket.send(pack(request))
-            silence = min(SILENCE, self.timeout)
-            answered = await socket.poll(silence * 1e3)
-            what = answer_to(request, self.command_address)
-            if not answered and silence < self.timeout:
-                _log.warning(still_waiting(what, self.timeout))
-                answered = await socket.poll((self.timeout - silence) * 1e3)
-            if not answered:
-                raise NoAnswer(f"no {what} within {self.timeout:g} s; is softfinger running?")
-            reply = msgpack.unpackb(await socket.recv())
-        if not isinstance(reply, dict):
-            raise NoAnswer(f"{self.command_address} answered something that is not a reply")
+        request = self._request(name, numbers)
+        reply = await asyncio.to_thread(
+            send, self.command_address, request, self.timeout, self._keys
+        )
         return accepted(reply)
+
+    async def _carry_out(self, command: str, **numbers: float) -> None:
+        try:
+            await self.command(command, **numbers)
+        except Refused:
+            if not stands_already(command, await self.status()):
+                raise
+
+    async def status(self) -> dict[str, Any]:
+        """The daemon's mode, fault, torque, and counters of servos and sensors."""
+        return await self.command("status")

@@ -1,22 +1,26 @@
-"""One command to a daemon from outside, and its answer."""
+"""Commands to a daemon from outside: one request and its answer, and the commands by name."""
 
 from __future__ import annotations
 
 import logging
 import math
-from typing import Any
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import msgpack
 import zmq
 
-from softfinger.daemon.client.patience import PATIENCE, SILENCE, answer_to, still_waiting
-from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.wire.keys import ClientKeys
+from softfinger import SoftfingerError
+from softfinger.daemon.client.connection import PATIENCE, SILENCE, default_addresses, still_waiting
+from softfinger.daemon.errors import HandClosed, Refused
+from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
+
+_Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
-LOCALLY = 0.5  # s for a daemon to answer past all other clients
+_LOCALLY = 0.5  # s for a daemon to answer past all other clients
 
 
 class NoAnswer(SoftfingerError):
@@ -32,9 +36,10 @@ def send(
     A ``stop`` to a daemon of this user on this machine goes past all other clients.
     """
     if request.get("command") == "stop":
-        stopped = stop_locally(address, min(timeout, LOCALLY))
+        stopped = stop_locally(address, min(timeout, _LOCALLY))
         if stopped is not None:
             return stopped
+    answer = f"answer to {request['command']} from {address}"
     context: zmq.Context[Any] = zmq.Context()
     socket = context.socket(zmq.REQ)
     socket.setsockopt(zmq.LINGER, 0)
@@ -49,13 +54,12 @@ def send(
         silence = min(SILENCE, timeout)
         answered = socket.poll(math.ceil(silence * 1e3))
         if not answered and silence < timeout:
-            _log.warning(still_waiting(answer_to(request, address), timeout))
+            _log.warning(still_waiting(answer, timeout))
             answered = socket.poll(math.ceil((timeout - silence) * 1e3))
         if not answered:
             hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
             raise NoAnswer(
-                f"no {answer_to(request, address)} within {timeout:g} s; is softfinger running, "
-                f"or still starting?{hint}"
+                f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
             )
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:
@@ -64,3 +68,106 @@ def send(
     if not isinstance(reply, dict):
         raise NoAnswer(f"{address} answered something that is not a reply")
     return reply
+
+
+def accepted(reply: dict[str, Any]) -> dict[str, Any]:
+    """The reply without ``ok``. Raises Refused with the reason when it is not ok."""
+    if reply.get("ok") is not True:
+        raise Refused(str(reply.get("error", "refused without a reason")))
+    return {key: value for key, value in reply.items() if key != "ok"}
+
+
+def stands_already(command: str, status: dict[str, Any]) -> bool:
+    """Whether a refused command asked for what is so: arming what is armed, clearing no fault."""
+    mode = status.get("mode")
+    if command == "arm":
+        return mode not in ("disarmed", "fault")
+    return command == "clear" and mode != "fault"
+
+
+class HandClient(Generic[_Done]):
+    """What `Hand` and `AsyncHand` have in common: the addresses, and the commands by name.
+
+    Commands raise Refused with the daemon's reason, and NoAnswer. ``arm``, ``disarm``, ``clear``
+    and ``release`` may be repeated: a hand that is armed stays armed.
+    """
+
+    _CONTEXT: type[zmq.Context[Any]] = zmq.Context
+
+    def __init__(
+        self,
+        stream: str | None = None,
+        commands: str | None = None,
+        *,
+        client: str = "",
+        timeout: float = PATIENCE,
+        keys: Path | None = None,
+    ) -> None:
+        usual = default_addresses()
+        self.stream_address = stream or usual[0]
+        self.command_address = commands or usual[1]
+        self.client = client
+        self.timeout = timeout
+        self._keys = None if keys is None else load_client(keys)
+        self._context = self._CONTEXT()
+        if self._keys is not None:
+            self._keys.guard(self._context)
+
+    def close(self) -> None:
+        """Close all sockets, those of open subscriptions included. The hand stays as it is."""
+        self._context.destroy(linger=0)
+
+    def _require_open(self) -> None:
+        if self._context.closed:
+            raise HandClosed(f"this {type(self).__name__} is closed: make another")
+
+    def _request(self, name: str, numbers: dict[str, float]) -> dict[str, Any]:
+        self._require_open()
+        envelope = {"client": self.client} if self.client else {}
+        return {"command": name, **numbers, **envelope}
+
+    def _carry_out(self, command: str, **numbers: float) -> _Done:
+        raise NotImplementedError
+
+    def arm(self) -> _Done:
+        """Torque on; the joints hold where they are."""
+        return self._carry_out("arm")
+
+    def disarm(self) -> _Done:
+        """Torque off."""
+        return self._carry_out("disarm")
+
+    def tare(self) -> _Done:
+        """Take what the sensors read now as unloaded."""
+        return self._carry_out("tare")
+
+    def move(self, left: float | None = None, right: float | None = None) -> _Done:
+        """Joints to angles [rad]."""
+        angles = {"left": left, "right": right}
+        return self._carry_out(
+            "move", **{finger: angle for finger, angle in angles.items() if angle is not None}
+        )
+
+    def grasp(self, force: float | None = None) -> _Done:
+        """Close, and press with ``force`` [N] on each tip; the settings' force when None."""
+        return self._carry_out("grasp", **({} if force is None else {"force": force}))
+
+    def rotate(self, angle: float) -> _Done:
+        """Turn the grasped object to ``angle`` [rad] in the hand's frame."""
+        return self._carry_out("rotate", angle=angle)
+
+    def release(self) -> _Done:
+        """Open."""
+        return self._carry_out("release")
+
+    def set(self, **numbers: float) -> _Done:
+        """Change a property of the grip, as ``compliance`` [rad/(N·m)]."""
+        return self._carry_out("set", **numbers)
+
+    def stop(self) -> _Done:
+        """Torque off at once, in every state."""
+        return self._carry_out("stop")
+
+    def clear(self) -> _Done:
+        """Clear a latched fault, once its cause is gone."""
+        return self._carry_out("clear")

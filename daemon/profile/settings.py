@@ -12,6 +12,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
+
 # Every number has an end on both sides: what no hand has is a slip of the pen, and must not reach
 # an integral. Bounds are closed or open as the quantity is.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
@@ -185,7 +187,7 @@ class Realtime(Section):
 class Stream(Section):
     """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
 
-    address: str = "tcp://127.0.0.1:9872"
+    address: str = STREAM_ADDRESS
     state_rate: Rate = 100.0
     tactile_rate: Rate = 100.0
     tactile_unit: Literal["count", "Pa"] = "count"  # raw, or what the estimator makes of it
@@ -195,7 +197,7 @@ class Stream(Section):
 class CommandSettings(Section):
     """The command server."""
 
-    address: str = "tcp://127.0.0.1:9873"
+    address: str = COMMAND_ADDRESS
     lease: Seconds = 2.0  # s a commander keeps the hand after its last command
     max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
     per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is free

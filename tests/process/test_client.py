@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -26,9 +28,13 @@ from softfinger.daemon.client import (
     TactileFrame,
     to_columns,
 )
-from softfinger.daemon.client.patience import SILENCE
+from softfinger.daemon.client.asynchronous import AsyncSubscription
+from softfinger.daemon.client.connection import SILENCE
+from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.client.records import read
-from softfinger.daemon.client.wire import Gaps
+from softfinger.daemon.client.stream import Gaps
+from softfinger.daemon.errors import HandClosed
+from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 from tests.conftest import until
 from tests.harness import fake_daemon
 from tests.harness.daemon_process import Running, insist
@@ -85,15 +91,18 @@ def test_the_same_from_asyncio(start: Start, profile: Profile, addresses: tuple[
 
     async def session() -> tuple[str, int]:
         async with AsyncHand(*addresses, timeout=60.0) as hand:
-            await hand.command("arm")
+            await hand.arm()
             with pytest.raises(Refused, match="expected a number"):
-                await hand.command("grasp", force="much")  # type: ignore[arg-type]
-            await hand.command("grasp", force=5.0)
+                await hand.grasp(force="much")  # type: ignore[arg-type]
+            await hand.grasp(force=5.0)
+            assert (await hand.status())["torque"] is True
             held = await hand.wait_for(lambda state: state.mode == "holding", 60.0)
-            seen = 0
-            async for frame in hand.frames():
-                seen += frame.counts.size
-                break
+            async with hand.frames() as frames:
+                seen = (await frames.next(60.0)).counts.size
+            states = await hand.collect(0.1)
+            assert [each.seq for each in states] == sorted({each.seq for each in states})
+            await hand.arm()  # it is
+            assert (await hand.state()).mode == "holding"
             with pytest.raises(NotInTime, match="mode holding"):
                 await hand.wait_for(lambda state: state.mode == "releasing", timeout=0.2)
             return held.mode, seen
@@ -254,6 +263,89 @@ def test_fingers_by_name() -> None:
         state.finger("thumb")
 
 
-def test_importing_the_client_compiles_nothing() -> None:
-    code = "import softfinger.daemon.client, sys; sys.exit('numba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
+def test_importing_the_client_loads_nothing_of_the_daemon() -> None:
+    code = "import softfinger, sys; softfinger.Hand; softfinger.AsyncHand; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    loaded = set(done.stdout.split())
+    assert "softfinger.daemon.client.hand" in loaded
+    assert not loaded & {"numba", "pydantic", "softfinger.kinematics", "softfinger.daemon.loop"}
+
+
+def _face(cls: type) -> dict[str, object]:
+    """The public methods, each with its parameters and their defaults."""
+    found = {name: member for name, member in vars(cls).items() if not name.startswith("_")}
+    return {
+        name: list(inspect.signature(member).parameters.values()) if callable(member) else None
+        for name, member in found.items()
+    }
+
+
+def test_both_hands_have_the_same_methods() -> None:
+    untyped = [re.sub(r"Async", "", repr(_face(cls))) for cls in (Hand, AsyncHand)]
+    assert untyped[0] == untyped[1]
+    assert _face(Subscription) == _face(AsyncSubscription)
+    commands = {"arm", "disarm", "clear", "grasp", "rotate", "release", "move", "stop", "tare"}
+    for cls in (Hand, AsyncHand):
+        assert commands | {"status", "collect", "state", "close"} <= set(dir(cls))
+
+
+def test_a_cell_may_be_run_twice(fake: FakeDaemon, hand: Hand) -> None:
+    fake.replies = {
+        name: {"ok": False, "error": f"{name}: not while it is so"} for name in ("arm", "clear")
+    }
+    fake.replies["status"] = {"ok": True, "mode": "holding"}
+    hand.arm()
+    hand.clear()
+    fake.replies["status"] = {"ok": True, "mode": "fault"}
+    for refused in (hand.arm, hand.clear):
+        with pytest.raises(Refused, match="not while it is so"):
+            refused()
+
+
+def test_a_closed_hand_says_so(hand: Hand) -> None:
+    states = hand.stream()
+    other = hand.stream()
+    other.close()
+    with pytest.raises(HandClosed, match="this subscription is closed"):
+        next(other)
+    hand.close()
+    hand.close()
+    for use in (hand.arm, hand.state, hand.stream, lambda: next(states)):
+        with pytest.raises(HandClosed, match="is closed: make another"):
+            use()
+
+    async def after() -> None:
+        async with AsyncHand(hand.stream_address, hand.command_address) as other:
+            pass
+        with pytest.raises(HandClosed, match="this AsyncHand is closed"):
+            await other.arm()
+        with pytest.raises(HandClosed, match="this AsyncHand is closed"):
+            await other.state()
+
+    asyncio.run(after())
+
+
+@pytest.mark.parametrize(
+    ("named", "addresses"),
+    [
+        ("", (STREAM_ADDRESS, COMMAND_ADDRESS)),
+        ("tcp://10.0.0.7", ("tcp://10.0.0.7:9872", "tcp://10.0.0.7:9873")),
+        ("tcp://[fe80::1]", ("tcp://[fe80::1]:9872", "tcp://[fe80::1]:9873")),
+        ("ipc:///run/a, ipc:///run/b", ("ipc:///run/a", "ipc:///run/b")),
+    ],
+)
+def test_addresses_from_the_environment(
+    monkeypatch: pytest.MonkeyPatch, named: str, addresses: tuple[str, str]
+) -> None:
+    monkeypatch.setenv("SOFTFINGER_ADDRESS", named)
+    with Hand() as hand:
+        assert (hand.stream_address, hand.command_address) == addresses
+
+
+@pytest.mark.parametrize("named", ["10.0.0.7", "tcp://10.0.0.7:9872", "ipc:///run/a", "a,b,c"])
+def test_an_address_in_the_environment_that_is_none(
+    monkeypatch: pytest.MonkeyPatch, named: str
+) -> None:
+    monkeypatch.setenv("SOFTFINGER_ADDRESS", named)
+    with pytest.raises(ValueError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://HOST"):
+        Hand()

@@ -17,14 +17,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from softfinger.daemon.client import Hand, HandState, to_columns
-from softfinger.daemon.client.hand import COMMANDS, STREAM
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--stream", default=STREAM)
-parser.add_argument("--commands", default=COMMANDS)
+parser.add_argument("--stream")
+parser.add_argument("--commands")
 parser.add_argument("--picture", default="grasp_and_turn.png")
 where = parser.parse_known_args()[0]  # a notebook has arguments of its own
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from softfinger.daemon.client.patience import PATIENCE, SILENCE
+from softfinger.daemon.client.connection import PATIENCE, SILENCE
 from softfinger.tools.terminal.feed import Feed, field, text
 
 TOPICS = (

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from softfinger.daemon.client.wire import Gaps
+from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.terminal.feed import number, printable, text

@@ -1,0 +1,170 @@
+"""A topic's messages as records: decoding, lost messages, and waiting for a state."""
+
+from __future__ import annotations
+
+import logging
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import zmq
+
+from softfinger.daemon.client.connection import still_waiting, subscribe, unpack
+from softfinger.daemon.client.records import read
+from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime
+from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState
+
+_Record = TypeVar("_Record")
+
+_REPEATED = 1000  # messages that are known when they are repeated
+
+_log = logging.getLogger(__name__)
+
+
+class Gaps:
+    """Counts the messages of one topic that were lost.
+
+    By their ``number`` where they have one, else by ``seq``, of which one in ``seq_step`` is sent.
+    One that goes back is another daemon's, or the same one's started again: no loss. A repeated
+    message (``again``) is new where it was not received before, and may fill a gap.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._last: dict[str, int] = {}
+        self._received: deque[int] = deque(maxlen=_REPEATED)
+
+    def take(self, message: dict[str, Any]) -> bool:
+        """Count one more message. False: it was received before."""
+        place = message.get("number")
+        if not isinstance(place, int):
+            seq, step = message.get("seq"), message.get("seq_step", 1)
+            if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
+                return True
+            place = seq // step
+        source, again = message.get("finger"), message.get("again")
+        key = source if isinstance(source, str) else ""
+        last = self._last.get(key)
+        if again is True and last is not None and place <= last:
+            if place in self._received:
+                return False
+            self._received.append(place)
+            self.lost = max(self.lost - 1, 0)
+            return True
+        if again is not None:
+            if last is not None and place <= last:
+                self._received.clear()  # another daemon's
+            self._received.append(place)
+        if last is not None and place > last:
+            self.lost += place - last - 1
+        self._last[key] = place
+        return True
+
+
+class Decoder(Generic[_Record]):
+    """Turns one topic's messages into records."""
+
+    def __init__(self, address: str, topic: bytes) -> None:
+        self._address = address
+        self._topic = topic
+        self._record: type[_Record] = TOPICS[topic].record
+        self._warned = False
+        self.gaps = Gaps()
+        self.unreadable = 0
+
+    def take(self, frames: list[bytes]) -> _Record | None:
+        """The record of one message, None when it can't be read or was received before."""
+        try:
+            _, message = unpack(frames)
+            record = read(self._record, message)
+        except ValueError:
+            self.unreadable += 1
+            return None
+        if not self.gaps.take(message):
+            return None
+        found = message.get("schema")
+        if found != SCHEMA and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the stream is of schema {found!r}, this client knows {SCHEMA}; "
+                "it keeps to the fields it knows",
+                stacklevel=3,
+            )
+        return record
+
+    def warn_of_silence(self, timeout: float) -> None:
+        """Log that nothing has come for a while."""
+        _log.warning(still_waiting(f"{self._topic.decode()} from {self._address}", timeout))
+
+    def no_stream(self, timeout: float) -> NoStream:
+        """The exception when nothing has come at all."""
+        return NoStream(
+            f"no {self._topic.decode()} from {self._address} within {timeout:g} s; "
+            "is softfinger running?"
+        )
+
+
+class Subscriber(Generic[_Record]):
+    """A topic's socket and decoder: what `Subscription` and `AsyncSubscription` have in common."""
+
+    def __init__(
+        self, context: zmq.Context[Any], address: str, topic: bytes, timeout: float | None
+    ) -> None:
+        self._timeout = timeout
+        self._decoder = Decoder[_Record](address, topic)
+        self._socket: Any = subscribe(context, address, topic)
+
+    @property
+    def lost(self) -> int:
+        """Messages that never arrived, by the gaps in their ``seq``."""
+        return self._decoder.gaps.lost
+
+    @property
+    def unreadable(self) -> int:
+        """Messages that could not be read, and were passed over."""
+        return self._decoder.unreadable
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._socket.close()
+
+    def _require_open(self) -> None:
+        if self._socket.closed:
+            raise HandClosed("this subscription is closed: make another")
+
+
+class Wait:
+    """A wait of ``timeout`` s for a state for which ``condition`` holds."""
+
+    def __init__(self, condition: Callable[[HandState], object], timeout: float) -> None:
+        self._condition = condition
+        self._timeout = timeout
+        self._end = time.monotonic() + timeout
+        self._last: HandState | None = None
+
+    def left(self) -> float:
+        """How long the next state may take [s]. Raises NotInTime after the end."""
+        left = self._end - time.monotonic()
+        if left <= 0.0 and self._last is not None:
+            raise self.over("")
+        return max(left, 0.0)
+
+    def ends_with(self, state: HandState) -> bool:
+        """Whether the condition holds. Raises HandFault when the hand has a fault instead."""
+        self._last = state
+        if self._condition(state):
+            return True
+        if state.fault:
+            raise HandFault(state.fault)
+        return False
+
+    def over(self, address: str) -> NotInTime | NoStream:
+        """The exception when no further state came."""
+        if self._last is None:
+            return Decoder[HandState](address, STATE).no_stream(self._timeout)
+        return NotInTime(
+            f"not within {self._timeout:g} s; the last state: mode {self._last.mode}, "
+            f"tick {self._last.seq}"
+        )
