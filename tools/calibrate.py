@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     from softfinger.daemon.errors import RecordingError, TactileError
     from softfinger.daemon.perception.calibration_file import save_calibration
-    from softfinger.kinematics.sensing.calibration import CalibrationError
+    from softfinger.kinematics.estimation.calibration import CalibrationError
     from softfinger.tools.calibration.calibration_frames import gather
 
     try:
@@ -127,7 +127,7 @@ def _check(loads: Loads, radius: float) -> None:
 
     import numpy as np
 
-    from softfinger.kinematics.sensing.calibration import CalibrationError
+    from softfinger.kinematics.estimation.calibration import CalibrationError
 
     truths = loads.truths
     if not loads.frames:
@@ -214,7 +214,7 @@ def _tare(_: Any, settings: Settings, calibration: Calibration, loads: Loads) ->
     import numpy as np
 
     from softfinger.daemon.perception.calibration_file import TareStep, now
-    from softfinger.kinematics.sensing.calibration import tare
+    from softfinger.kinematics.estimation.calibration import tare
 
     found = tare(np.concatenate(loads.frames))
     noise = float(np.median(found.noise))
@@ -228,7 +228,7 @@ def _equilibrate(_: Any, settings: Settings, calibration: Calibration, loads: Lo
     import numpy as np
 
     from softfinger.daemon.perception.calibration_file import EquilibrateStep, now
-    from softfinger.kinematics.sensing.calibration import equilibrate
+    from softfinger.kinematics.estimation.calibration import equilibrate
 
     zero = _converter(settings, calibration).zero
     found = equilibrate(loads.frames, zero)
@@ -252,7 +252,7 @@ def _readings(settings: Settings, calibration: Calibration, loads: Loads) -> lis
     """Each load's mean reading, cleared of noise far from the contact."""
     import numpy as np
 
-    from softfinger.kinematics.sensing.calibration import cleared
+    from softfinger.kinematics.estimation.calibration import cleared
 
     converter = _converter(settings, calibration)
     noise = calibration.tare.noise if calibration.tare else 0.0
@@ -270,7 +270,7 @@ def _curve(
 
     from softfinger.daemon.perception.calibration_file import CurveStep, now
     from softfinger.daemon.profile.factory import make_material, make_tip
-    from softfinger.kinematics.sensing.calibration import CalibrationError, fit_curve
+    from softfinger.kinematics.estimation.calibration import CalibrationError, fit_curve
     from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
     sensor = calibration.sensor
@@ -321,7 +321,7 @@ def _centre(_: Any, settings: Settings, calibration: Calibration, loads: Loads) 
 
     from softfinger.daemon.perception.calibration_file import CentreStep, now
     from softfinger.daemon.profile.factory import make_material, make_tip
-    from softfinger.kinematics.sensing.calibration import fit_centre
+    from softfinger.kinematics.estimation.calibration import fit_centre
     from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
     sensor, tactile = calibration.sensor, settings.tactile
@@ -359,7 +359,7 @@ def _modulus(
 
     from softfinger.daemon.perception.calibration_file import ModulusStep, now
     from softfinger.daemon.profile.factory import make_grid, make_tip
-    from softfinger.kinematics.sensing.calibration import CalibrationError, fit_law, fit_modulus
+    from softfinger.kinematics.estimation.calibration import CalibrationError, fit_law, fit_modulus
 
     d = loads.truths.get("d")
     if d is None:

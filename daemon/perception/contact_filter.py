@@ -33,7 +33,8 @@ from softfinger.daemon.perception import contact_filter_kernels
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
-from softfinger.kinematics.contact.table import ContactTable, lookup
+from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
 

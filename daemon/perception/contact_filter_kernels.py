@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.contact.table import lookup
+from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.external_load import load_by_torques
 from softfinger.kinematics.hand.grasp_state import held_motion, holding_levers, total_tilt
 

@@ -16,8 +16,9 @@ from softfinger.daemon.profile.settings import MaterialLaw, Settings
 from softfinger.daemon.profile.table_files import load_or_build
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable, TableError
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 

@@ -15,8 +15,9 @@ from pathlib import Path
 
 from softfinger.daemon.wire.own_files import write_bytes
 from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable, TableError, table_key
+from softfinger.kinematics.contact.table import ContactTable, table_key
 
 
 def table_file(folder: Path, tip: Fingertip, material: Material, tolerance: float) -> Path:

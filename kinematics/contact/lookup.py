@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
 from softfinger.kinematics.compiled.simd import SIZES, Pointer, address, polynomials
 from softfinger.kinematics.contact.closed_form import theta_limit
@@ -72,6 +73,17 @@ _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
 _ONE = 1023 << _MANTISSA  # the bits of 1.0
 _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above LOWEST
+
+
+class TableError(SoftfingerError):
+    """A table can't be built to the tolerance, or a file holds no sound table of this kind."""
+
+
+def aligned(size: int) -> FloatArray:
+    """Zeros, float64 [size], starting at a cache line so that vector loads do not straddle two."""
+    room = np.zeros(size + 8)
+    skip = (-room.ctypes.data % 64) // 8
+    return room[skip : skip + size]
 
 
 @inlined_kernel

@@ -16,9 +16,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger import SoftfingerError
-from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.contact.closed_form import flatten
+from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.contact.material_fit import MaterialError, fit_law
 
 FloatArray = NDArray[np.float64]
 
@@ -54,47 +53,6 @@ def stress_at(law: FloatArray, strain: float) -> float:
     for j in range(order - 2, -1, -1):
         result = result * u + law[k, j]
     return result
-
-
-@inner_kernel
-def energy_density_at(energy_law: FloatArray, strain: float) -> float:
-    """w(ε) = ∫₀^ε σ [J/m³] from ``energy_law``; 0 for ε ≤ 0, beyond ε = 1 as σ is continued."""
-    if strain <= 0.0:
-        return 0.0
-    pieces, order = energy_law.shape
-    if not strain < 1.0:
-        value: float = 0.0
-        slope: float = 0.0
-        curve: float = 0.0
-        for j in range(order):
-            value += energy_law[pieces - 1, j]
-            slope += j * energy_law[pieces - 1, j]
-            curve += j * (j - 1) * energy_law[pieces - 1, j]
-        more: float = pieces * (strain - 1.0)
-        return value + more * (slope + 0.5 * more * curve)
-    u = strain * pieces
-    k = int(u)
-    u -= k
-    result: float = energy_law[k, order - 1]
-    for j in range(order - 2, -1, -1):
-        result = result * u + energy_law[k, j]
-    return result
-
-
-@kernel
-def _stresses(law: FloatArray, strain: FloatArray, out: FloatArray) -> None:
-    for i in range(strain.shape[0]):
-        out[i] = stress_at(law, strain[i])
-
-
-@kernel
-def _energy_densities(energy_law: FloatArray, strain: FloatArray, out: FloatArray) -> None:
-    for i in range(strain.shape[0]):
-        out[i] = energy_density_at(energy_law, strain[i])
-
-
-class MaterialError(SoftfingerError, ValueError):
-    """The data make no usable stress-strain law. The message says what is wrong and where."""
 
 
 @dataclass(frozen=True)
@@ -156,11 +114,6 @@ class Material:
         return cls(tuple(_integral(modulus)[1:]), name="table_i")
 
     @classmethod
-    def paper(cls) -> Material:
-        """The constant modulus that the paper works with: the greatest of its Table I."""
-        return cls.constant(TABLE_I_MAXIMUM)
-
-    @classmethod
     def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
         """A smooth monotone law near measured points of strain (a ratio) and stress [Pa].
 
@@ -169,21 +122,8 @@ class Material:
         runs from the points. Raises MaterialError, with everything that is wrong, for points that
         are too few, not finite, not rising, start off zero, or that no such law comes near to.
         """
-        from softfinger.kinematics.contact.material_fit import fit_law
-
         coefficients, misfit = fit_law(strain, stress)
         return cls(tuple(coefficients), name="points", fit_error=misfit)
-
-    @classmethod
-    def from_csv(cls, text: str, branch: str = "load") -> Material:
-        """A law from CSV text with the columns strain, stress [Pa] and optionally branch.
-
-        The third column says ``load`` or ``unload``; ``branch`` chooses one. Unloading points may
-        fall in strain, as they are measured. A header line and lines that start with # are skipped.
-        Raises MaterialError naming the line that can't be read, and as :meth:`from_points` does.
-        """
-        strain, stress = parse_points(text, branch)
-        return cls.from_points(strain, stress)
 
     @property
     def reference_modulus(self) -> float:
@@ -202,17 +142,11 @@ class Material:
 
     def stress(self, strain: ArrayLike) -> FloatArray:
         """σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, continued linearly beyond 1, NaN for NaN."""
-        shape, (flat,) = flatten(strain)
-        out = np.empty_like(flat)
-        _stresses(self.law, flat, out)
-        return out.reshape(shape)
+        return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
         """w(ε) = ∫₀^ε σ [J/m³], shape of ``strain``; 0 for ε ≤ 0, NaN for NaN."""
-        shape, (flat,) = flatten(strain)
-        out = np.empty_like(flat)
-        _energy_densities(self.energy_law, flat, out)
-        return out.reshape(shape)
+        return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
         """What the quadrature needs of the law over E₀: float64 [7, pieces, order].
@@ -243,29 +177,21 @@ class Material:
         return table
 
 
-def parse_points(text: str, branch: str = "load") -> tuple[list[float], list[float]]:
-    """Strain and stress [Pa] of one branch of a CSV text; see Material.from_csv."""
-    if branch not in ("load", "unload"):
-        raise MaterialError(f"the branch is load or unload, not {branch!r}")
-    points = []
-    for number, line in enumerate(text.splitlines(), 1):
-        cells = [cell.strip() for cell in line.split(",")]
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        if number == 1 and cells[0].lower().startswith("strain"):
-            continue
-        phase = cells[2].lower() if len(cells) > 2 and cells[2] else "load"
-        try:
-            point = float(cells[0]), float(cells[1])
-        except (ValueError, IndexError):
-            raise MaterialError(f"line {number} holds no strain and stress: {line!r}") from None
-        if phase not in ("load", "unload"):
-            raise MaterialError(f"line {number}: the branch is load or unload, not {cells[2]!r}")
-        if phase == branch:
-            points.append(point)
-    if len(points) > 1 and points[0][0] > points[-1][0] and branch == "unload":
-        points.reverse()
-    return [x for x, _ in points], [y for _, y in points]
+def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
+    """The pieces of ``law`` at ``strain``; 0 below 0, beyond 1 Taylor's series to ``order``."""
+    x = np.asarray(strain, dtype=np.float64)
+    pieces = len(law)
+    u = np.clip(x, 0.0, 1.0) * pieces
+    k = np.minimum(np.nan_to_num(u), pieces - 1).astype(np.intp)
+    u = u - k
+    value = law[k, -1]
+    for j in range(law.shape[1] - 2, -1, -1):
+        value = value * u + law[k, j]
+    beyond = np.maximum(x - 1.0, 0.0) * pieces
+    last = np.polynomial.Polynomial(law[-1])
+    for n in range(1, order + 1):
+        value = value + last.deriv(n)(1.0) / math.factorial(n) * beyond**n
+    return np.asarray(np.where(x <= 0.0, 0.0, value))
 
 
 def _integral(polynomial: Sequence[Fraction]) -> list[Fraction]:

@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.kinematics.contact.material import MaterialError
+from softfinger import SoftfingerError
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +26,11 @@ _BEYOND = 0.1  # weight of the points that only continue the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences, against wiggles between points
 
 
-def check_points(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
+class MaterialError(SoftfingerError, ValueError):
+    """The data make no usable stress-strain law. The message says what is wrong and where."""
+
+
+def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """The points up to strain 1, without the origin. Raises MaterialError with all errors."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
@@ -72,7 +76,7 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float
     The lowest degree is taken that comes about as near to the points as any. Beyond the last point
     the law goes on about straight.
     """
-    x, y = check_points(strain, stress)
+    x, y = _checked(strain, stress)
     top = float(y[-1])
     points, values = _continued(x, y / top)
     weights = np.where(np.arange(points.size) < x.size, 1.0, _BEYOND)
@@ -91,25 +95,6 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
     return [value / (j + 1) for j, value in enumerate(rising)], misfit * top
-
-
-def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike) -> float:
-    """The constant modulus E [Pa] that best explains forces [N] measured in compression.
-
-    Least squares on F = πE d²/cos θ over d [m], θ [rad]. Raises MaterialError when nothing can be
-    told from the data.
-    """
-    depth, tilt, measured = np.broadcast_arrays(
-        *(np.asarray(value, dtype=np.float64) for value in (d, theta, force))
-    )
-    basis = math.pi * depth**2 / np.cos(tilt)
-    weight = float(np.sum(basis**2))
-    if not (math.isfinite(weight) and weight > 0.0 and np.all(np.isfinite(measured))):
-        raise MaterialError("the compression data must be finite and reach some displacement")
-    modulus = float(np.sum(basis * measured)) / weight
-    if not modulus > 0.0:
-        raise MaterialError(f"the compression data give a modulus of {modulus:.4g} Pa")
-    return modulus
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

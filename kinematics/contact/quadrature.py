@@ -28,7 +28,6 @@ from softfinger.kinematics.contact.closed_form import (
     Fingertip,
     closed_forms,
     flatten,
-    theta_limits,
 )
 from softfinger.kinematics.contact.material import Material
 
@@ -190,7 +189,7 @@ def integrate(
     """
     shape, (depth, tilt) = flatten(d, theta)
     radius = tip.radius
-    inside = (depth > 0.0) & (depth <= radius) & (np.abs(tilt) <= theta_limits(radius, depth))
+    inside = (depth > 0.0) & (depth <= radius) & (np.abs(tilt) <= tip.theta_limit(depth))
     within = np.flatnonzero(inside)
     found = np.full((5, depth.size), np.nan)
     found[:, depth <= 0.0] = 1.0

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger import SoftfingerError
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import (
     FORM,
@@ -28,18 +27,15 @@ from softfinger.kinematics.contact.lookup import (
     WORST_D,
     WORST_THETA,
     Form,
+    TableError,
+    aligned,
     lookup,
     lookups,
 )
 from softfinger.kinematics.contact.material import Material
-
-__all__ = ["Certificate", "Contact", "ContactTable", "TableError", "lookup", "lookups"]
+from softfinger.kinematics.contact.table_build import build
 
 FloatArray = NDArray[np.float64]
-
-
-class TableError(SoftfingerError):
-    """A table can't be built to the tolerance, or a file holds no sound table of this kind."""
 
 
 class Contact(NamedTuple):
@@ -106,9 +102,6 @@ class ContactTable:
         ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
         with the best that was reached, when the tolerance can't be met within 256 KiB.
         """
-        # Imported here: a table that is loaded needs none of the quadrature.
-        from softfinger.kinematics.contact.table_build import build
-
         return cls(build(tip, material, tolerance, form))
 
     def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
@@ -189,10 +182,3 @@ def _sources() -> str:
     for name in _SOURCES:
         state.update(here.joinpath(name).read_bytes())
     return state.hexdigest()
-
-
-def aligned(size: int) -> FloatArray:
-    """Zeros, float64 [size], starting at a cache line so that vector loads do not straddle two."""
-    room = np.zeros(size + 8)
-    skip = (-room.ctypes.data % 64) // 8
-    return room[skip : skip + size]

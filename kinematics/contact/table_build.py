@@ -11,7 +11,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.simd import LANES, SHAPES, SIZES, STRIDE
-from softfinger.kinematics.contact.closed_form import Fingertip, theta_limits
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import (
     CHEAPEST_FIRST,
     CLOSED,
@@ -33,6 +33,8 @@ from softfinger.kinematics.contact.lookup import (
     WORST_D,
     WORST_THETA,
     Form,
+    TableError,
+    aligned,
     lookup,
 )
 from softfinger.kinematics.contact.material import Material
@@ -43,7 +45,6 @@ from softfinger.kinematics.contact.quadrature import (
     nodes_for,
     ratios_at,
 )
-from softfinger.kinematics.contact.table import TableError, aligned
 
 FloatArray = NDArray[np.float64]
 
@@ -278,7 +279,7 @@ def hard_points(
     even = rng.uniform(0.0, 1.0, points)
     d = np.where(which < 3, small, np.where(which < 5, 1.0 - small, even)) * radius
     d = np.maximum(d, 1e-9 * radius)
-    limit = theta_limits(radius, d)
+    limit = Fingertip(radius).theta_limit(d)
     near = 10.0 ** rng.uniform(-12.0, 0.0, points)
     kind = np.where(which % 3 == 0, rng.uniform(0.0, 1.0, points), 1.0 - near)
     kind = np.where(rng.integers(0, 8, points) == 0, near, kind)

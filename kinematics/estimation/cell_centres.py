@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.estimation.footprint import FloatArray, Geometry, IntArray
+from softfinger.kinematics.sensing.footprint import FloatArray, Geometry, IntArray
 
 # Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's middle, or
 # over its nearest corner where the middle lies beyond the rim, and −∞ for a cell that is dead or

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.estimation.footprint import (
+from softfinger.kinematics.sensing.footprint import (
     GAUSS_NODES,
     GAUSS_WEIGHTS,
     Crossings,

@@ -10,7 +10,7 @@ import math
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address
 from softfinger.kinematics.estimation.cell_centres import FIRST, LAST, NUMBER, next_above, totals
-from softfinger.kinematics.estimation.footprint import (
+from softfinger.kinematics.sensing.footprint import (
     FloatArray,
     Geometry,
     IntArray,

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation import frame_pipeline, scratch
-from softfinger.kinematics.estimation.blur import parts_to_fit, weights
+from softfinger.kinematics.estimation.blurred_cells import parts_to_fit, weights
 from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_middles
-from softfinger.kinematics.estimation.cell_integrals import CELL_PLANES, LIVE, face_integrals
-from softfinger.kinematics.estimation.footprint import FloatArray, IntArray
 from softfinger.kinematics.estimation.likelihood import fit_law
 from softfinger.kinematics.estimation.moments import moment_ratios
+from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE, face_integrals
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 

@@ -13,11 +13,11 @@ from softfinger.kinematics.compiled.unowned import borrowed
 from softfinger.kinematics.estimation import gauss_newton
 from softfinger.kinematics.estimation.cell_centres import NUMBER
 from softfinger.kinematics.estimation.detection import presses_outside
-from softfinger.kinematics.estimation.footprint import FloatArray, IntArray
 from softfinger.kinematics.estimation.gauss_newton import RESULT, fit
 from softfinger.kinematics.estimation.moments import RATIO_POINTS, coarse, coarse_weak, refine
 from softfinger.kinematics.estimation.outliers import revive, without_spikes
 from softfinger.kinematics.estimation.scratch import MIDDLES, SPIKES_MAX
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 
 # Places in the state: what a frame leaves, and where the next one starts. The estimate in the
 # sensor's axes comes first, then what is told in the finger's.

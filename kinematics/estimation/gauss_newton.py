@@ -11,10 +11,8 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd_sums import LANES
-from softfinger.kinematics.estimation.blur import spread
-from softfinger.kinematics.estimation.cell_integrals import CELL_PLANES
+from softfinger.kinematics.estimation.blurred_cells import spread
 from softfinger.kinematics.estimation.cut_cells import LEVELS, OWNERS, PLANES, STRIP_ROWS, STRIPS
-from softfinger.kinematics.estimation.footprint import FloatArray, Geometry, IntArray, plane
 from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, is_bent, press
 from softfinger.kinematics.estimation.packing import pack
 from softfinger.kinematics.estimation.scratch import (
@@ -33,6 +31,8 @@ from softfinger.kinematics.estimation.scratch import (
     WEIGHTS_Y,
     WORK,
 )
+from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES
+from softfinger.kinematics.sensing.footprint import FloatArray, Geometry, IntArray, plane
 
 # Places in what a fit leaves in ``result``.
 D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)

@@ -23,7 +23,7 @@ from softfinger.kinematics.estimation.cut_cells import (
     VARIANCE,
     WEIGHT,
 )
-from softfinger.kinematics.estimation.footprint import FloatArray
+from softfinger.kinematics.sensing.footprint import FloatArray
 
 SUMS = 17
 

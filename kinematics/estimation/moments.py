@@ -29,7 +29,7 @@ from softfinger.kinematics.estimation.cell_centres import (
     sums_inside,
 )
 from softfinger.kinematics.estimation.detection import neighbourhood
-from softfinger.kinematics.estimation.footprint import (
+from softfinger.kinematics.sensing.footprint import (
     FloatArray,
     Geometry,
     IntArray,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address
 from softfinger.kinematics.estimation.cell_centres import HEIGHT, NUMBER
-from softfinger.kinematics.estimation.cell_integrals import LIVE
 from softfinger.kinematics.estimation.detection import activity
-from softfinger.kinematics.estimation.footprint import FloatArray, IntArray
 from softfinger.kinematics.estimation.scratch import SPIKES, SPIKES_MAX
+from softfinger.kinematics.sensing.cell_integrals import LIVE
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 
 _DEAD = 1e3  # m below: no face is ever there
 

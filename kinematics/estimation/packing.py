@@ -9,19 +9,7 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.estimation.blur import PLACE_BITS
-from softfinger.kinematics.estimation.cell_integrals import (
-    LIVE,
-    PLAIN_MEAN,
-    PLAIN_VAR,
-    PLAIN_X,
-    PLAIN_Y,
-    X_MEAN,
-    X_VAR,
-    X_Y,
-    Y_MEAN,
-    Y_VAR,
-)
+from softfinger.kinematics.estimation.blurred_cells import PLACE_BITS
 from softfinger.kinematics.estimation.cut_cells import (
     ALONG_X,
     ALONG_Y,
@@ -42,7 +30,19 @@ from softfinger.kinematics.estimation.cut_cells import (
     flush,
     push_strips,
 )
-from softfinger.kinematics.estimation.footprint import (
+from softfinger.kinematics.sensing.cell_integrals import (
+    LIVE,
+    PLAIN_MEAN,
+    PLAIN_VAR,
+    PLAIN_X,
+    PLAIN_Y,
+    X_MEAN,
+    X_VAR,
+    X_Y,
+    Y_MEAN,
+    Y_VAR,
+)
+from softfinger.kinematics.sensing.footprint import (
     FloatArray,
     Geometry,
     IntArray,
@@ -74,8 +74,8 @@ def pack(
 
     ``cells`` [rows, CELL_PLANES, cols] is what :func:`estimation.cell_integrals.face_integrals`
     gives. ``bent``: the strain's variance is wanted, too. ``places`` takes the cells' rows and
-    columns, see :func:`estimation.blur.spread`, unless it is empty. ``columns`` [2, cols + 1],
-    ``lines`` [2, rows + 1], ``strips``, ``queues`` and ``owners`` are scratch, see workspace.py.
+    columns, see :func:`estimation.blurred_cells.spread`, unless it is empty. ``columns``
+    [2, cols + 1], ``lines`` [2, rows + 1], ``strips``, ``queues`` and ``owners`` are scratch, see workspace.py.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape

@@ -13,7 +13,7 @@ import numpy as np
 from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.estimation import cell_centres
 from softfinger.kinematics.estimation.cut_cells import LEVELS, OWNERS, PLANES, STRIP_ROWS, STRIPS
-from softfinger.kinematics.estimation.footprint import FloatArray, IntArray
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 
 # Floats: the planes of estimation.cell_centres, that many numbers a cell, then scratch, by its
 # place: covariance of the estimate, then of one step of the fit the sums, the
@@ -48,7 +48,7 @@ class Parts:
     """The finer grid of a blurred model: (x, y) parts of a cell and how many the blur reaches.
 
     ``planes`` [rows, CELL_PLANES, cols] are the parts', ``across`` and ``along`` their weights, see
-    :func:`estimation.blur.weights`.
+    :func:`estimation.blurred_cells.weights`.
     """
 
     number: tuple[int, int]

@@ -13,7 +13,7 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.contact.table import lookup
+from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import sheared_gradient
 
 _STEPS = 4  # of Newton's method; the equation is a parabola, all but a line

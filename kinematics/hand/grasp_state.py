@@ -14,7 +14,7 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.contact.table import lookup
+from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 
 _SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits

@@ -14,8 +14,8 @@ import numpy as np
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.blur import average, parts, stencil
-from softfinger.kinematics.estimation.cell_integrals import (
+from softfinger.kinematics.sensing.blur import average, parts, stencil
+from softfinger.kinematics.sensing.cell_integrals import (
     MAX_BREAKS,
     NODE_ROWS,
     NODES_A_CELL,
@@ -25,7 +25,7 @@ from softfinger.kinematics.estimation.cell_integrals import (
     push_cut,
     push_whole,
 )
-from softfinger.kinematics.estimation.footprint import (
+from softfinger.kinematics.sensing.footprint import (
     FloatArray,
     Geometry,
     IntArray,

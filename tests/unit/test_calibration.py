@@ -9,7 +9,7 @@ import pytest
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.calibration import (
+from softfinger.kinematics.estimation.calibration import (
     CalibrationError,
     cleared,
     equilibrate,

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material
-from softfinger.kinematics.contact.table import lookup
+from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.external_load import load_by_torques
-from softfinger.kinematics.hand.geometry import HandGeometry
-from softfinger.kinematics.hand.grasp import Grasp, GraspState
 from softfinger.kinematics.hand.grasp_state import held_motion, holding_levers, sheared_gradient
 from tests.harness.called import called
+from tests.harness.grasp import Grasp, GraspState
+from tests.harness.reference_hand import ReferenceHand
 
 # Inner kernels, made callable.
 held_motion = called(held_motion)
@@ -21,7 +21,7 @@ holding_levers = called(holding_levers)
 sheared_gradient = called(sheared_gradient)
 load_by_torques = called(load_by_torques)
 
-HAND = HandGeometry(finger_offset=0.003)
+HAND = ReferenceHand(finger_offset=0.003)
 LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)
 WIDTH = 0.040
 

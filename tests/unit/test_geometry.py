@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.kinematics.hand.geometry import HandGeometry
+from tests.harness.reference_hand import ReferenceHand
 
 HANDS = [
-    HandGeometry(),
-    HandGeometry(pivot_separation=0.07, finger_length=0.06, finger_offset=0.012, tip_radius=0.012),
-    HandGeometry(finger_offset=-0.02),
+    ReferenceHand(),
+    ReferenceHand(pivot_separation=0.07, finger_length=0.06, finger_offset=0.012, tip_radius=0.012),
+    ReferenceHand(finger_offset=-0.02),
 ]
 WIDTH = 0.04
 
@@ -32,7 +32,7 @@ def rotation(angle: float) -> np.ndarray:
     return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
-def contacts_by_rotation(hand: HandGeometry, q, pose, width) -> np.ndarray:
+def contacts_by_rotation(hand: ReferenceHand, q, pose, width) -> np.ndarray:
     """The plain twin: fingers as rotated vectors, the object's frame as a rotation matrix."""
     local = np.array([hand.finger_offset, hand.finger_length])
     left = np.array([-hand.half_separation, 0]) + rotation(-q[0]) @ local
@@ -43,7 +43,7 @@ def contacts_by_rotation(hand: HandGeometry, q, pose, width) -> np.ndarray:
     return np.array([d1, d2, pose[2] + q[0], pose[2] - q[1], in_object[0][1], in_object[1][1]])
 
 
-def stacked(hand: HandGeometry, q, pose, width=WIDTH) -> np.ndarray:
+def stacked(hand: ReferenceHand, q, pose, width=WIDTH) -> np.ndarray:
     c = hand.contacts(q, pose, width)
     return np.concatenate((c.d, c.theta, c.s))
 
@@ -110,7 +110,7 @@ def test_inverse_kinematics_round_trip(hand):
 
 
 def test_symmetric_grasp_angles_of_the_default_hand():
-    hand = HandGeometry()
+    hand = ReferenceHand()
     for d, degrees in [
         (0.002, 8.6269265587),
         (0.004, 10.0786581078),
@@ -132,7 +132,7 @@ def test_object_from_contacts_recovers_angle_and_width(hand):
 
 
 def test_a_joint_offset_shows_as_disagreement():
-    hand = HandGeometry()
+    hand = ReferenceHand()
     q, pose = np.array([0.2, 0.15]), np.array([0.001, 0.08, 0.05])
     c = hand.contacts(q, pose, WIDTH)
     _, _, disagreement = hand.object_from_contacts(q + np.array([0.03, 0.0]), c.d, c.theta)
@@ -140,12 +140,12 @@ def test_a_joint_offset_shows_as_disagreement():
 
 
 def test_out_of_reach_and_bad_shapes_are_refused():
-    hand = HandGeometry()
+    hand = ReferenceHand()
     with pytest.raises(ValueError, match="out of reach"):
         hand.inverse((0.2, 0.08, 0), (0, 0), 0.04)
     with pytest.raises(ValueError, match="shape"):
         hand.tips([0.1, 0.2, 0.3])
     with pytest.raises(ValueError, match="finger_length"):
-        HandGeometry(finger_length=0.0)
+        ReferenceHand(finger_length=0.0)
     with pytest.raises(ValueError, match="finger_offset"):
-        HandGeometry(finger_offset=math.nan)
+        ReferenceHand(finger_offset=math.nan)

@@ -1,4 +1,4 @@
-"""Grasps in balance: the closed forms of the symmetric grasp, steering, stiffness and slip."""
+"""The reference grasp: closed forms of the symmetric grasp, steering, stiffness."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ import pytest
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.kinematics.hand.geometry import HandGeometry
-from softfinger.kinematics.hand.grasp import (
+from tests.harness.grasp import (
     Grasp,
     GraspError,
     GraspState,
-    moment_limit,
     sheared_contact,
-    slip_margin,
 )
+from tests.harness.reference_hand import ReferenceHand
 
 MODULUS = 0.304e6
 TIP = Fingertip(radius=0.020)
@@ -85,7 +83,7 @@ def test_sheared_partials_are_the_gradient_for_any_material(table):
 
 @pytest.mark.parametrize(("d", "degrees", "normal", "moment"), SYMMETRIC)
 def test_symmetric_grasp_table(paper, d, degrees, normal, moment):
-    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    grasp = Grasp(ReferenceHand(), paper, WIDTH)
     state = grasp.symmetric(d * 1e-3)
     forces = grasp.forces(state)
     np.testing.assert_allclose(np.degrees(state.q), degrees, rtol=1e-10)
@@ -100,7 +98,7 @@ def test_symmetric_grasp_table(paper, d, degrees, normal, moment):
 
 
 def test_balance_finds_the_symmetric_grasp_from_elsewhere(table):
-    grasp = Grasp(HandGeometry(), table, WIDTH)
+    grasp = Grasp(ReferenceHand(), table, WIDTH)
     best = grasp.symmetric(0.004)
     generator = np.random.default_rng(4)
     for _ in range(5):
@@ -121,7 +119,7 @@ def test_balance_finds_the_symmetric_grasp_from_elsewhere(table):
     ("degrees", "gain"), [(0.01, 1.5207), (1, 1.520), (5, 1.5076), (10, 1.471)]
 )
 def test_steering_gain(paper, degrees, gain):
-    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    grasp = Grasp(ReferenceHand(), paper, WIDTH)
     delta = math.radians(degrees)
     turned = grasp.steer(grasp.symmetric(0.004), delta)
     # The sign: fingers to the right turn the object to the left, counter-clockwise.
@@ -132,7 +130,7 @@ def test_steering_gain(paper, degrees, gain):
 
 
 def test_steering_by_ten_degrees_raises_the_normal_force(paper):
-    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    grasp = Grasp(ReferenceHand(), paper, WIDTH)
     start = grasp.symmetric(0.004)
     turned = grasp.steer(start, math.radians(10), steps=128)
     np.testing.assert_allclose(grasp.forces(start).normal, 15.40, atol=0.005)
@@ -140,7 +138,7 @@ def test_steering_by_ten_degrees_raises_the_normal_force(paper):
 
 
 def test_path_integration_converges_at_second_order(paper):
-    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    grasp = Grasp(ReferenceHand(), paper, WIDTH)
     start = grasp.symmetric(0.004)
     angles = [grasp.steer(start, 0.15, steps).pose[2] for steps in (4, 8, 16, 256)]
     errors = np.abs(np.array(angles[:3]) - angles[3])
@@ -150,86 +148,37 @@ def test_path_integration_converges_at_second_order(paper):
 
 def test_gravity_is_borne_by_shear(table):
     weight = 0.98
-    grasp = Grasp(HandGeometry(), table, WIDTH, weight=(0.0, -weight))
-    free = Grasp(HandGeometry(), table, WIDTH)
+    grasp = Grasp(ReferenceHand(), table, WIDTH, weight=(0.0, -weight))
+    free = Grasp(ReferenceHand(), table, WIDTH)
     hung = grasp.balance(free.symmetric(0.004))
     assert hung.pose[1] < free.symmetric(0.004).pose[1]
     forces = grasp.forces(hung)
     # Each tip's N and T in the hand's plane sum to the weight; the tips' own moments balance too.
     np.testing.assert_allclose(forces.tangential[0], -forces.tangential[1], rtol=1e-6)
     np.testing.assert_allclose(np.abs(forces.tangential).sum(), weight, rtol=1e-6)
-    margin = grasp.slip_margin(hung, 0.6)
-    np.testing.assert_allclose(margin, 1 - np.abs(forces.tangential) / (0.6 * forces.normal))
 
 
 def test_stiffness_predicts_the_answer_to_a_push(table):
-    free = Grasp(HandGeometry(), table, WIDTH)
+    free = Grasp(ReferenceHand(), table, WIDTH)
     state = free.symmetric(0.005)
     stiffness = free.stiffness(state)[2:, 2:]
     np.testing.assert_allclose(stiffness, stiffness.T, atol=1e-3 * np.abs(stiffness).max())
     assert np.linalg.eigvalsh(stiffness)[0] > 0
     push = np.array([1e-3, 2e-3])
-    pushed = Grasp(HandGeometry(), table, WIDTH, weight=tuple(push)).balance(state)
+    pushed = Grasp(ReferenceHand(), table, WIDTH, weight=tuple(push)).balance(state)
     expected = np.linalg.solve(stiffness, [*push, 0.0])
     np.testing.assert_allclose(pushed.pose - state.pose, expected, rtol=1e-3, atol=1e-12)
 
 
-def test_moment_limit_and_limit_surface():
-    limits = moment_limit([0.002, 0.004, 0.006, 0.008], 0.020, MODULUS, 1.0) * 1e3
-    np.testing.assert_allclose(
-        limits, [18.026678395647, 100.84588674463, 274.74235693693, 557.41116521988], rtol=1e-12
-    )
-    assert slip_margin(0.0, 0.0, 5.0, 0.5, 0.1) == 1.0
-    assert slip_margin(1.5, 0.08, 5.0, 0.5, 0.1) == pytest.approx(0.0)
-    assert slip_margin(3.0, 0.0, 5.0, 0.5, 0.1) < 0
-
-
-def test_moment_limit_of_any_material():
-    depths = np.array([0.0005, 0.002, 0.008, 0.016])
-    closed = moment_limit(depths, 0.020, MODULUS, 0.6)
-    by_material = moment_limit(depths, 0.020, Material.constant(MODULUS), 0.6)
-    np.testing.assert_allclose(by_material, closed, rtol=1e-9)
-    # Table I by a sum over a polar grid of the footprint.
-    material, d, cells = Material.table_i(), 0.006, 200_000
-    rho = math.sqrt(2 * 0.020 * d - d * d)
-    r = (np.arange(cells) + 0.5) * rho / cells
-    stress = material.stress(1 - (0.020 - d) / np.sqrt(0.020**2 - r * r))
-    expected = 0.6 * (stress * r * 2 * math.pi * r).sum() * rho / cells
-    assert moment_limit(d, 0.020, material, 0.6) == pytest.approx(expected, rel=1e-8)
-
-
-def test_a_moment_out_of_the_plane_takes_from_the_slip_margin(table):
-    grasp = Grasp(HandGeometry(), table, WIDTH)
-    state = grasp.steer(grasp.symmetric(0.004), 0.1)
-    forces = grasp.forces(state)
-    load = forces.tangential / (0.6 * forces.normal)
-    np.testing.assert_allclose(grasp.slip_margin(state, 0.6), 1 - np.abs(load))
-    margin = grasp.slip_margin(state, 0.6, moment=0.02, largest_moment=0.05)
-    np.testing.assert_allclose(margin, 1 - np.hypot(load, 0.4))
-
-
-def test_joint_limits_are_kept(paper):
-    hand = HandGeometry(q_min=(-0.5, -0.5), q_max=(0.18, 0.5))
-    assert hand.within_limits((0.1, 0.4))
-    assert not hand.within_limits((0.2, 0.1))
-    grasp = Grasp(hand, paper, WIDTH)
-    with pytest.raises(ValueError, match="past their limits"):
-        grasp.symmetric(0.006)
-    with pytest.raises(GraspError, match="limits"):
-        grasp.steer(grasp.symmetric(0.003), 0.05)
-    with pytest.raises(ValueError, match="q_min"):
-        HandGeometry(q_min=(0.0, 1.0), q_max=(1.0, 1.0))
-
-
 def test_impossible_grasps_are_refused(paper):
-    grasp = Grasp(HandGeometry(), paper, WIDTH)
+    grasp = Grasp(ReferenceHand(), paper, WIDTH)
     with pytest.raises(GraspError, match="open"):
         grasp.symmetric(-0.001)
     with pytest.raises(GraspError, match="outside"):
         grasp.symmetric(0.017)
     with pytest.raises(ValueError, match="out of reach"):
-        Grasp(HandGeometry(pivot_separation=0.3), paper, WIDTH).symmetric(0.004)
+        Grasp(ReferenceHand(pivot_separation=0.3), paper, WIDTH).symmetric(0.004)
     with pytest.raises(GraspError):
         grasp.balance(grasp.symmetric(0.004), (0.05, 0.05))
     with pytest.raises(ValueError, match="width"):
-        Grasp(HandGeometry(), paper, 0.0)
+        Grasp(ReferenceHand(), paper, 0.0)

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material
-from softfinger.kinematics.contact.table import lookup
-from softfinger.kinematics.hand.geometry import HandGeometry
-from softfinger.kinematics.hand.grasp import Grasp, GraspState
+from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import (
     held_motion,
     holding_levers,
@@ -18,13 +16,15 @@ from softfinger.kinematics.hand.grasp_state import (
     total_tilt,
 )
 from tests.harness.called import called
+from tests.harness.grasp import Grasp, GraspState
+from tests.harness.reference_hand import ReferenceHand
 
 # Inner kernels, made callable.
 holding_levers = called(holding_levers)
 sheared_gradient = called(sheared_gradient)
 held_motion = called(held_motion)
 
-HAND = HandGeometry(finger_offset=0.003)
+HAND = ReferenceHand(finger_offset=0.003)
 LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)
 WIDTH = 0.040
 

@@ -10,8 +10,7 @@ import pytest
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.hand import SimulatedHand
-from softfinger.kinematics.hand.geometry import HandGeometry
-from softfinger.kinematics.hand.grasp import Grasp
+from tests.harness.grasp import Grasp
 from tests.harness.plant import (
     BOUNDED,
     CONSTANT,
@@ -27,13 +26,14 @@ from tests.harness.plant import (
     run,
     settled,
 )
+from tests.harness.reference_hand import ReferenceHand
 
 # Balance.
 
 
 def test_symmetric_grasp_settles_where_the_theory_puts_it():
     hand = make(table_friction=0.0, joint_friction=0.0)
-    grasp = Grasp(HandGeometry(), PAPER, WIDTH)
+    grasp = Grasp(ReferenceHand(), PAPER, WIDTH)
     for d, degrees, normal in [
         (0.002, 8.6269265587, 3.8421597806),
         (0.004, 10.0786581078, 15.4013956785),
@@ -49,7 +49,7 @@ def test_symmetric_grasp_settles_where_the_theory_puts_it():
 @pytest.mark.parametrize(("degrees", "gain"), [(1, 1.520), (5, 1.5076)])
 def test_quasi_static_steering_gain(degrees, gain):
     hand = make(table_friction=0.0, joint_friction=0.0, tip_friction=50.0)
-    grasp = Grasp(HandGeometry(), PAPER, WIDTH)
+    grasp = Grasp(ReferenceHand(), PAPER, WIDTH)
     start = grasp.symmetric(0.004)
     place(hand, start.q, start.pose)
     hand.shear[:] = start.shear
@@ -76,7 +76,7 @@ def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
     np.testing.assert_allclose(hand.object_pose[1], 0.08 - 0.5 * 9.80665 * t * t, rtol=1e-12)
     assert hand.object_velocity[1] == pytest.approx(-9.80665 * t)
     held = make(gravity=(0.0, -9.80665), object_mass=0.3)
-    grasp = Grasp(HandGeometry(), PAPER, WIDTH)
+    grasp = Grasp(ReferenceHand(), PAPER, WIDTH)
     start = grasp.symmetric(0.004)
     place(held, start.q, start.pose)
     settled(held, (0.9, 0.9), 0.7, 1.0)
@@ -280,7 +280,7 @@ def test_without_servos_and_script_the_joints_stay():
 
 def test_tips_roll_over_the_ends_of_the_object():
     hand = make(object_height=0.02)
-    geometry = HandGeometry()
+    geometry = ReferenceHand()
     tip = geometry.tips((0.15, 0.15))[0]
     for height in np.linspace(0.05, 0.11, 25):
         place(hand, (0.15, 0.15), (0.0, height, 0.0))
@@ -297,7 +297,7 @@ def test_tips_roll_over_the_ends_of_the_object():
 def test_object_turned_by_a_right_angle_is_touched_on_its_other_faces():
     hand = make()
     place(hand, (0.05, 0.05), (0.0, 0.08, 0.5 * math.pi))
-    geometry = HandGeometry()
+    geometry = ReferenceHand()
     expected = geometry.contacts((0.05, 0.05), (0.0, 0.08, 0.0), 0.060)
     np.testing.assert_allclose(hand.d, expected.d, atol=1e-12)
     np.testing.assert_allclose(hand.theta, expected.theta, atol=1e-12)

@@ -11,9 +11,9 @@ import pytest
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics import layout
-from softfinger.kinematics.hand.geometry import HandGeometry
+from tests.harness.reference_hand import ReferenceHand
 
-HAND = HandGeometry()
+HAND = ReferenceHand()
 SLOW: dict[str, Any] = {"rate": 25.0}
 
 

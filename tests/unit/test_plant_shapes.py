@@ -13,7 +13,6 @@ from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.hand import SimulatedHand
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.tactile.simulated import SimulatedTactile
-from softfinger.kinematics.hand.geometry import HandGeometry
 from tests.harness.plant import (
     BOUNDED,
     CONSTANT,
@@ -26,10 +25,11 @@ from tests.harness.plant import (
     run,
     settled,
 )
+from tests.harness.reference_hand import ReferenceHand
 
 RADIUS = 0.020
 GRAVITY = 9.80665
-HAND = HandGeometry()
+HAND = ReferenceHand()
 
 
 def shape(**simulation):

@@ -14,7 +14,7 @@ from numpy.polynomial.legendre import leggauss
 from softfinger import Fingertip, Material
 from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.quadrature import circle_rule, gauss_rule, integrate, ratios_at
-from softfinger.kinematics.contact.tip_profile import TipProfile, compress
+from tests.harness.tip_profile import TipProfile, compress
 
 TIP = Fingertip(0.020)
 TABLE_I = Material.table_i()

@@ -14,9 +14,18 @@ from softfinger import ContactTable, Fingertip, Material
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import closed_forms
-from softfinger.kinematics.contact.lookup import FORM, FORMS, MODULUS, RADIUS, START
+from softfinger.kinematics.contact.lookup import (
+    FORM,
+    FORMS,
+    MODULUS,
+    RADIUS,
+    START,
+    TableError,
+    aligned,
+    lookup,
+    lookups,
+)
 from softfinger.kinematics.contact.quadrature import integrate
-from softfinger.kinematics.contact.table import TableError, aligned, lookup, lookups
 from softfinger.kinematics.contact.table_build import MEMORY_LIMIT, hard_points
 
 TIP = Fingertip(0.020)
@@ -345,3 +354,16 @@ def test_aligned_arrays_are_zero_and_contiguous() -> None:
         assert array.size == size
         assert array.ctypes.data % 64 == 0 or size == 0
         assert not array.any()
+
+
+@pytest.mark.parametrize("material", [CONSTANT, TABLE_I])
+def test_the_energy_has_its_minimum_where_nothing_is_tilted(material: Material) -> None:
+    theta = np.radians(np.linspace(-25, 25, 101))
+    table = ContactTable.build(TIP, material, 1e-9)
+    for d in (0.002, 0.004, 0.008):
+        ours = table(d, theta)
+        assert ours.energy.argmin() == 50
+        assert np.all(np.diff(ours.energy[50:]) > 0)
+        assert np.all(np.diff(ours.energy[:51]) < 0)
+        assert ours.energy_theta[50] == 0.0
+        assert np.all(ours.energy_theta * theta >= 0)

@@ -15,7 +15,7 @@ from softfinger.daemon.profile import table_files
 from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.table_files import load_or_build, load_table, save_table, table_file
-from softfinger.kinematics.contact.table import TableError
+from softfinger.kinematics.contact.lookup import TableError
 
 TIP = Fingertip(0.020)
 CONSTANT = Material.constant(0.304e6)

@@ -13,13 +13,13 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
 from softfinger.tools.viewing.known import Hand, Wanted, read_settings
 from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
 from softfinger.tools.viewing.planar import Contact, HeldObject, finger_lines, tip_axes
 from softfinger.tools.viewing.statistics import table
+from tests.harness.reference_hand import ReferenceHand
 
 TIP = Fingertip(radius=0.020)
 GRIDS = (
@@ -83,7 +83,7 @@ def test_the_grid_is_read_from_the_frame() -> None:
 
 # The hand in its plane
 
-HAND = HandGeometry(0.1, 0.08, 0.005, 0.02)
+HAND = ReferenceHand(0.1, 0.08, 0.005, 0.02)
 POSE = np.array([0.003, 0.081, 0.12])
 WIDTH_M = 0.043
 Q = (0.14, 0.10)

@@ -23,12 +23,11 @@ from softfinger.kinematics.contact.closed_form import (
     Fingertip,
     closed_form,
     closed_forms,
-    theta_limits,
 )
-from softfinger.kinematics.contact.lookup import CLOSED, FORMS, lookup
+from softfinger.kinematics.contact.lookup import CLOSED, FORMS, TableError, lookup
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
-from softfinger.kinematics.contact.table import ContactTable, TableError
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks import contact_kernels, contact_scipy
 from softfinger.tools.benchmarks.contact_report import MODES, ContactRow, Timing, aligned_table
 from softfinger.tools.benchmarks.interleaved import Subject, interleave
@@ -231,7 +230,7 @@ def _domain_case(table: ContactTable, tolerance: float, count: int) -> _Case:
     """The same lookup over the whole domain, d up to a: more of the table, and its slow corner."""
     rng = np.random.default_rng(4)
     d = rng.uniform(0.0, TIP.radius, count)
-    theta = rng.uniform(-1.0, 1.0, count) * theta_limits(TIP.radius, d)
+    theta = rng.uniform(-1.0, 1.0, count) * TIP.theta_limit(d)
     error = _error(table(d, theta), reference(Material.table_i(), d, theta), 6)
     case = _Case(
         f"table to {tolerance:g}, points over its whole domain",

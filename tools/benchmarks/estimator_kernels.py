@@ -17,8 +17,8 @@ from softfinger.kinematics.estimation.cell_centres import (
     sums_inside,
 )
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.kinematics.estimation.footprint import plane
 from softfinger.kinematics.estimation.moments import footprint_moments
+from softfinger.kinematics.sensing.footprint import plane
 
 FloatArray = NDArray[np.float64]
 OUTPUTS = 4  # d, tilt_x, tilt_y, 1 for a valid contact

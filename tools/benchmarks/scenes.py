@@ -24,7 +24,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.contact.table import ContactTable, lookup
+from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation import frame_pipeline
 from softfinger.tools.benchmarks.canned import can, hold
 from softfinger.tools.benchmarks.interleaved import Subject, interleave

@@ -21,7 +21,7 @@ from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.tactile.recording import TRUTHS, load_recording
 from softfinger.daemon.types import FINGERS, Frame
-from softfinger.kinematics.sensing.calibration import CalibrationError
+from softfinger.kinematics.estimation.calibration import CalibrationError
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 3.0  # s without a new frame

@@ -5,6 +5,7 @@ The measured points are printed in the paper as pictures only and are not reprod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,6 @@ import numpy as np
 
 from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.other_laws import RadialModel
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
@@ -117,7 +117,8 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             (f"F at d = {deepest} mm", "N", _force(d, tilting)),
         ]
         force, law = _force(d, rolling), _force_table_i(d, rolling)
-        radial = np.full(rolling.shape, RadialModel(TIP, MODULUS).force(d * MILLI))
+        # Springs that point at the tip's centre (Nguyen and Arimoto): N = πE d², whatever the tilt.
+        radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second += [
             (f"F at d = {deepest} mm", "N", force),
             (f"F/F(0) at d = {deepest} mm", "1", force / force[rolling == 0.0]),

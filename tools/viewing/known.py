@@ -16,7 +16,8 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.contact.table import ContactTable, TableError
+from softfinger.kinematics.contact.lookup import TableError
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing.landscape import Landscape

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.contact.closed_form import theta_limits
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.table import ContactTable
 
 FloatArray = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Landscape:
         stops = np.arange(len(_RAMP))
         colours = [np.interp(share, stops, _RAMP[:, channel]) for channel in range(3)]
         picture = np.stack(colours, axis=-1)
-        picture[np.abs(angle) > theta_limits(self._radius, depth)] = _OUTSIDE
+        picture[np.abs(angle) > Fingertip(self._radius).theta_limit(depth)] = _OUTSIDE
         return picture.astype(np.uint8)
 
     def contours(self) -> list[Contour]:
@@ -90,7 +90,7 @@ class Landscape:
             last = upright
             # U grows with d: one depth for each angle.
             d = np.array([np.interp(level, energy[:, k], self._d) for k in range(len(theta))])
-            inside = np.abs(theta) <= theta_limits(self._radius, d)
+            inside = np.abs(theta) <= Fingertip(self._radius).theta_limit(d)
             contours.append(Contour(float(level), self.place(d[inside], theta[inside])))
         return contours
 

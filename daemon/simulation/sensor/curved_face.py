@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.material import stress_at
-from softfinger.kinematics.estimation.footprint import Geometry, extremes, plane
+from softfinger.kinematics.sensing.footprint import Geometry, extremes, plane
 
 FloatArray = NDArray[np.float64]
 

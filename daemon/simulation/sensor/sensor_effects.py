@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.estimation.footprint import Geometry
+from softfinger.kinematics.sensing.footprint import Geometry
 
 FloatArray = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ The energy is that of both tips and of gravity. A tip's energy with the shear d_
 
 with U₀ and F from the contact table; for a constant modulus it is πE[d³/(3cos²θ) + d² d_t tan θ +
 d d_t²], the parallel-distributed model. Its shear force is T = ∂U/∂d_t, its normal force
-N = ∂U/∂d − T tan θ. Shears follow the rolling increments of :mod:`hand.geometry`, which can't
-be integrated in general, so that a grasp depends on its path: what moves here moves in small steps
+N = ∂U/∂d − T tan θ. Shears follow the rolling increments of `reference_hand`, which can't be
+integrated in general, so that a grasp depends on its path: what moves here moves in small steps
 and carries its shears along. Balance is where the energy is stationary along those increments.
 """
 
@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable, lookup
-from softfinger.kinematics.hand.geometry import (
-    HandGeometry,
+from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.contact.table import ContactTable
+from tests.harness.reference_hand import (
+    ReferenceHand,
     contact_jacobian,
     contact_variables,
     rolling_rows,
@@ -34,7 +34,6 @@ FloatArray = NDArray[np.float64]
 
 _TOLERANCE = 1e-12  # of the contact forces, for balance
 _ITERATIONS = 60
-_MOMENT_NODES = 48  # exponential convergence: 1e-10 and better up to d = 0.9 a
 
 
 class GraspError(SoftfingerError, ValueError):
@@ -145,7 +144,7 @@ class Grasp:
 
     def __init__(
         self,
-        hand: HandGeometry,
+        hand: ReferenceHand,
         table: ContactTable,
         width: float,
         weight: tuple[float, float] = (0.0, 0.0),
@@ -211,8 +210,6 @@ class Grasp:
         x = state.coordinates
         if q is not None:
             x[:2] = q
-            if not self.hand.within_limits(x[:2]):
-                raise GraspError("the joints' limits are passed")
         energy, gradient, shear, sound = self._evaluate(x, state)
         for _ in range(_ITERATIONS):
             self._check(sound)
@@ -266,21 +263,6 @@ class Grasp:
         """
         return self._hessian(state.coordinates, state)
 
-    def slip_margin(
-        self,
-        state: GraspState,
-        friction: float,
-        moment: ArrayLike = 0.0,
-        largest_moment: ArrayLike = math.inf,
-    ) -> FloatArray:
-        """Distance of both contacts (2,) to the limit surface; 0 or less slips.
-
-        ``moment`` [N·m] about each face's normal is what acts out of the hand's plane, such as a
-        weight beside the tips; ``largest_moment`` is :func:`moment_limit`.
-        """
-        forces = self.forces(state)
-        return slip_margin(forces.tangential, moment, forces.normal, friction, largest_moment)
-
     def _evaluate(
         self, coordinates: FloatArray, start: GraspState
     ) -> tuple[float, FloatArray, FloatArray, bool]:
@@ -313,45 +295,6 @@ class Grasp:
     def _check(sound: bool) -> None:
         if not sound:
             raise GraspError("a contact is open or outside the tip's range")
-
-
-def slip_margin(
-    tangential: ArrayLike,
-    moment: ArrayLike,
-    normal: ArrayLike,
-    friction: float,
-    largest_moment: ArrayLike,
-) -> FloatArray:
-    """1 − √((T/μN)² + (m/M_max)²), the distance to the limit surface; arrays broadcast.
-
-    ``moment`` m [N·m] acts about the face's normal, ``largest_moment`` is :func:`moment_limit`.
-    """
-    load = np.asarray(tangential) / (friction * np.asarray(normal))
-    spin = np.asarray(moment) / np.asarray(largest_moment)
-    return np.asarray(1.0 - np.hypot(load, spin), dtype=np.float64)
-
-
-def moment_limit(
-    d: ArrayLike, radius: float, material: Material | float, friction: float
-) -> FloatArray:
-    """Largest friction moment [N·m] about the normal of an upright contact of ``d`` [m].
-
-    2πμ ∫ σ(ε(r)) r² dr over the footprint, ε = 1 − h/√(a² − r²), for a ``material``. For a constant
-    modulus [Pa], given as a number, it is 2πμE[ρ³/3 − h((a²/2) asin(ρ/a) − ρh/2)] with h = a − d,
-    ρ² = 2ad − d².
-    """
-    depth = np.asarray(d, dtype=np.float64)
-    h = radius - depth
-    rho = np.sqrt(2.0 * radius * depth - depth * depth)
-    if not isinstance(material, Material):
-        disc = 0.5 * radius * radius * np.arcsin(rho / radius) - 0.5 * rho * h
-        return np.asarray(2.0 * math.pi * friction * material * (rho**3 / 3.0 - h * disc))
-    nodes, weights = np.polynomial.legendre.leggauss(_MOMENT_NODES)
-    angle = 0.25 * math.pi * (nodes + 1.0)
-    r = rho[..., None] * np.sin(angle)
-    strain = 1.0 - h[..., None] / np.sqrt(radius * radius - r * r)
-    integral = material.stress(strain) * r * r * rho[..., None] * np.cos(angle)
-    return np.asarray(0.5 * math.pi**2 * friction * (integral @ weights))
 
 
 def _positive(hessian: FloatArray, gradient: FloatArray) -> FloatArray:

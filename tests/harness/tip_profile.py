@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material, energy_density_at, stress_at
+from softfinger.kinematics.contact.material import Material, stress_at
 
 FloatArray = NDArray[np.float64]
 
@@ -129,6 +129,31 @@ def _breaks(profile: TipProfile, s: float, c: float, h: float) -> FloatArray:
                 low, high = (middle, high) if there * value[k] > 0.0 else (low, middle)
             radii.append(0.5 * (low + high))
     return np.unique(np.asarray(radii))
+
+
+@inner_kernel
+def energy_density_at(energy_law: FloatArray, strain: float) -> float:
+    """w(ε) = ∫₀^ε σ [J/m³] from ``energy_law``; 0 for ε ≤ 0, beyond ε = 1 as σ is continued."""
+    if strain <= 0.0:
+        return 0.0
+    pieces, order = energy_law.shape
+    if not strain < 1.0:
+        value: float = 0.0
+        slope: float = 0.0
+        curve: float = 0.0
+        for j in range(order):
+            value += energy_law[pieces - 1, j]
+            slope += j * energy_law[pieces - 1, j]
+            curve += j * (j - 1) * energy_law[pieces - 1, j]
+        more: float = pieces * (strain - 1.0)
+        return value + more * (slope + 0.5 * more * curve)
+    u = strain * pieces
+    k = int(u)
+    u -= k
+    result: float = energy_law[k, order - 1]
+    for j in range(order - 2, -1, -1):
+        result = result * u + energy_law[k, j]
+    return result
 
 
 @inner_kernel

@@ -12,7 +12,7 @@ import math
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel, kernel
 from softfinger.kinematics.contact.material import stress_at
-from softfinger.kinematics.estimation.footprint import (
+from softfinger.kinematics.sensing.footprint import (
     GAUSS_NODES,
     GAUSS_WEIGHTS,
     Ends,

@@ -1,0 +1,105 @@
+"""Imports run one way: tools → daemon → kinematics, and no files or rooms import in a circle."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+
+import softfinger
+
+ROOT = Path(softfinger.__file__).parents[1]
+ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module's name below softfinger and its file."""
+    files = (file for top in ORDER for file in (ROOT / top).rglob("*.py"))
+    return {
+        ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+        for file in files
+    }
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Modules of ours that ``file`` names, at its top or within a function."""
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{each.name}" for each in node.names]
+        elif isinstance(node, ast.Import):
+            names = [each.name for each in node.names]
+        else:
+            continue
+        for name in (each.removeprefix("softfinger.") for each in names):
+            # `from a.b import c`: c is a module, or something in b.
+            found = {name, name.rpartition(".")[0]} & modules().keys()
+            if found:
+                yield max(found, key=len)
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """What each module imports."""
+    return {name: {*imported(file)} - {name} for name, file in modules().items()}
+
+
+def circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
+    """Each set of names that reach one another (Tarjan's strongly connected components)."""
+    found: list[list[str]] = []
+    number: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+
+    def visit(name: str) -> None:
+        number[name] = lowest[name] = len(number)
+        stack.append(name)
+        for other in sorted(graph.get(name, ())):
+            if other not in number:
+                visit(other)
+            if other in stack:
+                lowest[name] = min(lowest[name], lowest[other])
+        if lowest[name] == number[name]:
+            circle = stack[stack.index(name) :]
+            del stack[stack.index(name) :]
+            if len(circle) > 1:
+                found.append(sorted(circle))
+
+    for name in sorted(graph):
+        if name not in number:
+            visit(name)
+    return found
+
+
+def rooms(top: str) -> dict[str, set[str]]:
+    """What each room of ``top`` imports of its sister rooms; a module beside them is one itself."""
+    graph: dict[str, set[str]] = {}
+    for name, others in imports().items():
+        if name.startswith(f"{top}."):
+            room = graph.setdefault(name.split(".")[1], set())
+            room |= {each.split(".")[1] for each in others if each.startswith(f"{top}.")}
+    return {room: others - {room} for room, others in graph.items()}
+
+
+def test_circles_are_found() -> None:
+    graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": set[str]()}
+    assert circles(graph) == [["a", "b", "c"]]
+    assert len(modules()) > 100
+    assert "kinematics.compiled.kernel" in imports()["kinematics.contact.lookup"]
+
+
+def test_tools_use_the_daemon_and_both_use_kinematics() -> None:
+    for name, others in imports().items():
+        allowed = ORDER[: ORDER.index(name.split(".")[0]) + 1]
+        wrong = [each for each in others if each.split(".")[0] not in allowed]
+        assert not wrong, f"{name} imports {', '.join(sorted(wrong))}"
+
+
+def test_no_files_import_in_a_circle() -> None:
+    known = [["daemon.gateway.curve", "daemon.gateway.service"]]
+    assert [each for each in circles(imports()) if each not in known] == []
+
+
+def test_no_rooms_of_kinematics_import_in_a_circle() -> None:
+    assert circles(rooms("kinematics")) == []
