@@ -75,7 +75,7 @@ def pack(
     ``cells`` [rows, CELL_PLANES, cols] is what :func:`estimation.cell_integrals.face_integrals`
     gives. ``bent``: the strain's variance is wanted, too. ``places`` takes the cells' rows and
     columns, see :func:`estimation.blurred_cells.spread`, unless it is empty. ``columns``
-    [2, cols + 1], ``lines`` [2, rows + 1], ``strips``, ``queues`` and ``owners`` are scratch, see workspace.py.
+    [2, cols + 1], ``lines`` [2, rows + 1], ``strips``, ``queues`` and ``owners`` are scratch.
     """
     a, x_first, y_first, pitch_x, pitch_y = geometry
     rows, cols = frame.shape

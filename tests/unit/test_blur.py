@@ -16,6 +16,7 @@ from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import (
+from softfinger.kinematics.sensing.blur import 
     PLACE_BITS,
     PLANES,
     spread,
