@@ -15,16 +15,10 @@ from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, Sens
 from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.blurred_cells import (
-from softfinger.kinematics.sensing.blur import 
-    PLACE_BITS,
-    PLANES,
-    spread,
-    stencil,
-    weights,
-)
+from softfinger.kinematics.estimation.blurred_cells import PLACE_BITS, PLANES, spread, weights
 from softfinger.kinematics.estimation.cut_cells import READING, WEIGHT
 from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.blur import stencil
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.called import called
