@@ -73,6 +73,7 @@ POSITION_TRAJECTORY: Final = 140
 PRESENT_INPUT_VOLTAGE: Final = 144
 PRESENT_TEMPERATURE: Final = 146
 BACKUP_READY: Final = 147
+INDIRECT_ADDRESS: Final = 168
 
 # --- units ---------------------------------------------------------------------------------------
 
@@ -186,10 +187,10 @@ class ServoModel:
     def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
         """(first address register, first data register, entries) of each indirect block."""
         if not self.small:
-            return ((168, 224, 28), (578, 634, 28))
+            return ((INDIRECT_ADDRESS, 224, 28), (578, 634, 28))
         if firmware <= 52:
-            return ((168, 208, 20),)
-        return ((168, 224, 28),)
+            return ((INDIRECT_ADDRESS, 208, 20),)
+        return ((INDIRECT_ADDRESS, 224, 28),)
 
     def fast_read(self, firmware: int) -> bool:
         """Whether this firmware answers fast sync read and fast bulk read."""

@@ -14,29 +14,29 @@ from typing import NamedTuple
 
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.crc import crc16
-from softfinger.daemon.simulation.servo_model import protocol
-from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, Parser, frame
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Parser, frame
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME, EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import make_bus
 
 SEEDS = (
-    frame(1, protocol.READ, struct.pack("<HH", 0, 147)),
-    frame(2, protocol.WRITE, struct.pack("<HI", reg.GOAL_POSITION, 9)),
-    frame(1, protocol.WRITE, struct.pack("<HB", reg.OPERATING_MODE, 16)),
-    frame(1, protocol.REG_WRITE, struct.pack("<HB", reg.LED, 1)),
-    frame(2, protocol.ACTION),
-    frame(1, protocol.REBOOT),
-    frame(2, protocol.CLEAR, b"\x01DXL\x22"),
-    frame(1, protocol.BACKUP, b"\x01CTRL"),
-    frame(2, protocol.FACTORY_RESET, b"\x02"),
-    frame(BROADCAST, protocol.PING),
-    frame(BROADCAST, protocol.SYNC_READ, struct.pack("<HHBB", 126, 10, 1, 2)),
-    frame(BROADCAST, protocol.FAST_SYNC_READ, struct.pack("<HHBB", 120, 27, 1, 2)),
-    frame(BROADCAST, protocol.SYNC_WRITE, struct.pack("<HHBBBB", 64, 1, 1, 1, 2, 1)),
-    frame(BROADCAST, protocol.BULK_READ, struct.pack("<BHHBHH", 1, 132, 4, 2, 146, 1)),
-    frame(BROADCAST, protocol.FAST_BULK_READ, struct.pack("<BHHBHH", 1, 132, 4, 2, 146, 1)),
-    frame(BROADCAST, protocol.BULK_WRITE, struct.pack("<BHHIBHHB", 1, 116, 4, 7, 2, 64, 1, 1)),
+    frame(1, framing.READ, struct.pack("<HH", 0, 147)),
+    frame(2, framing.WRITE, struct.pack("<HI", reg.GOAL_POSITION, 9)),
+    frame(1, framing.WRITE, struct.pack("<HB", reg.OPERATING_MODE, 16)),
+    frame(1, framing.REG_WRITE, struct.pack("<HB", reg.LED, 1)),
+    frame(2, framing.ACTION),
+    frame(1, framing.REBOOT),
+    frame(2, framing.CLEAR, b"\x01DXL\x22"),
+    frame(1, framing.BACKUP, b"\x01CTRL"),
+    frame(2, framing.FACTORY_RESET, b"\x02"),
+    frame(BROADCAST, framing.PING),
+    frame(BROADCAST, framing.SYNC_READ, struct.pack("<HHBB", 126, 10, 1, 2)),
+    frame(BROADCAST, framing.FAST_SYNC_READ, struct.pack("<HHBB", 120, 27, 1, 2)),
+    frame(BROADCAST, framing.SYNC_WRITE, struct.pack("<HHBBBB", 64, 1, 1, 1, 2, 1)),
+    frame(BROADCAST, framing.BULK_READ, struct.pack("<BHHBHH", 1, 132, 4, 2, 146, 1)),
+    frame(BROADCAST, framing.FAST_BULK_READ, struct.pack("<BHHBHH", 1, 132, 4, 2, 146, 1)),
+    frame(BROADCAST, framing.BULK_WRITE, struct.pack("<BHHIBHHB", 1, 116, 4, 7, 2, 64, 1, 1)),
 )
 
 
@@ -85,7 +85,7 @@ def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """To a ping, with the others unplugged: by now they may all have one ID."""
     for each in bus.servos:
         each.silent = each is not servo
-    found = Parser().feed(bus.feed(frame(BROADCAST, protocol.PING), t), 0.0)
+    found = Parser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
     return [packet.id for packet in found] == [servo.id]
 
 

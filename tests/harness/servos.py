@@ -65,6 +65,12 @@ def make_bus(
     return ServoBus(servos, plant, **options)
 
 
+def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: Any) -> ServoBus:
+    """The servos of settings with these ``servos``, set up for the hand, on free joints."""
+    settings = Settings.model_validate({"servos": servos or {}})
+    return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
+
+
 class DirectPort(SerialPort):
     """A port whose other end is a bus in this thread: a reply is there at once or never comes.
 
@@ -107,9 +113,7 @@ class RunningBus:
     ) -> None:
         if bus is None:
             now = clock()
-            bus = ServoBus.from_settings(
-                Settings(), FreeJoints(2, now), baud=baud, t=now, **options
-            )
+            bus = hand_bus(t=now, baud=baud, **options)
         self.bus = bus
         self.port = PtyServoBus(bus, baud=baud, clock=clock)
         self._clock = clock
@@ -154,7 +158,7 @@ class RunningBus:
         self._running = False
         os.write(self._wake_write, b"!")
         self._thread.join(timeout=10)
-        self.port.close()
+        self.port.unplug()
         os.close(self._wake_read)
         os.close(self._wake_write)
 

@@ -13,8 +13,8 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
-from softfinger.daemon.simulation.servo_model import protocol
-from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, frame
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.tools.cli import main
 from tests.harness.servos import RADIAN
@@ -37,7 +37,7 @@ class Hand:
     def write(self, servo: int, address: int, form: str, *values: int) -> int:
         """The error of the reply."""
         data = struct.pack("<H" + form, address, *values)
-        return self.bus.feed(frame(servo, protocol.WRITE, data), self.t)[8]
+        return self.bus.feed(frame(servo, framing.WRITE, data), self.t)[8]
 
     def report(self, servo: int) -> dict:
         return next(each for each in self.bus.report(self.t) if each["id"] == servo)
@@ -56,10 +56,10 @@ def test_extremes_of_goals_refused_ones_too() -> None:
     assert left["goals_refused"] == 0
     assert hand.report(2)["goal_q"] is None
     # Beyond the model's range, beyond the configured limit, and with torque stopped.
-    assert hand.write(1, reg.GOAL_CURRENT, "h", 5000) == protocol.DATA_RANGE
+    assert hand.write(1, reg.GOAL_CURRENT, "h", 5000) == framing.DATA_RANGE
     assert hand.report(1)["goal_current"][1] == pytest.approx(5000 * UNIT)
     hand.write(1, reg.CURRENT_LIMIT, "H", 200)
-    assert hand.write(1, reg.GOAL_CURRENT, "h", -300) == protocol.DATA_LIMIT
+    assert hand.write(1, reg.GOAL_CURRENT, "h", -300) == framing.DATA_LIMIT
     assert hand.report(1)["goal_current"][0] == pytest.approx(-300 * UNIT)
     assert hand.report(1)["goals_refused"] == 2
     hand.bus.forget(hand.t)
@@ -74,13 +74,13 @@ def test_goals_through_group_writes_and_indirect_addresses() -> None:
         assert hand.write(servo, reg.INDIRECT_ADDRESS, "6H", *places) == 0
     goal = struct.pack("<hi", 10, 2048 + 30)
     data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
-    hand.bus.feed(frame(BROADCAST, protocol.SYNC_WRITE, data), hand.t)
+    hand.bus.feed(frame(BROADCAST, framing.SYNC_WRITE, data), hand.t)
     assert hand.report(1)["goal_q"] == pytest.approx([30 * RADIAN] * 2)
     assert hand.report(2)["goal_q"] == pytest.approx([-30 * RADIAN] * 2)  # the right one's sense
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
     # A registered write is on the wire before its action.
     kept = struct.pack("<Hi", reg.GOAL_POSITION, 2048 + 90)
-    hand.bus.feed(frame(1, protocol.REG_WRITE, kept), hand.t)
+    hand.bus.feed(frame(1, framing.REG_WRITE, kept), hand.t)
     assert hand.report(1)["goal_q"][1] == pytest.approx(90 * RADIAN)
 
 
@@ -112,7 +112,7 @@ def test_silence_and_the_watchdog() -> None:
     hand.write(1, reg.TORQUE_ENABLE, "B", 1)
     hand.write(1, reg.BUS_WATCHDOG, "B", 5)
     hand.later(0.04)
-    hand.bus.feed(frame(2, protocol.PING), hand.t)
+    hand.bus.feed(frame(2, framing.PING), hand.t)
     hand.later(0.03)
     state = hand.report(1)
     assert state["quiet"] == pytest.approx(0.03)

@@ -117,7 +117,7 @@ def test_boards_are_listened_to(emulated, capsys):
     for side in ("left", "right"):
         # On a busy machine they may be told as slow, which is no failure.
         assert [line for line in lines if f" tactile {side}: 32 × 32 cells, " in line]
-    hand.emulator.tell("left:wrong-size")
+    hand.emulator.request("left:wrong-size")
     status, lines = hand.doctor(capsys)
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
@@ -126,7 +126,7 @@ def test_boards_are_listened_to(emulated, capsys):
 
 def test_a_missing_port_and_a_missing_servo(emulated, capsys):
     hand = emulated()
-    hand.emulator.tell("silent=2 right:unplug")
+    hand.emulator.request("silent=2 right:unplug")
     status, lines = hand.doctor(capsys)
     assert status == 1
     failed = with_status(lines, "FAIL")

@@ -32,7 +32,7 @@ from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
-from tests.harness.servos import RADIAN, RunningBus, make_bus
+from tests.harness.servos import RADIAN, RunningBus, hand_bus, make_bus
 
 # The bus shares this process's interpreter lock, so replies need longer than on a wire.
 PATIENCE = 1.0
@@ -43,9 +43,8 @@ def profile(path: str, **servos: Any) -> Settings:
     return Settings.model_validate({"servos": values})
 
 
-def hand_bus(**options: Any) -> ServoBus:
-    now = time.monotonic()
-    return ServoBus.from_settings(Settings(), FreeJoints(2, now), t=now, **options)
+def present_bus(model: str = "XM430-W350", **options: Any) -> ServoBus:
+    return hand_bus(time.monotonic(), {"model": model}, **options)
 
 
 @pytest.fixture
@@ -115,7 +114,7 @@ def test_connect_changes_nothing_and_stiffens_nothing(bus: RunningBus) -> None:
 def test_everything_wrong_is_told_at_once_with_what_mends_it(
     running: Callable[..., RunningBus],
 ) -> None:
-    bus = running(hand_bus(prepared=False))
+    bus = running(present_bus(prepared=False))
     bus.fault("overload=2")
     text = refusal(bus)
     lines = text.splitlines()
@@ -192,12 +191,12 @@ def test_a_second_daemon_gets_a_clear_error_and_disturbs_nothing(bus: RunningBus
 
 
 def test_another_model_than_configured(running: Callable[..., RunningBus]) -> None:
-    bus = running(hand_bus(model="XM430-W210"))
+    bus = running(present_bus(model="XM430-W210"))
     assert refusal(bus).count("is an XM430-W210, not an XM430-W350: set servos.model") == 2
 
 
 def test_a_model_without_current_control(running: Callable[..., RunningBus]) -> None:
-    bus = running(hand_bus(model="XL430-W250"))
+    bus = running(present_bus(model="XL430-W250"))
     assert refusal(bus, model="XL430-W250").count("no current-based position mode") == 2
 
 
@@ -371,7 +370,7 @@ def test_torque_is_refused_where_the_joint_can_not_be(bus: RunningBus) -> None:
 def test_the_joints_go_where_they_are_told(
     running: Callable[..., RunningBus], model: str, level: int
 ) -> None:
-    bus = running(hand_bus(model=model))
+    bus = running(present_bus(model=model))
     bus.call(lambda: [s.table.set(reg.STATUS_RETURN_LEVEL, level) for s in bus.bus.servos])
     limit = by_name(model).stall_current
     settings = profile(bus.path, model=model).model_copy(

@@ -87,7 +87,7 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with Process("--dir", folder) as process:
         process.ready()
         yield folder
-        assert process.end() == (0, "", "")
+        assert process.end()[:2] == (0, "")  # kernels that were compiled are told beside it
 
 
 @contextlib.contextmanager
@@ -607,5 +607,5 @@ def test_an_adapters_latency_timer_has_its_range(tmp_path, capsys):
 def test_an_object_that_slipped_away_is_put_back(tmp_path: Path) -> None:
     with thread(tmp_path) as made:
         made.hand.object_pose[:] = 0.07, 0.02, 1.2
-        assert made.tell("place report").startswith("{")
+        assert made.request("place report").startswith("{")
         until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))

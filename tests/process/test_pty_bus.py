@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 import serial
 
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.pty_bus import PASSAGE, PtyServoBus
-from softfinger.daemon.simulation.servo_model import protocol
-from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, frame
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import make_bus
 
-PING = frame(1, protocol.PING)
+PING = frame(1, framing.PING)
 PONG = 14
 
 
@@ -55,7 +56,7 @@ class Wire:
 
     def close(self) -> None:
         self.client.close()
-        self.port.close()
+        self.port.unplug()
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_replies_take_the_wires_time_and_the_return_delay(wires: list[Wire]) -> 
 
 def test_replies_of_a_group_follow_each_other(wires: list[Wire]) -> None:
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
-    wire.send(frame(BROADCAST, protocol.PING))
+    wire.send(frame(BROADCAST, framing.PING))
     byte = 10 / 57600
     first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
     assert len(wire.when(first + 1e-5)) == PONG
@@ -88,7 +89,7 @@ def test_replies_of_a_group_follow_each_other(wires: list[Wire]) -> None:
 
 def test_the_wire_carries_one_thing_at_a_time(wires: list[Wire]) -> None:
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
-    write = frame(BROADCAST, protocol.WRITE, b"\x41\x00\x01")
+    write = frame(BROADCAST, framing.WRITE, b"\x41\x00\x01")
     wire.send(write)
     wire.send(PING)
     due = (len(write) + len(PING) + PONG) * 10 / 57600 + 500e-6 - 2 * PASSAGE
@@ -145,26 +146,17 @@ def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires: list[Wire
 
 def test_a_client_that_never_reads_does_not_hold_the_bus_up(wires: list[Wire]) -> None:
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
-    request = frame(1, protocol.READ, b"\x00\x00\x93\x00")
+    request = frame(1, framing.READ, b"\x00\x00\x93\x00")
     for _ in range(400):  # far more than a terminal holds
         wire.send(request)
     assert wire.port.bus.packets == 400
 
 
-def test_the_link_is_made_replaced_and_taken_away(tmp_path: Path) -> None:
-    link = tmp_path / "servos"
-    link.symlink_to("/dev/pts/stale")
-    port = PtyServoBus(make_bus(), link)
-    assert port.path == str(link)
-    assert link.resolve().exists()
-    port.unplug()
-    assert port.fileno() == -1
-    assert not link.is_symlink()
-    port.service(1.0)  # the servos go on
-    port.plug()
-    assert link.is_symlink()
-    other = PtyServoBus(make_bus(), link)
-    port.close()
-    assert link.is_symlink()  # it belongs to the other one now
-    other.close()
-    assert not link.is_symlink()
+def test_the_terminal_goes_and_comes_back_and_the_servos_go_on(wires: list[Wire]) -> None:
+    wires.append(wire := Wire(make_bus(), 0, spin=0.0))
+    wire.port.unplug()
+    assert (wire.port.plugged, wire.port.fileno()) == (False, -1)
+    wire.port.service(2.0)
+    assert wire.port.bus.servos[0].read(reg.REALTIME_TICK, 2, 2.0) == b"\xd0\x07"
+    wire.port.plug()
+    assert Path(wire.port.path).is_char_device()

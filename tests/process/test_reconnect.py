@@ -74,11 +74,11 @@ class Rig:
         return [servo.table.memory[reg.TORQUE_ENABLE] for servo in bus.servos]
 
     def unplug(self) -> None:
-        assert self.emulator.tell("unplug") == "ok"
+        assert self.emulator.request("unplug") == "ok"
         until(lambda: self.emulator._servos.fileno() < 0)
 
     def plug(self) -> None:
-        assert self.emulator.tell("plug") == "ok"
+        assert self.emulator.request("plug") == "ok"
         until(Path(self.settings.servos.port).exists)
 
     def close(self) -> None:
@@ -121,7 +121,7 @@ def test_an_unplugged_bus_comes_back_on_command_and_limp(rig: Rig) -> None:
 
 def test_clear_of_another_fault_leaves_the_port_alone(rig: Rig) -> None:
     rig.does("arm")
-    assert rig.emulator.tell("overload=1") == "ok"
+    assert rig.emulator.request("overload=1") == "ok"
     rig.until(lambda: rig.loop.state.mode == "fault")
     rig.refuses("clear", "hardware error reported by left")
     assert ("info", "servos", "connected anew") not in rig.events
@@ -145,13 +145,13 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path: Path) -> None:
         loop, left = rig.loop, rig.loop.perception.fingers[0].sensor
         rig.does("arm")
         rig.does("grasp")
-        assert rig.emulator.tell("left:unplug") == "ok"
+        assert rig.emulator.request("left:unplug") == "ok"
         until(lambda: left.counters()["port_lost"] == 1)
         rig.until(lambda: loop.state.mode == "fault")
         assert loop.state.fault_name == "tactile.silent"
         for _ in range(2):  # a try that failed is no last one
             rig.refuses("clear", "no such port")
-        assert rig.emulator.tell("left:plug") == "ok"
+        assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
         assert rig.does("clear")["mode"] == "disarmed"
         assert ("info", "tactile", "left sensor opened anew") in rig.events
@@ -159,13 +159,13 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path: Path) -> None:
         rig.until(lambda: loop.state.contacts[0].seq > seq and loop.state.contacts[0].valid)
 
         # While nothing grips its loss is no fault: there is nothing to clear.
-        assert rig.emulator.tell("left:unplug") == "ok"
+        assert rig.emulator.request("left:unplug") == "ok"
         until(lambda: left.counters()["port_lost"] == 1)
         rig.does("arm")
         assert rig.events[-1][:2] != ("info", "tactile")
         assert any("no such port" in text for level, _, text in rig.events if level == "warning")
         rig.does("disarm")
-        assert rig.emulator.tell("left:plug") == "ok"
+        assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
         rig.does("arm")
         rig.does("grasp")

@@ -13,14 +13,14 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import MODELS, by_name
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
-from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
-from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, Parser, frame
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Parser, frame
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.simulation.servo_model.servo_health import OVERLOAD_TIME
 from tests.fuzz.servo_bus import fuzz
-from tests.harness.servos import RADIAN, make_bus
+from tests.harness.servos import RADIAN, hand_bus, make_bus
 
 FORMS = {1: "<B", 2: "<H", 4: "<I"}
 
@@ -41,18 +41,18 @@ class Client:
         """(error byte, data) of the one reply."""
         (packet,) = Parser().feed(self.send(packet_id, instruction, parameters), 0.0)
         assert packet.valid
-        assert packet.instruction == protocol.STATUS
+        assert packet.instruction == framing.STATUS
         return packet.parameters[0], packet.parameters[1:]
 
     def read(self, address: int, size: int, packet_id: int = 1) -> int:
-        error, data = self.ask(protocol.READ, struct.pack("<HH", address, size), packet_id)
+        error, data = self.ask(framing.READ, struct.pack("<HH", address, size), packet_id)
         assert error & 0x7F == 0, f"error {error}"
         return int.from_bytes(data, "little", signed=True)
 
     def write(self, address: int, value: int, size: int, packet_id: int = 1) -> int:
         """The error byte."""
         data = address.to_bytes(2, "little") + value.to_bytes(size, "little", signed=value < 0)
-        return self.ask(protocol.WRITE, data, packet_id)[0]
+        return self.ask(framing.WRITE, data, packet_id)[0]
 
     def later(self, seconds: float) -> None:
         self.t += seconds
@@ -152,7 +152,7 @@ def test_published_fast_bulk_read() -> None:
     pwm = bus.servos[1]
     pwm.table.set(reg.TORQUE_ENABLE, 1)
     bus.plant.current[1] = 421 / 885 * pwm.model.stall_current
-    request = frame(BROADCAST, protocol.FAST_BULK_READ, hexes("0384000400077C0002000492000100"))
+    request = frame(BROADCAST, framing.FAST_BULK_READ, hexes("0384000400077C0002000492000100"))
     assert bus.feed(request, 0.0) == hexes(
         "FFFFFD00FE1400 55 00 03 A6000000 67A4", "00 07 A501 2474", "00 04 1F D9C1"
     )
@@ -168,9 +168,9 @@ def test_status_return_level(level: int, answers: tuple[bool, bool, bool]) -> No
     c = client()
     c.write(reg.STATUS_RETURN_LEVEL, level, 1)
     replies = (
-        c.send(1, protocol.PING),
-        c.send(1, protocol.READ, struct.pack("<HH", reg.ID, 1)),
-        c.send(1, protocol.WRITE, struct.pack("<HB", reg.LED, 1)),
+        c.send(1, framing.PING),
+        c.send(1, framing.READ, struct.pack("<HH", reg.ID, 1)),
+        c.send(1, framing.WRITE, struct.pack("<HB", reg.LED, 1)),
     )
     assert tuple(bool(reply) for reply in replies) == answers
     assert c.bus.servos[0].table.get(reg.LED) == 1
@@ -179,29 +179,29 @@ def test_status_return_level(level: int, answers: tuple[bool, bool, bool]) -> No
 def test_a_shadow_id_obeys_and_never_answers() -> None:
     c = client()
     assert c.write(reg.SHADOW_ID, 9, 1, packet_id=2) == 0
-    assert c.send(9, protocol.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
-    assert c.send(9, protocol.PING) == b""
+    assert c.send(9, framing.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
+    assert c.send(9, framing.PING) == b""
     assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [0, 1]
 
 
 def test_a_new_id_takes_effect_after_the_reply_under_the_old_one() -> None:
     c = client()
     assert c.write(reg.ID, 40, 1) == 0
-    assert c.send(1, protocol.PING) == b""
-    assert c.ask(protocol.PING, packet_id=40)[0] == 0
+    assert c.send(1, framing.PING) == b""
+    assert c.ask(framing.PING, packet_id=40)[0] == 0
 
 
 def test_broadcast_reads_and_writes_are_not_answered() -> None:
     c = client()
-    assert c.send(BROADCAST, protocol.READ, struct.pack("<HH", 132, 4)) == b""
-    assert c.send(BROADCAST, protocol.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
+    assert c.send(BROADCAST, framing.READ, struct.pack("<HH", 132, 4)) == b""
+    assert c.send(BROADCAST, framing.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
     assert all(servo.table.get(reg.LED) for servo in c.bus.servos)
 
 
 def test_a_missing_servo_silences_those_named_after_it() -> None:
     c = client(ids=(1, 2, 3))
     packets = Parser().feed(
-        c.send(BROADCAST, protocol.SYNC_READ, struct.pack("<HH", 132, 4) + bytes((1, 9, 3))), 0.0
+        c.send(BROADCAST, framing.SYNC_READ, struct.pack("<HH", 132, 4) + bytes((1, 9, 3))), 0.0
     )
     assert [packet.id for packet in packets] == [1]
 
@@ -209,10 +209,10 @@ def test_a_missing_servo_silences_those_named_after_it() -> None:
 def test_an_old_firmware_does_not_know_fast_reads() -> None:
     request = struct.pack("<HHBB", 132, 4, 1, 2)
     old = client(model="XL330-M288", firmware=45)
-    assert old.send(BROADCAST, protocol.FAST_SYNC_READ, request) == b""
-    assert len(old.send(BROADCAST, protocol.SYNC_READ, request)) == 2 * 15
+    assert old.send(BROADCAST, framing.FAST_SYNC_READ, request) == b""
+    assert len(old.send(BROADCAST, framing.SYNC_READ, request)) == 2 * 15
     new = client(model="XL330-M288", firmware=46)
-    assert len(new.send(BROADCAST, protocol.FAST_SYNC_READ, request)) == 8 + 2 * 8
+    assert len(new.send(BROADCAST, framing.FAST_SYNC_READ, request)) == 8 + 2 * 8
 
 
 def test_fast_sync_read_is_not_stuffed() -> None:
@@ -220,20 +220,19 @@ def test_fast_sync_read_is_not_stuffed() -> None:
     for servo in c.bus.servos:
         servo.table.memory[reg.GOAL_CURRENT : reg.GOAL_CURRENT + 6] = hexes("FFFFFDFFFFFF")
     span = struct.pack("<HHB", reg.GOAL_CURRENT, 6, 1)
-    assert c.send(BROADCAST, protocol.FAST_SYNC_READ, span)[8:-2] == hexes("0001 FFFFFDFFFFFF")
-    assert c.send(BROADCAST, protocol.SYNC_READ, span)[8:-2] == hexes("00 FFFFFDFDFFFFFF")
+    assert c.send(BROADCAST, framing.FAST_SYNC_READ, span)[8:-2] == hexes("0001 FFFFFDFFFFFF")
+    assert c.send(BROADCAST, framing.SYNC_READ, span)[8:-2] == hexes("00 FFFFFDFDFFFFFF")
 
 
-def test_a_damaged_packet_is_met_with_silence_or_with_an_error() -> None:
-    damaged = bytearray(frame(1, protocol.READ, struct.pack("<HH", 132, 4)))
+def test_a_damaged_packet_is_met_with_silence() -> None:
+    damaged = bytearray(frame(1, framing.READ, struct.pack("<HH", 132, 4)))
     damaged[-1] ^= 1
     assert make_bus().feed(bytes(damaged), 0.0) == b""
-    assert make_bus(crc_reply=True).feed(bytes(damaged), 0.0) == protocol.status(1, 3)
 
 
 def test_servos_at_another_rate_hear_nothing() -> None:
     c = client()
-    ping = frame(BROADCAST, protocol.PING)
+    ping = frame(BROADCAST, framing.PING)
     assert c.bus.feed(ping, c.t, baud=1_000_000) == b""
     assert len(c.bus.feed(ping, c.t, baud=57600)) == 28
     assert c.write(reg.BAUD_RATE, 3, 1, packet_id=2) == 0
@@ -247,25 +246,25 @@ def test_servos_at_another_rate_hear_nothing() -> None:
 @pytest.mark.parametrize(
     ("address", "value", "size", "error"),
     [
-        (reg.MODEL_NUMBER, 1, 2, protocol.ACCESS),
-        (reg.PRESENT_POSITION, 1, 4, protocol.ACCESS),
-        (14, 1, 1, protocol.ACCESS),  # no such register
-        (reg.GOAL_POSITION + 1, 1, 1, protocol.ACCESS),  # within a register
-        (reg.GOAL_POSITION, 1, 2, protocol.DATA_LENGTH),
-        (reg.TORQUE_ENABLE, 2, 1, protocol.DATA_RANGE),
-        (reg.BAUD_RATE, 8, 1, protocol.DATA_RANGE),
-        (reg.OPERATING_MODE, 2, 1, protocol.DATA_RANGE),
-        (reg.ID, 253, 1, protocol.DATA_RANGE),
-        (reg.GOAL_POSITION, 4096, 4, protocol.DATA_LIMIT),
-        (reg.GOAL_POSITION, -1, 4, protocol.DATA_LIMIT),
-        (reg.GOAL_VELOCITY, 331, 4, protocol.DATA_LIMIT),
-        (reg.GOAL_VELOCITY, -330, 4, protocol.OK),
-        (reg.GOAL_CURRENT, -1193, 2, protocol.OK),
-        (reg.GOAL_CURRENT, 1194, 2, protocol.DATA_RANGE),
-        (reg.MIN_POSITION_LIMIT, 4095, 4, protocol.OK),
-        (reg.LED, 1, 1, protocol.OK),
-        (660, 7, 1, protocol.OK),  # indirect data of the second block
-        (661, 0, 2, protocol.ACCESS),  # past the end
+        (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
+        (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
+        (14, 1, 1, framing.ACCESS),  # no such register
+        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # within a register
+        (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
+        (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
+        (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
+        (reg.OPERATING_MODE, 2, 1, framing.DATA_RANGE),
+        (reg.ID, 253, 1, framing.DATA_RANGE),
+        (reg.GOAL_POSITION, 4096, 4, framing.DATA_LIMIT),
+        (reg.GOAL_POSITION, -1, 4, framing.DATA_LIMIT),
+        (reg.GOAL_VELOCITY, 331, 4, framing.DATA_LIMIT),
+        (reg.GOAL_VELOCITY, -330, 4, framing.OK),
+        (reg.GOAL_CURRENT, -1193, 2, framing.OK),
+        (reg.GOAL_CURRENT, 1194, 2, framing.DATA_RANGE),
+        (reg.MIN_POSITION_LIMIT, 4095, 4, framing.OK),
+        (reg.LED, 1, 1, framing.OK),
+        (660, 7, 1, framing.OK),  # indirect data of the second block
+        (661, 0, 2, framing.ACCESS),  # past the end
     ],
 )
 def test_what_a_write_is_answered(address: int, value: int, size: int, error: int) -> None:
@@ -279,36 +278,36 @@ def test_what_a_write_is_answered(address: int, value: int, size: int, error: in
 def test_configured_limits_bind() -> None:
     c = client()
     assert c.write(reg.CURRENT_LIMIT, 500, 2) == 0
-    assert c.write(reg.GOAL_CURRENT, 501, 2) == protocol.DATA_LIMIT
+    assert c.write(reg.GOAL_CURRENT, 501, 2) == framing.DATA_LIMIT
     assert c.write(reg.MAX_POSITION_LIMIT, 3000, 4) == 0
-    assert c.write(reg.GOAL_POSITION, 3001, 4) == protocol.DATA_LIMIT
-    assert c.write(reg.MIN_POSITION_LIMIT, 3001, 4) == protocol.DATA_LIMIT
+    assert c.write(reg.GOAL_POSITION, 3001, 4) == framing.DATA_LIMIT
+    assert c.write(reg.MIN_POSITION_LIMIT, 3001, 4) == framing.DATA_LIMIT
 
 
 def test_eeprom_is_locked_while_torque_is_on() -> None:
     c = client()
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
-    assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == protocol.ACCESS
+    assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == framing.ACCESS
     assert c.write(reg.TORQUE_ENABLE, 0, 1) == 0
     assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == 0
 
 
 def test_reading_past_the_table_and_reading_gaps() -> None:
     c = client()
-    assert c.ask(protocol.READ, struct.pack("<HH", 660, 3))[0] == protocol.ACCESS
-    assert c.ask(protocol.READ, struct.pack("<HH", 14, 6)) == (0, bytes(6))
+    assert c.ask(framing.READ, struct.pack("<HH", 660, 3))[0] == framing.ACCESS
+    assert c.ask(framing.READ, struct.pack("<HH", 14, 6)) == (0, bytes(6))
 
 
 def test_unknown_instruction_and_action_without_one() -> None:
     c = client()
-    assert c.ask(0x77)[0] == protocol.INSTRUCTION_ERROR
-    assert c.ask(protocol.ACTION)[0] == protocol.INSTRUCTION_ERROR
+    assert c.ask(0x77)[0] == framing.INSTRUCTION_ERROR
+    assert c.ask(framing.ACTION)[0] == framing.INSTRUCTION_ERROR
 
 
 def test_a_model_without_current_sensing_has_no_current_registers() -> None:
     c = client(model="XL430-W250")
-    assert c.write(reg.GOAL_CURRENT, 1, 2) == protocol.ACCESS
-    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == protocol.DATA_RANGE
+    assert c.write(reg.GOAL_CURRENT, 1, 2) == framing.ACCESS
+    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == framing.DATA_RANGE
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -338,9 +337,9 @@ def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -
         assert c.write(address + 2 * i, target, 2) == 0
     assert c.write(data, 1, 1) == 0
     assert c.bus.servos[0].table.get(reg.LED) == 1
-    assert c.ask(protocol.READ, struct.pack("<HH", data, 5)) == (0, hexes("01 A6000000"))
-    assert c.write(data + 1, 5, 4) == protocol.ACCESS  # present position is read-only
-    assert c.write(address, 20, 2) == protocol.DATA_RANGE  # EEPROM can't be pointed to
+    assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, hexes("01 A6000000"))
+    assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
+    assert c.write(address, 20, 2) == framing.DATA_RANGE  # EEPROM can't be pointed to
 
 
 # --- torque, modes, motion ---------------------------------------------------------------------
@@ -451,7 +450,7 @@ def test_turns_are_kept_until_position_mode_or_clear() -> None:
     c = client(prepared=True)
     c.bus.plant.q[0] = 5000 * RADIAN
     assert c.read(reg.PRESENT_POSITION, 4) == 5000
-    assert c.ask(protocol.CLEAR, b"\x01DXL\x22")[0] == 0
+    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == 0
     assert c.read(reg.PRESENT_POSITION, 4) == 904
     c.bus.plant.q[0] = 9000 * RADIAN
     assert c.read(reg.PRESENT_POSITION, 4) == 4904
@@ -462,7 +461,7 @@ def test_turns_are_kept_until_position_mode_or_clear() -> None:
 def test_clear_fails_while_the_shaft_moves() -> None:
     c = client()
     c.bus.plant.dq[0] = 3.0
-    assert c.ask(protocol.CLEAR, b"\x01DXL\x22")[0] == protocol.RESULT_FAIL
+    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == framing.RESULT_FAIL
 
 
 def test_homing_offset_and_reverse_mode() -> None:
@@ -500,8 +499,8 @@ def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
     stood = c.read(reg.PRESENT_POSITION, 4)
     assert c.bus.plant.dq[0] == 0.0
     assert c.read(reg.TORQUE_ENABLE, 1) == 1
-    assert c.write(reg.GOAL_POSITION, 10, 4) == protocol.DATA_RANGE
-    assert c.write(reg.BUS_WATCHDOG, 5, 1) == protocol.DATA_RANGE
+    assert c.write(reg.GOAL_POSITION, 10, 4) == framing.DATA_RANGE
+    assert c.write(reg.BUS_WATCHDOG, 5, 1) == framing.DATA_RANGE
     assert c.write(reg.BUS_WATCHDOG, 0, 1) == 0
     assert c.write(reg.GOAL_POSITION, stood + 10, 4) == 0
 
@@ -524,14 +523,14 @@ def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.bus.fault(fault, c.t)
     c.later(0.02)
-    error, data = c.ask(protocol.READ, struct.pack("<HH", reg.HARDWARE_ERROR_STATUS, 1))
-    assert error == protocol.ALERT
+    error, data = c.ask(framing.READ, struct.pack("<HH", reg.HARDWARE_ERROR_STATUS, 1))
+    assert error == framing.ALERT
     assert data[0] == 1 << bit
     assert c.bus.servos[0].torque_on is False
-    assert c.write(reg.TORQUE_ENABLE, 1, 1) == protocol.ALERT | protocol.RESULT_FAIL
+    assert c.write(reg.TORQUE_ENABLE, 1, 1) == framing.ALERT | framing.RESULT_FAIL
     c.bus.fault("recover=1", c.t)
-    assert c.ask(protocol.REBOOT)[0] == protocol.ALERT
-    assert c.send(1, protocol.PING) == b""
+    assert c.ask(framing.REBOOT)[0] == framing.ALERT
+    assert c.send(1, framing.PING) == b""
     c.later(REBOOT_TIME)
     assert c.read(reg.HARDWARE_ERROR_STATUS, 1) == 0
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
@@ -542,7 +541,7 @@ def test_an_error_outside_the_shutdown_mask_only_alerts() -> None:
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.bus.fault("undervoltage=1", c.t)
     c.later(0.02)
-    assert c.write(reg.LED, 1, 1) == protocol.ALERT
+    assert c.write(reg.LED, 1, 1) == framing.ALERT
     assert c.bus.servos[0].torque_on is True
 
 
@@ -571,9 +570,9 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
         (reg.TORQUE_ENABLE, 1, 1),
     ):
         assert c.write(address, value, size) == 0
-    c.ask(protocol.REBOOT)
+    c.ask(framing.REBOOT)
     c.later(REBOOT_TIME - 0.01)
-    assert c.send(1, protocol.PING) == b""
+    assert c.send(1, framing.PING) == b""
     c.later(0.01)
     assert c.read(reg.RETURN_DELAY_TIME, 1) == 3
     assert (
@@ -589,7 +588,7 @@ def test_factory_reset(option: int, new_id: int, baud: int) -> None:
     c = client(ids=(5, 6))
     c.write(reg.BAUD_RATE, 3, 1, packet_id=5)
     c.write(reg.RETURN_DELAY_TIME, 3, 1, packet_id=5)
-    assert c.ask(protocol.FACTORY_RESET, bytes((option,)), packet_id=5)[0] == 0
+    assert c.ask(framing.FACTORY_RESET, bytes((option,)), packet_id=5)[0] == 0
     c.later(REBOOT_TIME)
     assert c.read(reg.BAUD_RATE, 1, packet_id=new_id) == baud
     assert c.read(reg.RETURN_DELAY_TIME, 1, packet_id=new_id) & 0xFF == 250
@@ -597,27 +596,27 @@ def test_factory_reset(option: int, new_id: int, baud: int) -> None:
 
 def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
     c = client(ids=(5, 6))
-    assert c.send(BROADCAST, protocol.FACTORY_RESET, b"\xff") == b""
-    assert c.ask(protocol.PING, packet_id=5)[0] == 0
-    assert c.ask(protocol.FACTORY_RESET, b"\x07", packet_id=5)[0] == protocol.DATA_RANGE
+    assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
+    assert c.ask(framing.PING, packet_id=5)[0] == 0
+    assert c.ask(framing.FACTORY_RESET, b"\x07", packet_id=5)[0] == framing.DATA_RANGE
 
 
 def test_backup_and_restore() -> None:
     c = client()
     store, restore = b"\x01CTRL", b"\x02CTRL"
-    assert c.ask(protocol.BACKUP, restore)[0] == protocol.RESULT_FAIL  # nothing stored yet
+    assert c.ask(framing.BACKUP, restore)[0] == framing.RESULT_FAIL  # nothing stored yet
     c.write(reg.RETURN_DELAY_TIME, 11, 1)
     c.write(reg.STARTUP_CONFIGURATION, 2, 1)
     c.write(reg.POSITION_P_GAIN, 321, 2)
-    assert c.ask(protocol.BACKUP, store)[0] == 0
+    assert c.ask(framing.BACKUP, store)[0] == 0
     assert c.read(reg.BACKUP_READY, 1) == 1
     c.write(reg.RETURN_DELAY_TIME, 99, 1)
-    assert c.ask(protocol.BACKUP, restore)[0] == 0
+    assert c.ask(framing.BACKUP, restore)[0] == 0
     c.later(REBOOT_TIME)
     assert c.read(reg.RETURN_DELAY_TIME, 1) == 11
     assert c.read(reg.POSITION_P_GAIN, 2) == 321  # RAM too, as the startup configuration asks
     c.write(reg.TORQUE_ENABLE, 1, 1)
-    assert c.ask(protocol.BACKUP, store)[0] == protocol.RESULT_FAIL
+    assert c.ask(framing.BACKUP, store)[0] == framing.RESULT_FAIL
 
 
 # --- faults on demand --------------------------------------------------------------------------
@@ -627,10 +626,10 @@ def test_reply_faults_do_what_they_say_and_are_seeded() -> None:
     def replies(fault: str) -> list[bytes]:
         bus = make_bus()
         bus.fault(fault, 0.0)
-        ping = frame(1, protocol.PING)
+        ping = frame(1, framing.PING)
         return [bus.feed(ping, 0.001 * i) for i in range(400)]
 
-    whole = make_bus().feed(frame(1, protocol.PING), 0.0)
+    whole = make_bus().feed(frame(1, framing.PING), 0.0)
     dropped = replies("drop=0.25")
     assert 60 < dropped.count(b"") < 140
     assert set(dropped) == {b"", whole}
@@ -642,16 +641,16 @@ def test_reply_faults_do_what_they_say_and_are_seeded() -> None:
     assert replies("drop=0.25") == dropped
     late = make_bus()
     late.fault("late=1", 0.0)
-    assert late.exchange(frame(1, protocol.PING), 0.0)[0].late > 0.0
+    assert late.exchange(frame(1, framing.PING), 0.0)[0].late > 0.0
 
 
 def test_a_silent_servo_comes_back() -> None:
     c = client()
     c.bus.fault("silent=2", c.t)
-    assert c.send(2, protocol.PING) == b""
-    assert c.send(1, protocol.PING) != b""
+    assert c.send(2, framing.PING) == b""
+    assert c.send(1, framing.PING) != b""
     c.bus.fault("answer=2", c.t)
-    assert c.send(2, protocol.PING) != b""
+    assert c.send(2, framing.PING) != b""
 
 
 @pytest.mark.parametrize("text", ["drop", "drop=2", "drop=x", "melt=1", "silent=7", "reboot=1.5"])
@@ -673,7 +672,7 @@ def test_directions_and_zeros_of_the_settings() -> None:
     assert c.read(reg.PRESENT_POSITION, 4, 2) == 2048 - turn
     assert c.read(reg.OPERATING_MODE, 1, 2) == reg.CURRENT_BASED_POSITION_MODE
     with pytest.raises(ValueError, match="no 4500000 baud"):
-        ServoBus.from_settings(Settings(), plant, model="XL330-M288", baud=4_500_000)
+        hand_bus(servos={"model": "XL330-M288"}, baud=4_500_000)
 
 
 def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
@@ -684,7 +683,7 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
         for i in range(200):
             c.write(reg.GOAL_POSITION, 300 + i % 7, 4)
             c.later(0.002)
-            out += c.send(BROADCAST, protocol.FAST_SYNC_READ, struct.pack("<HHBB", 120, 27, 1, 2))
+            out += c.send(BROADCAST, framing.FAST_SYNC_READ, struct.pack("<HHBB", 120, 27, 1, 2))
         return out, np.array(c.bus.plant.q).tobytes()
 
     assert run() == run()
@@ -717,11 +716,11 @@ def test_any_packets_are_survived_and_answered_in_form(
     bus = make_bus()
     for step, content in enumerate(packets):
         reply = bus.feed(frame(*content), step * 0.02)
-        if content[1] not in (protocol.FAST_SYNC_READ, protocol.FAST_BULK_READ):
+        if content[1] not in (framing.FAST_SYNC_READ, framing.FAST_BULK_READ):
             parser = Parser()
             found = parser.feed(reply, 0.0)
             assert sum(packet.size for packet in found) == len(reply)
-            assert all(p.valid and p.instruction == protocol.STATUS for p in found)
+            assert all(p.valid and p.instruction == framing.STATUS for p in found)
 
 
 def test_thousands_of_mutated_packets_neither_crash_nor_hang() -> None:

@@ -1,8 +1,8 @@
-"""The stand-in hand's process: physics in real time, behind servos and tactile boards on ptys.
+"""The emulated hand: physics in real time, behind servos and tactile boards on ptys.
 
 One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
 due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
-before it looks for bytes again. Here live that loop and its time.
+before it looks for bytes again.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from softfinger.daemon.tactile.simulated import SimulatedTactile
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, longest that the physics lags behind
-_ASKS = ("report", "forget", "place")  # words to the control socket that are no fault
+_REQUESTS = ("report", "forget", "place")  # words to the control socket that are no fault
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
-# The board that stands in where a profile names none: that of config/hil.toml.
+# The board where a profile names none: that of config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
     "rows": 32,
@@ -48,11 +48,11 @@ DEFAULT_BOARD = {
 
 
 class EmulatorError(SoftfingerError):
-    """The stand-in hand can't be set up. The message says why, and what mends it."""
+    """The emulated hand can't be set up. The message says why, and how to fix it."""
 
 
 class EmulatorClock:
-    """Time of the stand-in hand: real time from 0, less the interruptions of its process.
+    """Time of the emulated hand: real time from 0, less the interruptions of its process.
 
     Without that a process that was stopped for a minute would have to compute that minute, and
     would answer nobody meanwhile.
@@ -80,7 +80,7 @@ class EmulatorClock:
 
 
 class Emulator:
-    """A stand-in hand on ptys, linked in ``folder``; :meth:`run` keeps it alive.
+    """An emulated hand on ptys, linked in ``folder``; :meth:`run` keeps it alive.
 
     The scene of ``settings`` says what there is: a finger that is absent has no board, and servos
     or tactile backends of ``none`` have no port.
@@ -105,8 +105,8 @@ class Emulator:
         with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
         rate. ``ids``: others than the settings', even one for both. ``faults``: see
         :class:`Faults`. ``table_cache``: a folder where the contact table is kept.
-        ``undisturbed``: what keeps exceptions of signal handlers out while something is made that
-        is to be taken away.
+        ``undisturbed``: a context without exceptions of signal handlers, for making what has to
+        be removed again.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
@@ -115,12 +115,28 @@ class Emulator:
         self._stopping = False
         self._undisturbed = undisturbed
         self._watched: list[int | TactileBoard | socket.socket] | None = None
+        self._servos: PtyServoBus | None = None
+        self._boards: dict[str, TactileBoard] = {}
+        self._sources: list[SimulatedTactile] = []
+        self._advance_due = 0.0
         try:
             self._ids = settings.servos.ids if ids is None else ids
             self._events = Faults(faults, self._ids).events
             with undisturbed():
-                self._take(folder)
-            self._build(with_board(settings), (baud, latency), prepared, table_cache)
+                self._links = LinkFolder(folder)
+                self._closers.append(self._links.close)
+                self._control = ControlPort(folder, self._answer)
+                self._closers.append(self._control.close)
+            settings = with_board(settings)
+            self._simulation = settings.simulation
+            self.clock = EmulatorClock()
+            table = make_table(settings, make_material(settings.material), table_cache)
+            self.hand = SimulatedHand(settings, 0.0, table)
+            if settings.servos.backend != "none":
+                self._add_servos(settings, baud, latency, prepared)
+            if settings.tactile.backend != "none":
+                for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+                    self._add_board(settings, finger)
         except (FolderError, FaultError) as error:
             self.close()
             raise EmulatorError(str(error)) from None
@@ -128,61 +144,35 @@ class Emulator:
             self.close()
             raise
 
-    def _take(self, folder: Path) -> None:
-        self._links = LinkFolder(folder)
-        self._closers.append(self._links.close)
-        self._control = ControlPort(folder, self._told)
-        self._closers.append(self._control.close)
-
-    def _build(
-        self,
-        settings: Settings,
-        pace: tuple[int, float],
-        prepared: bool,
-        table_cache: Path | None,
-    ) -> None:
-        self.clock = EmulatorClock()
-        self._simulation = settings.simulation
-        table = make_table(settings, make_material(settings.material), table_cache)
-        self.hand = SimulatedHand(settings, 0.0, table)
-        self._servos: PtyServoBus | None = None
-        if settings.servos.backend != "none":
-            with self._undisturbed():
-                self._servos = self._make_servos(settings, pace, prepared)
-                self._closers.append(self._servos.close)
-        self._boards: dict[str, TactileBoard] = {}
-        self._sources: list[SimulatedTactile] = []
-        tactile = settings.tactile
-        if tactile.backend != "none":
-            for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
-                source = SimulatedTactile(settings, self.hand, self.clock, finger)
-                source.open()
-                board = TactileBoard(
-                    source,
-                    encoder_for(tactile.backend, tactile.full_count),
-                    tactile.rate,
-                    settings.simulation.tactile_delay,
-                    seed=settings.simulation.seed + finger,
-                )
-                self._sources.append(source)
-                self._boards[FINGERS[finger]] = board
-                self._closers.append(board.close)
-                with self._undisturbed():
-                    self._links.link(f"tactile-{FINGERS[finger]}", board.path)
-        self._advance_due = 0.0
-
-    def _make_servos(
-        self, settings: Settings, pace: tuple[int, float], prepared: bool
-    ) -> PtyServoBus:
-        baud, latency = pace
+    def _add_servos(self, settings: Settings, baud: int, latency: float, prepared: bool) -> None:
         try:
             bus = ServoBus.from_settings(
                 settings, self.hand, ids=self._ids, baud=baud, prepared=prepared
             )
         except ValueError as error:
             raise EmulatorError(str(error)) from None
-        link = self._links.path / "servos"
-        return PtyServoBus(bus, link, baud=baud, latency=latency, clock=self.clock.now)
+        with self._undisturbed():
+            servos = PtyServoBus(bus, baud=baud, latency=latency, clock=self.clock.now)
+            self._closers.append(servos.unplug)
+            self._links.link("servos", servos.path)
+        self._servos = servos
+
+    def _add_board(self, settings: Settings, finger: int) -> None:
+        source = SimulatedTactile(settings, self.hand, self.clock, finger)
+        source.open()
+        tactile, simulation = settings.tactile, settings.simulation
+        board = TactileBoard(
+            source,
+            encoder_for(tactile.backend, tactile.full_count),
+            tactile.rate,
+            simulation.tactile_delay,
+            seed=simulation.seed + finger,
+        )
+        self._sources.append(source)
+        self._boards[FINGERS[finger]] = board
+        self._closers.append(board.close)
+        with self._undisturbed():
+            self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Answer until :meth:`stop`. ``on_ready`` is called once everything answers."""
@@ -208,6 +198,8 @@ class Emulator:
     def _close_wake(self) -> None:
         for end in self._wake:
             os.close(end)
+
+    # --- the event loop --------------------------------------------------------------------------
 
     def _turn(self) -> None:
         """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
@@ -242,7 +234,7 @@ class Emulator:
             *self._control.sockets(),
             *[board for board in self._boards.values() if board.plugged],
         ]
-        if self._servos is not None and self._servos.fileno() >= 0:
+        if self._servos is not None and self._servos.plugged:
             watched.append(self._servos.fileno())
         return watched
 
@@ -256,16 +248,18 @@ class Emulator:
             self.hand.advance(t)
         self._advance_due = t + _STEP
 
-    def tell(self, text: str) -> str:
-        """Take words from the control socket; ``ok``, or ``error: `` and why none of them counts.
+    # --- requests and faults ---------------------------------------------------------------------
+
+    def request(self, text: str) -> str:
+        """Take words of the control socket: ``ok``, or ``error: `` and why none of them counts.
 
         A time behind a word counts from now. With ``report`` among them the answer is
-        :meth:`report` as JSON; ``forget`` lets the record begin anew; ``place`` puts the object
-        back where it was at the start, at rest.
+        :meth:`report` as JSON; ``forget`` begins the record anew; ``place`` puts the object back
+        where it was at the start, at rest.
         """
         words = text.split()
         try:
-            fresh = Faults([word for word in words if word not in _ASKS], self._ids).events
+            fresh = Faults([word for word in words if word not in _REQUESTS], self._ids).events
         except FaultError as error:
             return f"error: {error}"
         now = self.clock.now()
@@ -273,67 +267,55 @@ class Emulator:
         if "forget" in words and self._servos is not None:
             self._servos.bus.forget(now)
         if "place" in words:
-            self._place()
+            simulation = self._simulation
+            self.hand.object_pose[:] = *simulation.object_position, simulation.object_angle
+            self.hand.object_velocity[:] = 0.0
+            self.hand.refresh()
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
         self._advance_due = now  # so that what starts now does
         return reply
 
-    def _place(self) -> None:
-        simulation = self._simulation
-        self.hand.object_pose[:] = *simulation.object_position, simulation.object_angle
-        self.hand.object_velocity[:] = 0.0
-        self.hand.refresh()
-
-    def _told(self, text: str) -> str:
-        """:meth:`tell`, with what starts now in force before the reply goes out."""
-        reply = self.tell(text)
+    def _answer(self, text: str) -> str:
+        """:meth:`request`, with what starts now in force before the reply goes out."""
+        reply = self.request(text)
         self._advance(self.clock.now())
         return reply
 
     def report(self, t: float) -> dict[str, Any]:
         """What was on the servos' wire, and their state; times are the hand's [s].
 
-        ``monotonic`` is time.monotonic() at ``t``, for whoever compares with a time of his own.
+        ``monotonic`` is time.monotonic() at ``t``, to compare with times of other processes.
         """
-        bus = self._servos.bus if self._servos is not None else None
-        servos = bus.report(t) if bus is not None else []
+        servos = self._servos.bus.report(t) if self._servos is not None else []
         return {"t": t, "monotonic": time.monotonic(), "servos": servos}
 
     def _apply(self, event: Event, t: float) -> None:
-        servos = self._servos
-        if event.part != SERVOS:
-            self._apply_to_board(event.part, event.what)
-        elif servos is None or isinstance(event.what, BoardFault):
+        part, what = event.part, event.what
+        device = self._servos if part == SERVOS else self._boards.get(part)
+        if device is None:
             return
-        elif event.what == "unplug":
-            servos.unplug()
-        elif event.what == "plug":
-            if servos.fileno() < 0:
-                servos.plug()
-        elif event.what == "well":
-            servos.bus.faults.rates = LineFaults()
-        else:
-            servos.bus.fault(event.what, t)
-
-    def _apply_to_board(self, side: str, what: str | BoardFault) -> None:
-        board = self._boards.get(side)
-        if board is None:
-            return
-        if isinstance(what, BoardFault):
-            board.fault(what)
+        name = part if part == SERVOS else f"tactile-{part}"
+        if what == "unplug":
+            self._links.unlink(name)
+            device.unplug()
+        elif what == "plug":
+            if not device.plugged:
+                device.plug()
+                self._links.link(name, device.path)
+        elif isinstance(device, TactileBoard):
+            if isinstance(what, BoardFault):
+                device.fault(what)
+            elif what == "well":
+                device.recover()
         elif what == "well":
-            board.recover()
-        elif what == "unplug":
-            self._links.unlink(f"tactile-{side}")
-            board.unplug()
-        elif not board.plugged:
-            board.plug()
-            self._links.link(f"tactile-{side}", board.path)
+            device.bus.faults.rates = LineFaults()
+        elif isinstance(what, str):
+            device.bus.fault(what, t)
 
 
 def with_board(settings: Settings) -> Settings:
-    """``settings`` with the default board where its tactile backend names none of ours."""
+    """``settings`` with the default board where its tactile backend has no framing."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -1,10 +1,9 @@
-"""A servo bus behind a pseudo-terminal, to be turned over by somebody else's event loop.
+"""A servo bus behind a pseudo-terminal, served by somebody else's event loop.
 
 It owns the terminal and the time on the wire: replies leave when their last byte would have
 arrived at the client's baud rate, return delays and a USB adapter's latency included; or at once,
-unpaced. Times on the wire are absolute: where this process was kept from running, which no servo
-ever is, that does not count. What the bytes mean is :mod:`simulation.servo_model.servo_bus`'s
-affair.
+unpaced. Times on the wire are absolute: time in which this process did not run, which no servo
+ever loses, does not count.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from softfinger.daemon.simulation.emulator.run_delay import RunDelay
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
 _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control characters, two speeds
@@ -29,19 +27,20 @@ _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
 _AT_A_TIME = 4  # reads, so that a client that never pauses leaves time for the rest of the hand
+_GAP = 0.02  # s of silence within a packet that drop it: the reader may be held up beyond 1.5 ms
 # s: about what a pseudo-terminal takes from one process's write to the other's read, woken by it.
 # A paced bus takes it off both ways, since it stands for a wire that has its own time already.
 PASSAGE = 15e-6
+_SCHEDSTAT = Path("/proc/thread-self/schedstat")  # ns run, ns waited for a processor, times run
 
 
 class PtyServoBus:
-    """``bus`` on a new pseudo-terminal.
+    """``bus`` on a new pseudo-terminal at ``path``.
 
     The loop that owns it waits until :meth:`fileno` is readable or :meth:`next_event` has come,
     then calls :meth:`service`; ``clock`` must be the clock that those times are of.
 
     Args:
-        link: where to put a symbolic link to the terminal; a link that is there is replaced.
         baud: 0 answers at any rate and at once. Above 0 a servo is deaf to a client whose port is
             set to another rate than its own, and replies take their time on the wire.
         latency: s, a USB adapter's latency timer: replies come at multiples of it.
@@ -52,7 +51,6 @@ class PtyServoBus:
     def __init__(
         self,
         bus: ServoBus,
-        link: Path | None = None,
         *,
         baud: int = 0,
         latency: float = 0.0,
@@ -60,60 +58,42 @@ class PtyServoBus:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.bus = bus
-        # A reader may be held up within a packet for longer than a wire would be silent.
-        bus.parser.gap = max(bus.parser.gap, 0.02)
-        self.link = link
+        bus.parser.gap = _GAP
         self._baud = baud
         self._latency = latency
         self._spin = spin
         self._clock = clock
-        self._run_delay: RunDelay | None = None
-        self._master = self._slave = -1
+        self._waited: float | None = None  # s this thread waited for a processor, at the last look
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
         self.plug()
 
-    @property
-    def path(self) -> str:
-        """What a client opens: the link, or the terminal itself."""
-        return str(self.link) if self.link is not None else self._name
-
     def fileno(self) -> int:
         """The descriptor to wait for; -1 while unplugged."""
         return self._master
 
+    @property
+    def plugged(self) -> bool:
+        """Whether the terminal is there."""
+        return self._master >= 0
+
     def plug(self) -> None:
-        """Make the terminal (again) and link it."""
+        """Make the terminal (again), at a new ``path``."""
         self._master, self._slave = pty.openpty()
         # The slave stays open here and raw, so that a client may come and go without an error.
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        self._name = os.ttyname(self._slave)
-        if self.link is not None:
-            fresh = self.link.with_name(f".{self.link.name}.{os.getpid()}")
-            fresh.unlink(missing_ok=True)
-            fresh.symlink_to(self._name)
-            fresh.replace(self.link)
+        self.path = os.ttyname(self._slave)
 
     def unplug(self) -> None:
-        """Take the whole port away, as when an adapter is pulled; the servos go on."""
+        """Take the terminal away, as when an adapter is pulled; the servos go on."""
         self._due.clear()
         self.bus.parser.reset()
-        for descriptor in (self._master, self._slave):
-            if descriptor >= 0:
-                os.close(descriptor)
+        if self.plugged:
+            os.close(self._master)
+            os.close(self._slave)
         self._master = self._slave = -1
-        if self.link is not None and self.link.is_symlink():
-            with contextlib.suppress(OSError):
-                if self.link.readlink() == Path(self._name):
-                    self.link.unlink()
-
-    def close(self) -> None:
-        """Take the port away for good."""
-        self.unplug()
-        if self._run_delay is not None:
-            self._run_delay.close()
 
     def client_baud(self) -> int:
         """The rate that the terminal is set to."""
@@ -129,29 +109,29 @@ class PtyServoBus:
     def service(self, t: float, since: float | None = None) -> None:
         """Take what has arrived by time t [s], let the servos act, send what is due.
 
-        ``since``: when the caller began to wait, as it had nothing to take; now, if it is not told.
+        ``since``: when the caller began to wait because nothing was there; t by default.
         """
-        if self._master < 0:
-            self.bus.advance(t)
-            return
-        arrived = self._arrival(t, t if since is None else since) if self._baud else t
-        for _ in range(_AT_A_TIME):
-            try:
-                data = os.read(self._master, _READ_SIZE)
-            except OSError:  # nothing there
-                break
-            self._receive(data, t, arrived)
-            # A client's next request often comes while its last write is being done.
-            arrived = t = max(t, self._clock())
-        if t > self.bus.now:
-            self.bus.advance(t)
+        if self.plugged:
+            arrived = self._arrival(t, t if since is None else since) if self._baud else t
+            for _ in range(_AT_A_TIME):
+                try:
+                    data = os.read(self._master, _READ_SIZE)
+                except OSError:  # nothing there
+                    break
+                self._receive(data, t, arrived)
+                # A client's next request often comes while its last write is being done.
+                arrived = t = max(t, self._clock())
+        self.bus.advance(t)
         self._send()
 
     def _arrival(self, t: float, since: float) -> float:
         """When bytes seen at time t came, if others had the processor from then on."""
-        if self._run_delay is None:
-            self._run_delay = RunDelay()
-        return min(t, max(since, t - self._run_delay.since_last()))
+        try:
+            waited = int(_SCHEDSTAT.read_bytes().split()[1]) * 1e-9
+        except OSError:  # a kernel without scheduling statistics
+            return t
+        last, self._waited = self._waited, waited
+        return t if last is None else min(t, max(since, t - (waited - last)))
 
     def _receive(self, data: bytes, t: float, arrived: float) -> None:
         if not self._baud:

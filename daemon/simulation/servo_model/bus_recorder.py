@@ -15,7 +15,7 @@ FAR = 0.05  # rad between goal and present angle at torque on that count as far
 _WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 
 
-class WireWatch:
+class BusRecorder:
     """The record of one servo."""
 
     def __init__(self, t: float) -> None:

@@ -1,10 +1,9 @@
-"""One emulated Dynamixel X servo: what its registers mean, over a joint of a plant.
+"""One emulated Dynamixel X servo: what its registers do, over a joint of a plant.
 
-Holds the behaviour behind the control table: torque, operating modes, limits, profiles, bus
-watchdog, hardware errors and shutdown, reboot, backup. Packets are the bus's affair
-(:mod:`simulation.servo_model.servo_bus`). Choices of our own, where the manuals say nothing: a
-write that breaks any rule changes nothing at all; torque on after a shutdown is refused with
-RESULT_FAIL.
+Torque, operating modes, limits, profiles, bus watchdog, hardware errors and shutdown, reboot,
+backup; packets belong to :mod:`simulation.servo_model.servo_bus`. Choices of our own, where the
+manuals say nothing: a write that breaks any rule changes nothing at all; torque on after a
+shutdown is refused with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -15,26 +14,14 @@ from typing import Any
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.control_table import JointScale, ServoModel
-from softfinger.daemon.simulation.servo_model import protocol
-from softfinger.daemon.simulation.servo_model.bus_recorder import WireWatch
-from softfinger.daemon.simulation.servo_model.control_table import ControlTable, Item
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
+from softfinger.daemon.simulation.servo_model.registers import ControlTable, Item
 from softfinger.daemon.simulation.servo_model.servo_health import SENSE, ServoHealth
 from softfinger.daemon.simulation.servo_model.servo_joint import STEP, ServoJoint
-from softfinger.daemon.simulation.servo_model.servo_rules import refusal, shut_down
-from softfinger.daemon.simulation.servo_model.table_backup import TableBackup
 
 REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
-# Registers whose writing does more than change them.
-_EFFECTIVE = frozenset(
-    (
-        reg.TORQUE_ENABLE,
-        reg.OPERATING_MODE,
-        reg.GOAL_POSITION,
-        reg.GOAL_VELOCITY,
-        reg.BUS_WATCHDOG,
-    )
-)
 _MOTION_END = reg.PRESENT_POSITION + 4
 _CLEAR_FIRMWARE = 42
 _BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
@@ -45,9 +32,9 @@ _BACKUP_KEY = b"CTRL"
 class EmulatedServo:
     """A servo on joint ``joint`` of ``plant``, factory-new unless ``prepared``.
 
-    ``prepared`` brings it up as the backend wants it: in operating mode ``mode`` where the model
-    has it, and with no return delay. What ``health`` has may be set from outside; ``silent`` makes
-    it deaf and dumb, with ``frozen`` what it measures stands still, its time included, and with
+    ``prepared`` sets it up as the daemon needs it: in operating mode ``mode`` where the model has
+    it, and with no return delay. ``health`` may be set from outside; a ``silent`` servo neither
+    hears nor answers, with ``frozen`` what it measures stands still, its time included, and with
     ``refuses`` it answers every reading with an error.
     """
 
@@ -72,9 +59,8 @@ class EmulatedServo:
         self.silent = self.frozen = self.refuses = False
         self.health = ServoHealth(model)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
-        self.watch = WireWatch(t)
+        self.recorder = BusRecorder(t)
         self._registered: tuple[int, bytes] | None = None
-        self._backup = TableBackup(self.table)
         self._watched = 0.0  # time of the last packet the watchdog knows of
         self._booted = t
         self._boot_at = -math.inf  # a reboot ends then
@@ -118,7 +104,7 @@ class EmulatedServo:
     @property
     def alert(self) -> int:
         """The alert bit of its status packets."""
-        return protocol.ALERT if self.table.memory[reg.HARDWARE_ERROR_STATUS] else 0
+        return framing.ALERT if self.table.memory[reg.HARDWARE_ERROR_STATUS] else 0
 
     @property
     def torque_on(self) -> bool:
@@ -139,7 +125,7 @@ class EmulatedServo:
     def heard(self, t: float) -> None:
         """An instruction packet went by: the bus watchdog starts anew."""
         self._watched = t
-        self.watch.heard(t, self.torque_on)
+        self.recorder.heard(t, self.torque_on)
 
     def next_event(self) -> float:
         """When :meth:`act` next has something to do [s]."""
@@ -163,7 +149,7 @@ class EmulatedServo:
         armed = 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on
         if armed and t >= self._watched + ticks * reg.WATCHDOG_UNIT:
             self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
-            self.watch.fired(t)
+            self.recorder.fired(t)
             self._stop()
         if t >= self._next_step:
             if self.torque_on and self._joint.moves_by_itself():
@@ -197,23 +183,24 @@ class EmulatedServo:
             return error
         limp = not self.torque_on
         for item, value in plan:
-            self.table.put(item, value)
+            self.table.set(item.address, value)
         for item, value in plan:
-            if item.address in _EFFECTIVE:
-                self._effect(item.address, value, t)
+            self._effect(item.address, value, t)
         if self.torque_on and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)
         if limp and self.torque_on:
-            self._note_torque(t)
+            current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
+            goals = self.table.get(reg.GOAL_POSITION), current
+            self.recorder.torque_on(t, self._joint, self.mode, goals)
         elif not limp and not self.torque_on:
-            self.watch.torque_off(t)
+            self.recorder.torque_off(t)
         self._joint.drive()
-        return protocol.OK
+        return framing.OK
 
     def register(self, address: int, data: bytes) -> int:
         """Keep a write for :meth:`action`."""
         error, _ = self._checked(address, data)
-        if error == protocol.OK:
+        if error == framing.OK:
             self._registered = (address, data)
             self.table.set(reg.REGISTERED_INSTRUCTION, 1)
         return error
@@ -221,7 +208,7 @@ class EmulatedServo:
     def action(self, t: float) -> int:
         """Do the write that was kept."""
         if self._registered is None:
-            return protocol.INSTRUCTION_ERROR
+            return framing.INSTRUCTION_ERROR
         address, data = self._registered
         self._registered = None
         self.table.set(reg.REGISTERED_INSTRUCTION, 0)
@@ -235,59 +222,48 @@ class EmulatedServo:
         self._boot_at = t + REBOOT_TIME
         self._next_sense = self._boot_at
 
-    def factory_reset(self, option: int, t: float) -> int:
-        """Factory defaults (0xFF all, 1 keeps the ID, 2 the baud rate too), then a reboot."""
-        keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option)
+    def factory_reset(self, option: bytes, t: float) -> int:
+        """Factory defaults (FF all, 01 keeps the ID, 02 the baud rate too), then a reboot."""
+        if len(option) != 1:
+            return framing.DATA_LENGTH
+        keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
         if keep is None:
-            return protocol.DATA_RANGE
+            return framing.DATA_RANGE
         self.table.set(reg.TORQUE_ENABLE, 0)
         self.table.reset(keep)
         self.reboot(t)
-        return protocol.OK
+        return framing.OK
 
     def clear(self, parameters: bytes, t: float) -> int:
         """Bring the position back into one turn; fails while the shaft moves."""
         if self.firmware < _CLEAR_FIRMWARE:
-            return protocol.INSTRUCTION_ERROR
+            return framing.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
-            return protocol.DATA_RANGE
+            return framing.DATA_RANGE
         self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
         if self.table.memory[reg.MOVING]:
-            return protocol.RESULT_FAIL
+            return framing.RESULT_FAIL
         shift = self._joint.forget_turns()
         self.table.set(reg.GOAL_POSITION, self.table.get(reg.GOAL_POSITION) - shift)
         self._joint.profile.hold(self._joint.profile.position - shift)
         self._joint.drive()
-        return protocol.OK
+        return framing.OK
 
     def backup(self, parameters: bytes, t: float) -> int:
         """Store the control table (1), or restore its EEPROM and reboot (2)."""
         if self.firmware < _BACKUP_FIRMWARE[self.model.small]:
-            return protocol.INSTRUCTION_ERROR
+            return framing.INSTRUCTION_ERROR
         if len(parameters) != 5 or parameters[1:] != _BACKUP_KEY or parameters[0] not in (1, 2):
-            return protocol.DATA_RANGE
+            return framing.DATA_RANGE
         if self.torque_on:
-            return protocol.RESULT_FAIL
+            return framing.RESULT_FAIL
         if parameters[0] == 1:
-            self._backup.store()
-            return protocol.OK
-        if not self._backup.held:
-            return protocol.RESULT_FAIL
-        self._backup.restore(saved=True)
+            self.table.back_up()
+            return framing.OK
+        if not self.table.restore():
+            return framing.RESULT_FAIL
         self.reboot(t)
-        return protocol.OK
-
-    def fail(self, bit: int) -> None:
-        """A hardware error: told by the alert bit, and a shutdown if the mask has its bit."""
-        status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
-        self.table.set(reg.HARDWARE_ERROR_STATUS, status)
-        if shut_down(self.table) and self.torque_on:
-            self.table.set(reg.TORQUE_ENABLE, 0)
-            self._joint.drive()
-
-    def forget(self, t: float) -> None:
-        """Begin the record anew."""
-        self.watch = WireWatch(t)
+        return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
         """Its state, and what it was told since the record began."""
@@ -300,50 +276,49 @@ class EmulatedServo:
             "watchdog": ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else None,
             "stopped_by_watchdog": ticks == reg.WATCHDOG_ERROR,
             "q": self._joint.goal_angle(self._joint.position()),
-            **self.watch.report(t, self._joint, self.torque_on),
+            **self.recorder.report(t, self._joint, self.torque_on),
         }
 
-    def stick(self) -> None:
-        """Its encoder and its current's sensor stand still from now on: angle kept, the rest 0."""
-        self._joint.stuck = self._joint.encoder()
-
-    def jump(self) -> None:
-        """Its encoder's zero jumps, as by a magnet that slips."""
-        self._joint.shift += JUMP
-
-    def recover(self) -> None:
-        """Cool down, bring the supply back and measure well again.
-
-        A latched hardware error stays until a reboot.
-        """
-        self.health.recover()
-        self.frozen = self.refuses = False
-        self._joint.stuck, self._joint.shift = None, 0
+    def fault(self, kind: str, t: float) -> None:
+        """One of SERVO_FAULTS. ``recover`` leaves a latched hardware error until a reboot."""
+        match kind:
+            case "silent" | "answer":
+                self.silent = kind == "silent"
+            case "reboot":
+                self.reboot(t)
+            case "overheat":
+                self.health.temperature = self.table.get(reg.TEMPERATURE_LIMIT) + 5.0
+            case "overload":
+                self._fail(5)
+            case "undervoltage":
+                self.health.voltage = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
+            case "stuck":
+                self._joint.stuck = self._joint.encoder()
+            case "jump":
+                self._joint.shift += JUMP
+            case "frozen":
+                self.frozen = True
+            case "refuse":
+                self.refuses = True
+            case "recover":
+                self.health.recover()
+                self.frozen = self.refuses = False
+                self._joint.stuck, self._joint.shift = None, 0
 
     # --- rules of writing ------------------------------------------------------------------
 
     def _checked(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
         error, plan = self.table.plan(address, data)
-        for item, value in plan:
-            self.watch.goal(item.address, value)
-            error = error or refusal(self.table, self.model, item, value)
         if error:
-            self._note_refused(address, data)
-            return error, []
-        return protocol.OK, plan
-
-    def _note_refused(self, address: int, data: bytes) -> None:
-        """Goals that were on the wire though the table would not have them."""
-        values = self.table.values(address, data)
-        if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
-            self.watch.refused()
+            # Goals that were on the wire are recorded though the table would not have them.
+            values = self.table.values(address, data)
+            if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
+                self.recorder.refused()
+        else:
+            values = {item.address: value for item, value in plan}
         for each, value in values.items():
-            self.watch.goal(each, value)
-
-    def _note_torque(self, t: float) -> None:
-        current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
-        goals = self.table.get(reg.GOAL_POSITION), current
-        self.watch.torque_on(t, self._joint, self.mode, goals)
+            self.recorder.goal(each, value)
+        return error, plan
 
     def _effect(self, address: int, value: int, t: float) -> None:
         if address == reg.TORQUE_ENABLE:
@@ -382,13 +357,7 @@ class EmulatedServo:
     def _start(self, t: float) -> None:
         """Power-up, or the end of a reboot."""
         table = self.table
-        known = reg.STARTUP_CONFIGURATION in table.at
-        startup = table.memory[reg.STARTUP_CONFIGURATION] if known else 0
         table.reset_ram()
-        if self._backup.held:
-            if startup & 2:
-                self._backup.restore(saved=False)
-            self._backup.tell()
         self._registered = None
         self.health.restart()
         self._booted = self._watched = t
@@ -397,7 +366,7 @@ class EmulatedServo:
         self._joint.hold()
         self._next_step = math.inf
         self._next_sense = t + SENSE
-        if startup & 1:
+        if table.memory[reg.STARTUP_CONFIGURATION] & 1:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.drive()
 
@@ -421,4 +390,12 @@ class EmulatedServo:
         current = self._joint.current
         pressed = self.torque_on and current >= 0.99 * self._joint.current_limit
         for bit in self.health.sense(self.table, current, pressed):
-            self.fail(bit)
+            self._fail(bit)
+
+    def _fail(self, bit: int) -> None:
+        """A hardware error: the alert bit, and a shutdown if the mask has its bit."""
+        status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
+        self.table.set(reg.HARDWARE_ERROR_STATUS, status)
+        if self.table.shut_down and self.torque_on:
+            self.table.set(reg.TORQUE_ENABLE, 0)
+            self._joint.drive()

@@ -1,6 +1,6 @@
 """A bus of emulated Dynamixel servos: instruction packets in, status packets out, byte for byte.
 
-Pure: it is given bytes and the time and gives bytes, so that tests and fuzzers need no port; the
+It takes bytes and the time and gives bytes, so that tests and fuzzers need no port; the
 pseudo-terminal around it is :mod:`simulation.emulator.pty_bus`. In group reads a servo answers
 after it has heard the one named before it; so where one is missing, those after it stay silent.
 """
@@ -9,36 +9,43 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterable, Sequence
+import struct
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import MODE_NUMBERS, JointScale, ServoModel, by_name
+from softfinger.daemon.servos.control_table import MODE_NUMBERS, JointScale, by_name
 from softfinger.daemon.servos.crc import crc16
-from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_faults import (
     LINE_FAULTS,
     FaultError,
     FaultSource,
     parse_fault,
 )
+from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.collision import collide
-from softfinger.daemon.simulation.servo_model.protocol import BROADCAST, Packet, Parser
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, Parser
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 
-_READS = frozenset(
+_GROUP_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
+_BULK_READS = frozenset((framing.BULK_READ, framing.FAST_BULK_READ))
+_READS = frozenset((framing.PING, framing.READ, *_GROUP_READS, *_BULK_READS))
+_TO_ALL = frozenset(  # what a broadcast may ask besides reads, without an answer
     (
-        protocol.PING,
-        protocol.READ,
-        protocol.SYNC_READ,
-        protocol.FAST_SYNC_READ,
-        protocol.BULK_READ,
-        protocol.FAST_BULK_READ,
+        framing.WRITE,
+        framing.REG_WRITE,
+        framing.ACTION,
+        framing.FACTORY_RESET,
+        framing.REBOOT,
+        framing.CLEAR,
+        framing.BACKUP,
     )
 )
 _FACTORY_RESET_GUARD = 42  # firmware that ignores a broadcast reset of everything
+_SPAN = struct.Struct("<HH")  # address, length
+_ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
 class Reply(NamedTuple):
@@ -50,10 +57,7 @@ class Reply(NamedTuple):
 
 
 class ServoBus:
-    """Servos sharing one wire and one plant.
-
-    ``crc_reply`` makes a servo answer a damaged packet with error 3 instead of staying silent.
-    """
+    """Servos sharing one wire and one plant. A damaged packet is met with silence."""
 
     def __init__(
         self,
@@ -61,29 +65,15 @@ class ServoBus:
         plant: JointPlant,
         *,
         seed: int = 1,
-        gap: float = 0.0015,
-        crc_reply: bool = False,
     ) -> None:
         self.servos = list(servos)
         self.plant = plant
         self.faults = FaultSource(seed)
-        self.parser = Parser(gap)
-        self.packets = 0
-        self._crc_reply = crc_reply
+        self.parser = Parser()
+        self.packets = 0  # that came through
         self._jitter = random.Random(seed)
         self._now = -math.inf
         self._due = -math.inf  # no servo does anything by itself before then
-        self._unicast: dict[int, Callable[[EmulatedServo, bytes, float], tuple[int, bytes]]] = {
-            protocol.PING: self._ping,
-            protocol.READ: self._read,
-            protocol.WRITE: self._write,
-            protocol.REG_WRITE: self._reg_write,
-            protocol.ACTION: lambda servo, _, t: (servo.action(t), b""),
-            protocol.FACTORY_RESET: self._factory_reset,
-            protocol.REBOOT: self._reboot,
-            protocol.CLEAR: lambda servo, data, t: (servo.clear(data, t), b""),
-            protocol.BACKUP: lambda servo, data, t: (servo.backup(data, t), b""),
-        }
 
     @classmethod
     def from_settings(
@@ -91,42 +81,38 @@ class ServoBus:
         settings: Settings,
         plant: JointPlant,
         *,
-        model: str | None = None,
         ids: Sequence[int] | None = None,
         baud: int = 0,
         prepared: bool = True,
-        faults: Iterable[str] = (),
         t: float = 0.0,
     ) -> ServoBus:
-        """The stand-in hand's servos: one a joint, left first, mapped as the settings say.
+        """The settings' servos, one a joint, left first.
 
-        ``baud`` > 0 sets the servos to that rate. Raises KeyError for an unknown model,
-        ValueError for a rate the model has not, FaultError for an unknown fault.
+        ``baud`` > 0 sets the servos to that rate, ``ids`` to others than the settings'. Raises
+        ValueError for a rate the model has not.
         """
-        chosen = by_name(settings.servos.model if model is None else model)
-        rate = baud or settings.servos.baud
-        if rate not in chosen.baud_rates:
+        servos = settings.servos
+        model = by_name(servos.model)
+        rate = baud or servos.baud
+        if rate not in model.baud_rates:
             raise ValueError(
-                f"{chosen.name} has no {rate} baud; it has {', '.join(map(str, chosen.baud_rates))}"
+                f"{model.name} has no {rate} baud; it has {', '.join(map(str, model.baud_rates))}"
             )
-        servos = [
+        made = [
             EmulatedServo(
-                chosen,
+                model,
                 servo_id,
                 plant,
                 joint,
-                JointScale.of(settings.servos, joint, chosen),
+                JointScale.of(servos, joint, model),
                 prepared=prepared,
-                mode=MODE_NUMBERS[settings.servos.mode],
-                baud_index=chosen.baud_rates.index(rate),
+                mode=MODE_NUMBERS[servos.mode],
+                baud_index=model.baud_rates.index(rate),
                 t=t,
             )
-            for joint, servo_id in enumerate(settings.servos.ids if ids is None else ids)
+            for joint, servo_id in enumerate(servos.ids if ids is None else ids)
         ]
-        bus = cls(servos, plant, seed=settings.simulation.seed)
-        for fault in faults:
-            bus.fault(fault, t)
-        return bus
+        return cls(made, plant, seed=settings.simulation.seed)
 
     # --- time ------------------------------------------------------------------------------
 
@@ -167,21 +153,16 @@ class ServoBus:
             self.packets += 1
             if self.faults.loses(packet.instruction in _READS):
                 continue
+            if not packet.valid:
+                continue
             listening = [
                 servo for servo in self.servos if servo.awake(t) and baud in (0, servo.baud)
             ]
-            if packet.valid:
-                for servo in listening:
-                    servo.heard(t)
-                replies += self._answers(packet, listening, t)
-                if packet.instruction not in _READS:
-                    self._due = min([servo.next_event() for servo in self.servos])
-            elif self._crc_reply:
-                replies += [
-                    self._status(servo, protocol.CRC_ERROR)
-                    for servo in listening
-                    if servo.id == packet.id
-                ]
+            for servo in listening:
+                servo.heard(t)
+            replies += self._answers(packet, listening, t)
+            if packet.instruction not in _READS:
+                self._due = min([servo.next_event() for servo in self.servos])
         if not self.faults.active:
             return replies
         return [
@@ -204,27 +185,7 @@ class ServoBus:
         servo = next((servo for servo in self.servos if servo.id == number), None)
         if servo is None:
             raise FaultError(f"fault {text!r}: no servo has that ID")
-        model: ServoModel = servo.model
-        if kind == "reboot":
-            servo.reboot(t)
-        elif kind == "overheat":
-            servo.health.temperature = servo.table.get(reg.TEMPERATURE_LIMIT) + 5.0
-        elif kind == "overload":
-            servo.fail(5)
-        elif kind == "undervoltage":
-            servo.health.voltage = (model.voltage_min - 10) * reg.VOLTAGE_UNIT
-        elif kind == "stuck":
-            servo.stick()
-        elif kind == "jump":
-            servo.jump()
-        elif kind == "frozen":
-            servo.frozen = True
-        elif kind == "refuse":
-            servo.refuses = True
-        elif kind == "recover":
-            servo.recover()
-        else:
-            servo.silent = kind == "silent"
+        servo.fault(kind, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
         """Each servo's state, and what it was told since the record began."""
@@ -234,66 +195,56 @@ class ServoBus:
     def forget(self, t: float) -> None:
         """Begin the record anew."""
         for servo in self.servos:
-            servo.forget(t)
+            servo.recorder = BusRecorder(t)
 
-    # --- instructions ----------------------------------------------------------------------
-
-    def _status(self, servo: EmulatedServo, error: int, data: bytes = b"") -> Reply:
-        # The alert bit is taken after the instruction was done.
-        return Reply(servo.return_delay, protocol.status(servo.id, error | servo.alert, data))
+    # --- instructions ----------------------------------------------------------------------------
 
     def _answers(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[Reply]:
         instruction = packet.instruction
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
-        if instruction == protocol.STATUS:
+        if instruction == framing.STATUS:
             return []  # another servo's answer, or our own echo
-        handler = self._unicast.get(instruction, self._unknown)
+        needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
+                # Level, delay and ID as they were when the instruction came.
                 level, delay, name = servo.status_return_level, servo.return_delay, servo.id
-                error, data = handler(servo, packet.parameters, t)
-                needed = {protocol.PING: 0, protocol.READ: 1}.get(instruction, 2)
+                error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # ID and delay as they were when the instruction came.
-                    status = protocol.status(name, error | servo.alert, data)
+                    # The alert bit is taken after the instruction was done.
+                    status = framing.status(name, error | servo.alert, data)
                     replies.append(Reply(delay, status))
-            elif servo.shadow_id == packet.id and instruction != protocol.PING:
-                handler(servo, packet.parameters, t)
+            elif servo.shadow_id == packet.id and instruction != framing.PING:
+                _execute(servo, instruction, packet.parameters, t)
         return self._at_once(replies, servos)
 
     def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[Reply]:
         instruction, data = packet.instruction, packet.parameters
-        if instruction == protocol.PING:
+        if instruction == framing.PING:
             replies = []
             for servo_id in sorted({servo.id for servo in servos}):
                 same = [servo for servo in servos if servo.id == servo_id]
-                answers = [self._status(servo, *self._ping(servo, data, t)) for servo in same]
+                answers = [_status(each, *_execute(each, instruction, data, t)) for each in same]
                 replies += self._at_once(answers, same)
             return replies
-        if instruction in (protocol.SYNC_READ, protocol.FAST_SYNC_READ):
-            if len(data) < 5:
-                return []
-            address, length = _word(data, 0), _word(data, 2)
+        if instruction in _GROUP_READS and len(data) >= 5:
+            address, length = _SPAN.unpack_from(data)
             wanted = [(servo_id, address, length) for servo_id in data[4:]]
-            return self._group_read(wanted, servos, t, instruction == protocol.FAST_SYNC_READ)
-        if instruction in (protocol.BULK_READ, protocol.FAST_BULK_READ):
-            if len(data) % 5:
-                return []
-            wanted = [
-                (data[i], _word(data, i + 1), _word(data, i + 3)) for i in range(0, len(data), 5)
-            ]
-            return self._group_read(wanted, servos, t, instruction == protocol.FAST_BULK_READ)
-        if instruction == protocol.SYNC_WRITE:
+            return self._group_read(wanted, servos, t, instruction == framing.FAST_SYNC_READ)
+        if instruction in _BULK_READS and len(data) % _ITEM.size == 0:
+            wanted = list(_ITEM.iter_unpack(data))
+            return self._group_read(wanted, servos, t, instruction == framing.FAST_BULK_READ)
+        if instruction == framing.SYNC_WRITE:
             self._sync_write(data, servos, t)
-        elif instruction == protocol.BULK_WRITE:
+        elif instruction == framing.BULK_WRITE:
             self._bulk_write(data, servos, t)
-        elif instruction in self._unicast and instruction != protocol.READ:
-            if instruction == protocol.FACTORY_RESET and data == b"\xff":
-                servos = [servo for servo in servos if servo.firmware < _FACTORY_RESET_GUARD]
+        elif instruction in _TO_ALL:
             for servo in servos:
-                self._unicast[instruction](servo, data, t)
+                guarded = servo.firmware >= _FACTORY_RESET_GUARD and data == b"\xff"
+                if instruction != framing.FACTORY_RESET or not guarded:
+                    _execute(servo, instruction, data, t)
         return []
 
     def _group_read(
@@ -311,7 +262,7 @@ class ServoBus:
         replies: list[Reply] = []
         if fast:
             length = 1 + sum([length + 4 for _, _, length in wanted])
-            piece = protocol.fast_head(length)
+            piece = framing.fast_head(length)
         block = b""
         crc, delay = 0, 0.0
         for servo_id, address, length in wanted:
@@ -319,9 +270,9 @@ class ServoBus:
             if servo is None or servo.status_return_level < 1 or (fast and not servo.fast_reads):
                 break
             data = servo.read(address, length, t)
-            error = protocol.OK if data is not None else protocol.ACCESS
+            error = framing.OK if data is not None else framing.ACCESS
             if not fast:
-                replies.append(self._status(servo, error, data or b""))
+                replies.append(_status(servo, error, data or b""))
                 continue
             # Each CRC goes over all bytes before it, the earlier CRCs too.
             piece += bytes((error | servo.alert, servo_id))
@@ -345,8 +296,7 @@ class ServoBus:
             if not same:
                 break
             answers = [
-                self._status(servo, protocol.OK, servo.read(address, length, t) or b"")
-                for servo in same
+                _status(servo, framing.OK, servo.read(address, length, t) or b"") for servo in same
             ]
             replies += self._at_once(answers, same)
         return replies
@@ -359,60 +309,60 @@ class ServoBus:
         return [Reply(min(reply.delay for reply in replies), data)]
 
     def _sync_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
-        if len(data) < 4:
+        if len(data) < _SPAN.size:
             return
-        address, length = _word(data, 0), _word(data, 2)
+        address, length = _SPAN.unpack_from(data)
         size = length + 1
-        if length == 0 or (len(data) - 4) % size:
+        if length == 0 or (len(data) - _SPAN.size) % size:
             return
-        for i in range(4, len(data), size):
+        for i in range(_SPAN.size, len(data), size):
             for servo in servos:
                 if data[i] in (servo.id, servo.shadow_id):
                     servo.write(address, data[i + 1 : i + size], t)
 
     def _bulk_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
         i = 0
-        while i + 5 <= len(data):
-            servo_id, address, length = data[i], _word(data, i + 1), _word(data, i + 3)
-            values = data[i + 5 : i + 5 + length]
-            if len(values) < length:
+        while i + _ITEM.size <= len(data):
+            servo_id, address, length = _ITEM.unpack_from(data, i)
+            i += _ITEM.size + length
+            if i > len(data):
                 return
             for servo in servos:
                 if servo_id in (servo.id, servo.shadow_id):
-                    servo.write(address, values, t)
-            i += 5 + length
-
-    def _ping(self, servo: EmulatedServo, _: bytes, t: float) -> tuple[int, bytes]:
-        return protocol.OK, servo.model.number.to_bytes(2, "little") + bytes((servo.firmware,))
-
-    def _read(self, servo: EmulatedServo, data: bytes, t: float) -> tuple[int, bytes]:
-        if len(data) != 4:
-            return protocol.DATA_LENGTH, b""
-        values = servo.read(_word(data, 0), _word(data, 2), t)
-        return (protocol.ACCESS, b"") if values is None else (protocol.OK, values)
-
-    def _write(self, servo: EmulatedServo, data: bytes, t: float) -> tuple[int, bytes]:
-        if len(data) < 3:
-            return protocol.DATA_LENGTH, b""
-        return servo.write(_word(data, 0), data[2:], t), b""
-
-    def _reg_write(self, servo: EmulatedServo, data: bytes, t: float) -> tuple[int, bytes]:
-        if len(data) < 3:
-            return protocol.DATA_LENGTH, b""
-        return servo.register(_word(data, 0), data[2:]), b""
-
-    def _factory_reset(self, servo: EmulatedServo, data: bytes, t: float) -> tuple[int, bytes]:
-        if len(data) != 1:
-            return protocol.DATA_LENGTH, b""
-        return servo.factory_reset(data[0], t), b""
-
-    def _reboot(self, servo: EmulatedServo, _: bytes, t: float) -> tuple[int, bytes]:
-        servo.reboot(t)
-        return protocol.OK, b""
-
-    def _unknown(self, servo: EmulatedServo, _: bytes, t: float) -> tuple[int, bytes]:
-        return protocol.INSTRUCTION_ERROR, b""
+                    servo.write(address, data[i - length : i], t)
 
 
-def _word(data: bytes, at: int) -> int:
-    return data[at] | data[at + 1] << 8
+def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> Reply:
+    return Reply(servo.return_delay, framing.status(servo.id, error | servo.alert, data))
+
+
+def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> tuple[int, bytes]:
+    """Let a servo do an instruction; error number and data of its reply."""
+    match instruction:
+        case framing.PING:
+            return framing.OK, struct.pack("<HB", servo.model.number, servo.firmware)
+        case framing.READ:
+            if len(data) != _SPAN.size:
+                return framing.DATA_LENGTH, b""
+            address, length = _SPAN.unpack(data)
+            values = servo.read(address, length, t)
+            return (framing.ACCESS, b"") if values is None else (framing.OK, values)
+        case framing.WRITE | framing.REG_WRITE:
+            if len(data) < 3:
+                return framing.DATA_LENGTH, b""
+            address = data[0] | data[1] << 8
+            if instruction == framing.WRITE:
+                return servo.write(address, data[2:], t), b""
+            return servo.register(address, data[2:]), b""
+        case framing.ACTION:
+            return servo.action(t), b""
+        case framing.FACTORY_RESET:
+            return servo.factory_reset(data, t), b""
+        case framing.REBOOT:
+            servo.reboot(t)
+            return framing.OK, b""
+        case framing.CLEAR:
+            return servo.clear(data, t), b""
+        case framing.BACKUP:
+            return servo.backup(data, t), b""
+    return framing.INSTRUCTION_ERROR, b""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import ServoModel
-from softfinger.daemon.simulation.servo_model.control_table import ControlTable
+from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
 OVERLOAD_TIME = 2.0  # s at the current limit
 SENSE = 0.010  # s between two looks

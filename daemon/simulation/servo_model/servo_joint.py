@@ -12,7 +12,7 @@ import struct
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.control_table import JointScale, ServoModel
-from softfinger.daemon.simulation.servo_model.control_table import ControlTable
+from softfinger.daemon.simulation.servo_model.registers import ControlTable
 from softfinger.daemon.simulation.servo_model.trajectory import Profile
 
 STEP = 0.001  # s: trajectories, velocity and PWM modes

@@ -1,7 +1,7 @@
-"""Dynamixel Protocol 2.0 framing as a servo does it: CRC, byte stuffing, packets and their parser.
+"""Dynamixel Protocol 2.0 framing as a servo does it: byte stuffing, packets and their parser.
 
-Bytes in, bytes out; no port and no control table. It shares no code with the SDK nor with our own
-packet handler, so that a test of one against the other means something.
+Bytes in, bytes out. It shares only the CRC with the client, so that a test of one against the other
+means something.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BULK_READ: Final = 0x92
 BULK_WRITE: Final = 0x93
 FAST_BULK_READ: Final = 0x9A
 
-# Error numbers of a status packet; bit 7 beside them tells of a hardware error.
+# Error numbers of a status packet; bit 7 (ALERT) beside them means a hardware error.
 OK: Final = 0x00
 RESULT_FAIL: Final = 0x01
 INSTRUCTION_ERROR: Final = 0x02
@@ -48,21 +48,9 @@ _ASKED_AGAIN: Final = frozenset((READ, SYNC_READ, FAST_SYNC_READ, BULK_READ, FAS
 _KNOWN: Final = 32  # requests remembered
 
 
-def stuff(body: bytes) -> bytes:
-    """``body`` (instruction and parameters) with an FD after each FF FF FD."""
-    return body.replace(HEADER, _STUFFED)
-
-
-def unstuff(body: bytes) -> bytes:
-    """The inverse of :func:`stuff`."""
-    return body.replace(_STUFFED, HEADER)
-
-
 def frame(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
     """A whole packet on the wire: header, stuffed body, length that counts the stuffing, CRC."""
-    body = bytes((instruction,)) + parameters
-    if HEADER in body:
-        body = stuff(body)
+    body = (bytes((instruction,)) + parameters).replace(HEADER, _STUFFED)
     length = len(body) + 2
     packet = _PREFIX + bytes((packet_id, length & 0xFF, length >> 8)) + body
     return packet + crc16(packet).to_bytes(2, "little")
@@ -165,9 +153,7 @@ class Parser:
             raw = bytes(buffer[:end])
             del buffer[:end]
             valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
-            body = raw[7:-2]
-            if _STUFFED in body:
-                body = unstuff(body)
+            body = raw[7:-2].replace(_STUFFED, HEADER)
             return Packet(packet_id, body[0], body[1:], valid, end)
         return None
 

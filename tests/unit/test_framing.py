@@ -8,56 +8,54 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.servos.crc import crc16
-from softfinger.daemon.simulation.servo_model import protocol
-from softfinger.daemon.simulation.servo_model.protocol import (
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import (
     BROADCAST,
     Parser,
     frame,
     status,
-    stuff,
-    unstuff,
 )
 
 # From the maker's Protocol 2.0 manual: (id, instruction, parameters, packet).
 INSTRUCTIONS = [
-    (1, protocol.PING, "", "FFFFFD00010300 01 194E"),
-    (BROADCAST, protocol.PING, "", "FFFFFD00FE0300 01 3142"),
-    (1, protocol.READ, "84000400", "FFFFFD00010700 02 84000400 1D15"),
-    (1, protocol.WRITE, "740000020000", "FFFFFD00010900 03 740000020000 CA89"),
-    (1, protocol.REG_WRITE, "6800C8000000", "FFFFFD00010900 04 6800C8000000 AE8E"),
-    (1, protocol.ACTION, "", "FFFFFD00010300 05 02CE"),
-    (1, protocol.FACTORY_RESET, "01", "FFFFFD00010400 06 01 A1E6"),
-    (1, protocol.REBOOT, "", "FFFFFD00010300 08 2F4E"),
-    (1, protocol.CLEAR, "0144584C22", "FFFFFD00010800 10 0144584C22 B1DC"),
-    (1, protocol.BACKUP, "014354524C", "FFFFFD00010800 20 014354524C 16F5"),
-    (BROADCAST, protocol.SYNC_READ, "840004000102", "FFFFFD00FE0900 82 840004000102 CEFA"),
+    (1, framing.PING, "", "FFFFFD00010300 01 194E"),
+    (BROADCAST, framing.PING, "", "FFFFFD00FE0300 01 3142"),
+    (1, framing.READ, "84000400", "FFFFFD00010700 02 84000400 1D15"),
+    (1, framing.WRITE, "740000020000", "FFFFFD00010900 03 740000020000 CA89"),
+    (1, framing.REG_WRITE, "6800C8000000", "FFFFFD00010900 04 6800C8000000 AE8E"),
+    (1, framing.ACTION, "", "FFFFFD00010300 05 02CE"),
+    (1, framing.FACTORY_RESET, "01", "FFFFFD00010400 06 01 A1E6"),
+    (1, framing.REBOOT, "", "FFFFFD00010300 08 2F4E"),
+    (1, framing.CLEAR, "0144584C22", "FFFFFD00010800 10 0144584C22 B1DC"),
+    (1, framing.BACKUP, "014354524C", "FFFFFD00010800 20 014354524C 16F5"),
+    (BROADCAST, framing.SYNC_READ, "840004000102", "FFFFFD00FE0900 82 840004000102 CEFA"),
     (
         BROADCAST,
-        protocol.SYNC_WRITE,
+        framing.SYNC_WRITE,
         "74000400 0196000000 02AA000000",
         "FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287",
     ),
     (
         BROADCAST,
-        protocol.BULK_READ,
+        framing.BULK_READ,
         "0190000200 0292000100",
         "FFFFFD00FE0D00 92 0190000200 0292000100 1A05",
     ),
     (
         BROADCAST,
-        protocol.BULK_WRITE,
+        framing.BULK_WRITE,
         "0120000200A000 021F00010050",
         "FFFFFD00FE1000 93 0120000200A000 021F00010050 B768",
     ),
     (
         BROADCAST,
-        protocol.FAST_SYNC_READ,
+        framing.FAST_SYNC_READ,
         "84000400 030704",
         "FFFFFD00FE0A00 8A 84000400 030704 20F2",
     ),
     (
         BROADCAST,
-        protocol.FAST_SYNC_READ,
+        framing.FAST_SYNC_READ,
         "44020400 0102",
         "FFFFFD00FE0900 8A 44020400 0102 72F2",
     ),
@@ -91,8 +89,8 @@ def test_published_status_packets() -> None:
     ("packet_id", "instruction", "parameters", "misprint"),
     [
         # Printed with the CRC of the fast sync read example.
-        (BROADCAST, protocol.FAST_BULK_READ, "0384000400 077C000200 0492000100", "20F2"),
-        (1, protocol.BACKUP, "024354524C", "92F5"),
+        (BROADCAST, framing.FAST_BULK_READ, "0384000400 077C000200 0492000100", "20F2"),
+        (1, framing.BACKUP, "024354524C", "92F5"),
     ],
 )
 def test_published_packets_whose_printed_crc_is_wrong(
@@ -118,17 +116,18 @@ def test_crc_equals_long_division_and_the_sdk(data: bytes) -> None:
 
 @given(payloads)
 def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
-    stuffed = stuff(body)
-    assert unstuff(stuffed) == body
-    at = stuffed.find(b"\xff\xff\xfd")
+    packet = frame(1, framing.WRITE, body)
+    at = packet.find(b"\xff\xff\xfd", 7)
     while at >= 0:
-        assert stuffed[at + 3] == 0xFD
-        at = stuffed.find(b"\xff\xff\xfd", at + 1)
+        assert packet[at + 3] == 0xFD
+        at = packet.find(b"\xff\xff\xfd", at + 1)
+    (parsed,) = Parser().feed(packet, 0.0)
+    assert parsed.parameters == body
 
 
 def test_stuffing_of_goal_current_minus_one_and_goal_velocity_minus_three() -> None:
     goals = (-1).to_bytes(2, "little", signed=True) + (-3).to_bytes(4, "little", signed=True)
-    packet = frame(1, protocol.WRITE, b"\x66\x00" + goals)
+    packet = frame(1, framing.WRITE, b"\x66\x00" + goals)
     assert packet[8:-2] == bytes.fromhex("6600 FFFF FDFD FFFFFF")
     assert packet[5] == len(packet) - 7
     (parsed,) = Parser().feed(packet, 0.0)
@@ -160,14 +159,14 @@ def test_parser_finds_every_packet_however_the_bytes_come(
 def test_parser_recovers_after_any_noise(noise: bytes, body: bytes) -> None:
     parser = Parser(gap=0.0015)
     parser.feed(noise, 0.0)
-    found = parser.feed(frame(7, protocol.WRITE, body), 1.0)
+    found = parser.feed(frame(7, framing.WRITE, body), 1.0)
     assert [(p.id, p.parameters, p.valid) for p in found] == [(7, body, True)]
 
 
 def test_a_cut_packet_does_not_swallow_the_next() -> None:
-    whole = frame(1, protocol.WRITE, bytes(20))
-    found = Parser().feed(whole[:15] + frame(2, protocol.PING), 0.0)
-    assert [(p.id, p.instruction) for p in found] == [(2, protocol.PING)]
+    whole = frame(1, framing.WRITE, bytes(20))
+    found = Parser().feed(whole[:15] + frame(2, framing.PING), 0.0)
+    assert [(p.id, p.instruction) for p in found] == [(2, framing.PING)]
 
 
 def test_an_unstuffed_packet_is_not_obeyed() -> None:
@@ -178,14 +177,14 @@ def test_an_unstuffed_packet_is_not_obeyed() -> None:
 
 
 def test_a_damaged_packet_is_told_apart() -> None:
-    damaged = bytearray(frame(1, protocol.READ, bytes(4)))
+    damaged = bytearray(frame(1, framing.READ, bytes(4)))
     damaged[9] ^= 4
     (packet,) = Parser().feed(bytes(damaged), 0.0)
     assert not packet.valid
 
 
 def test_silence_within_a_packet_ends_it() -> None:
-    packet = frame(1, protocol.PING)
+    packet = frame(1, framing.PING)
     parser = Parser(gap=0.0015)
     assert parser.feed(packet[:6], 0.0) == []
     assert parser.feed(packet[6:], 0.002) == []
@@ -195,4 +194,4 @@ def test_silence_within_a_packet_ends_it() -> None:
 
 @pytest.mark.parametrize("bad_id", [0xFD, 0xFF])
 def test_ids_that_no_servo_may_have(bad_id: int) -> None:
-    assert Parser().feed(frame(bad_id, protocol.PING), 0.0) == []
+    assert Parser().feed(frame(bad_id, framing.PING), 0.0) == []

@@ -1,7 +1,6 @@
-"""The control table of an emulated servo: its items, their access, defaults and ranges, its bytes.
+"""The registers of an emulated servo: access, defaults and ranges, their bytes, forbidden writes.
 
-Holds the memory and says which write is allowed by the table alone. What a write does, and limits
-that depend on other registers, belong to :mod:`simulation.servo_model.servo`.
+What a write does besides changing registers belongs to :mod:`simulation.servo_model.servo`.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import ServoModel
-from softfinger.daemon.simulation.servo_model import protocol
+from softfinger.daemon.simulation.servo_model import framing
 
 _GAIN_MAX = 16_383
 _PROFILE_MAX = 32_767
@@ -19,14 +18,18 @@ _OFFSET_MAX = 1_044_479
 _MULTI_TURN = 1_048_575
 _STARTUP_FIRMWARE = 45
 _LAYOUTS = 64  # spans whose layout is remembered
-_FORMATS = {
-    (1, False): "<B",
-    (2, False): "<H",
-    (4, False): "<I",
-    (1, True): "<b",
-    (2, True): "<h",
-    (4, True): "<i",
+_FORMATS = {1: "<B", 2: "<H", 4: "<I"}
+_GOALS = (reg.GOAL_PWM, reg.GOAL_CURRENT, reg.GOAL_VELOCITY, reg.GOAL_POSITION)
+_LIMITS = {
+    reg.GOAL_PWM: reg.PWM_LIMIT,
+    reg.GOAL_CURRENT: reg.CURRENT_LIMIT,
+    reg.GOAL_VELOCITY: reg.VELOCITY_LIMIT,
 }
+_PAIRS = {  # lower and upper limits of the same thing
+    reg.MIN_POSITION_LIMIT: reg.MAX_POSITION_LIMIT,
+    reg.MIN_VOLTAGE_LIMIT: reg.MAX_VOLTAGE_LIMIT,
+}
+_UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +61,13 @@ def _setting(
     return Item(address, size, True, default, low, high, low < 0, backed_up)
 
 
-def items_of(model: ServoModel, firmware: int) -> list[Item]:
+def _gain(address: int, default: int) -> Item:
+    return _setting(address, 2, default, 0, _GAIN_MAX, backed_up=True)
+
+
+def _items_of(model: ServoModel, firmware: int) -> list[Item]:
     """All registers of that model and firmware, by address."""
+    low, high = model.voltage_min, model.voltage_max
     items = [
         _read_only(reg.MODEL_NUMBER, 2, model.number),
         _read_only(reg.MODEL_INFORMATION, 4),
@@ -74,8 +82,8 @@ def items_of(model: ServoModel, firmware: int) -> list[Item]:
         _setting(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
         _setting(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
         _setting(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),
-        _setting(reg.MAX_VOLTAGE_LIMIT, 2, model.voltage_max, model.voltage_min, model.voltage_max),
-        _setting(reg.MIN_VOLTAGE_LIMIT, 2, model.voltage_min, model.voltage_min, model.voltage_max),
+        _setting(reg.MAX_VOLTAGE_LIMIT, 2, high, low, high),
+        _setting(reg.MIN_VOLTAGE_LIMIT, 2, low, low, high),
         _setting(reg.PWM_LIMIT, 2, 885, 0, 885),
         _setting(reg.VELOCITY_LIMIT, 4, model.velocity_limit, 0, model.velocity_max),
         _setting(reg.MAX_POSITION_LIMIT, 4, 4095, 0, 4095),
@@ -128,63 +136,41 @@ def items_of(model: ServoModel, firmware: int) -> list[Item]:
     return sorted(items, key=lambda item: item.address)
 
 
-def _gain(address: int, default: int) -> Item:
-    return _setting(address, 2, default, 0, _GAIN_MAX, backed_up=True)
-
-
 class ControlTable:
     """The registers' bytes, with access by value and by the span of a packet.
 
-    Addresses between the items read as 0. ``memory`` may be written directly by the servo.
+    Addresses between the registers read as 0. ``memory`` may be written directly by the servo.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
-        self.items = items_of(model, firmware)
+        self.items = _items_of(model, firmware)
         self.size = model.highest_address(firmware) + 1
         self.memory = bytearray(self.size)
         self.at = {item.address: item for item in self.items}
+        self._modes = model.modes
         self._start: list[int | None] = [None] * self.size  # byte → its item's first address
+        self._unpack = {}
         for item in self.items:
             self._start[item.address : item.address + item.size] = [item.address] * item.size
+            form = _FORMATS[item.size]
+            unpack = struct.Struct(form.lower() if item.signed else form).unpack_from
+            self._unpack[item.address] = unpack
         self._indirect = {
             data + i: address + 2 * i
             for address, data, entries in model.indirect_blocks(firmware)
             for i in range(entries)
         }
         self._first_indirect = min(self._indirect)
-        self._unpack = {
-            item.address: struct.Struct(_FORMATS[item.size, item.signed]).unpack_from
-            for item in self.items
-        }
-        self._pack = {
-            item.address: struct.Struct(_FORMATS[item.size, item.signed]).pack_into
-            for item in self.items
-        }
-        self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int, int]]]] = {}
+        self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int]]]] = {}
+        self._backup: dict[int, int] = {}
         self.reset()
 
-    def reset(self, keep: tuple[int, ...] = ()) -> None:
-        """Factory defaults everywhere but in the items at the addresses ``keep``."""
-        for item in self.items:
-            if item.address not in keep:
-                self.set(item.address, item.default)
-
-    def reset_ram(self, keep_backed_up: bool = False) -> None:
-        """RAM back to its defaults, as after a power-up."""
-        for item in self.items:
-            if not item.saved and not (keep_backed_up and item.backed_up):
-                self.set(item.address, item.default)
+    # --- values ----------------------------------------------------------------------------------
 
     def get(self, address: int) -> int:
         """Value of the item at that address."""
         value: int = self._unpack[address](self.memory, address)[0]
         return value
-
-    def put(self, item: Item, value: int) -> None:
-        """Store a value that lies in the item's range."""
-        self._pack[item.address](self.memory, item.address, value)
-        if item.backed_up:
-            self._layouts.clear()
 
     def set(self, address: int, value: int) -> None:
         """Store a value, access rights aside; too great a value keeps its low bytes."""
@@ -193,6 +179,43 @@ class ControlTable:
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
         if item.backed_up:  # indirect addresses are among these
             self._layouts.clear()
+
+    def reset(self, keep: tuple[int, ...] = ()) -> None:
+        """Factory defaults everywhere but in the items at the addresses ``keep``."""
+        for item in self.items:
+            if item.address not in keep:
+                self.set(item.address, item.default)
+
+    def reset_ram(self) -> None:
+        """RAM as after a power-up: defaults, or the backup where the settings ask for it."""
+        for item in self.items:
+            if not item.saved:
+                self.set(item.address, item.default)
+        if self._backup:
+            if self.memory[reg.STARTUP_CONFIGURATION] & 2:
+                self._restore(saved=False)
+            self.set(reg.BACKUP_READY, 1)
+
+    def back_up(self) -> None:
+        """Keep EEPROM, and the RAM that the manual names, over reboots."""
+        self._backup = {
+            item.address: self.get(item.address)
+            for item in self.items
+            if item.writable and (item.saved or item.backed_up)
+        }
+        self.set(reg.BACKUP_READY, 1)
+
+    def restore(self) -> bool:
+        """Bring EEPROM back from the backup; False when there is none."""
+        self._restore(saved=True)
+        return bool(self._backup)
+
+    def _restore(self, saved: bool) -> None:
+        for address, value in self._backup.items():
+            if self.at[address].saved == saved:
+                self.set(address, value)
+
+    # --- reading ---------------------------------------------------------------------------------
 
     def holds(self, address: int, length: int) -> bool:
         """Whether the span lies inside the table."""
@@ -222,26 +245,31 @@ class ControlTable:
             return False
         return any(first <= self.resolve(i) <= last for i in range(address, end))
 
+    # --- writing ---------------------------------------------------------------------------------
+
     def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        """What a write would do by the table alone: (error, the items with their new values).
+        """What a write would do: (error, the items with their new values).
 
         Every item must be written whole; one that is cut gives DATA_LENGTH, a read-only or
         undefined byte ACCESS, a value out of the item's own range DATA_RANGE. With an error
-        nothing is to be written, the items before the bad one neither.
+        nothing is to be written, the items before the bad one neither; the values that were
+        understood are there all the same where only another register forbids one.
         """
         error, layout = self._layout(address, len(data))
         if error:
             return error, []
         plan: list[tuple[Item, int]] = []
-        for item, begin, _ in layout:
+        for item, begin in layout:
             (value,) = self._unpack[item.address](data, begin)
             if not item.low <= value <= item.high:
-                return protocol.DATA_RANGE, []
+                return framing.DATA_RANGE, []
             plan.append((item, value))
-        return protocol.OK, plan
+        for item, value in plan:
+            error = error or self._refusal(item, value)
+        return error, plan
 
     def values(self, address: int, data: bytes) -> dict[int, int]:
-        """What a write has for each register that it holds whole, allowed or not."""
+        """The value of each register that a write has whole, allowed or not."""
         places = [self.resolve(i) for i in range(address, min(address + len(data), self.size))]
         found = {}
         for i, place in enumerate(places):
@@ -249,11 +277,10 @@ class ControlTable:
             if item is not None and places[i : i + item.size] == list(
                 range(place, place + item.size)
             ):
-                raw = data[i : i + item.size]
-                found[place] = int.from_bytes(raw, "little", signed=item.signed)
+                (found[place],) = self._unpack[place](data, i)
         return found
 
-    def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
+    def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
         """Which items a span writes, with their places in its data, or the error it makes."""
         known = self._layouts.get((address, length))
         if known is None:
@@ -262,23 +289,57 @@ class ControlTable:
                 self._layouts[address, length] = known
         return known
 
-    def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int, int]]]:
+    def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
         if length == 0:
-            return protocol.DATA_LENGTH, []
+            return framing.DATA_LENGTH, []
         if address + length > self.size:
-            return protocol.ACCESS, []
+            return framing.ACCESS, []
         places = [self.resolve(i) for i in range(address, address + length)]
-        layout: list[tuple[Item, int, int]] = []
+        layout: list[tuple[Item, int]] = []
         i = 0
         while i < length:
             start = self._start[places[i]]
             if start is None:
-                return protocol.ACCESS, []
+                return framing.ACCESS, []
             item = self.at[start]
             if not item.writable or places[i] != start:
-                return protocol.ACCESS, []
+                return framing.ACCESS, []
             if places[i : i + item.size] != list(range(start, start + item.size)):
-                return protocol.DATA_LENGTH, []
-            layout.append((item, i, i + item.size))
+                return framing.DATA_LENGTH, []
+            layout.append((item, i))
             i += item.size
-        return protocol.OK, layout
+        return framing.OK, layout
+
+    def _refusal(self, item: Item, value: int) -> int:
+        """The error of writing ``value`` because of what other registers hold; OK if allowed."""
+        memory, address = self.memory, item.address
+        if address in _GOALS:
+            if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
+                return framing.DATA_RANGE
+            return framing.OK if self._within_limit(address, value) else framing.DATA_LIMIT
+        if item.saved and memory[reg.TORQUE_ENABLE]:
+            return framing.ACCESS
+        if address == reg.OPERATING_MODE and value not in self._modes:
+            return framing.DATA_RANGE
+        if address == reg.BUS_WATCHDOG and value and memory[address] == reg.WATCHDOG_ERROR:
+            return framing.DATA_RANGE
+        if address == reg.TORQUE_ENABLE and value and self.shut_down:
+            return framing.RESULT_FAIL
+        if address in _PAIRS and value > self.get(_PAIRS[address]):
+            return framing.DATA_LIMIT
+        if address in _UPPER and value < self.get(_UPPER[address]):
+            return framing.DATA_LIMIT
+        return framing.OK
+
+    def _within_limit(self, address: int, value: int) -> bool:
+        if address != reg.GOAL_POSITION:
+            return abs(value) <= self.get(_LIMITS[address])
+        if self.memory[reg.OPERATING_MODE] != reg.POSITION_MODE:
+            return True
+        low, high = self.get(reg.MIN_POSITION_LIMIT), self.get(reg.MAX_POSITION_LIMIT)
+        return low <= value <= high
+
+    @property
+    def shut_down(self) -> bool:
+        """Whether a hardware error that the shutdown mask has keeps torque off."""
+        return bool(self.memory[reg.HARDWARE_ERROR_STATUS] & self.memory[reg.SHUTDOWN])
