@@ -23,9 +23,9 @@ def run(arguments: argparse.Namespace) -> int:
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
-    from softfinger.daemon.safety.limits import ROWS
+    from softfinger.daemon.safety.limits import LIMITS
 
-    lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in ROWS]
+    lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in LIMITS]
     widths = [max(len(line[column]) for line in lines) for column in range(3)]
     for line in lines:
         cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]

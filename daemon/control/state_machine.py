@@ -2,7 +2,7 @@
 
 Holds what each mode does and when it passes into the next. Which command is heard when stands in
 `control.modes`, what else speaks against one in `loop.requests`, the grip law in `control.grip`,
-limits that must not be trusted to a control law in `safety.safety`.
+limits that must not be trusted to a control law in `safety.supervisor`.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.safety import BUS, Safety
+from softfinger.daemon.safety.supervisor import BUS, Safety
 from softfinger.daemon.safety.torque_state import Drive
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import State, Truth

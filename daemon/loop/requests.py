@@ -16,7 +16,7 @@ from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
-from softfinger.daemon.safety.safety import Safety
+from softfinger.daemon.safety.supervisor import Safety
 from softfinger.daemon.safety.torque_state import Drive
 from softfinger.daemon.types import FINGERS, State
 

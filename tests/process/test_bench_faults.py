@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.profile.load import load
+from softfinger.daemon.safety.limits import LIMITS
 from softfinger.tools.bench import ON_DEMAND
 from softfinger.tools.benchmarks import faults, faults_trials
 from softfinger.tools.benchmarks.faults import Outcome
@@ -181,9 +182,8 @@ def test_the_command_line(monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path
 
 
 def test_every_fault_that_latches_has_a_time_and_names_that_exist() -> None:
-    from softfinger.daemon.safety.limits import ROWS
 
-    rows = {row.name for row in ROWS}
+    rows = {row.name for row in LIMITS}
     assert len({case.name for case in CASES}) == len(CASES)
     for case in CASES:
         assert isinstance(case, Case)

@@ -18,7 +18,7 @@ from tests.harness.gateway import Served
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
 
 
-def test_a_goal_that_is_no_number_is_a_fault_though_a_command_was_refused_for_it(
+def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
     make: Make,
 ) -> None:
     daemon = make()
@@ -26,7 +26,7 @@ def test_a_goal_that_is_no_number_is_a_fault_though_a_command_was_refused_for_it
     daemon.loop.advance(0.1)
     daemon.loop.state.goal.q[0] = math.nan
     daemon.loop._safety.bound(daemon.loop.state)
-    assert "a goal was no number" in refusal(daemon, "grasp")
+    assert "a non-finite goal" in refusal(daemon, "grasp")
     daemon.loop.advance(daemon.loop.period)
     assert daemon.loop.state.fault_name == "goal.number"
     command(daemon, "clear")

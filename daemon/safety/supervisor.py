@@ -1,0 +1,257 @@
+"""The last stage before the servos: judges every state, bounds every goal, and sends it.
+
+`Safety.write` is the only way from a goal to the bus, and bounds what it sends. What is judged
+stands in one table, `safety.limits.LIMITS`; here stands when, that a warning is reported once, and
+how long something must last to be a fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from softfinger.daemon.control.modes import GRIPPING, Mode
+from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.limits import LIMITS, Limit, View, holding
+from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.types import Goal, State
+
+_AGAIN = 1.0  # s after which a warning that was over may be reported again
+_EASE = 0.95  # hysteresis: what was reported stands until it falls below so much of its bound
+
+BUS = "servos.bus"  # the limit of what the servo backend itself refuses
+TORQUE_OFF = "torque.off"  # of torque off that is not confirmed, `safety.torque_state`
+
+
+class Finding(NamedTuple):
+    """A limit that is broken: its name, and what was found."""
+
+    name: str
+    text: str
+
+
+class _Watch:
+    """One limit of a scene, and since when it is broken."""
+
+    def __init__(self, limit: Limit, view: View) -> None:
+        self.limit = limit
+        self._view = view
+        self._terms = [(i, holding(term)) for i, term in limit.terms(view, "share")]
+        lasts = limit.lasts
+        self._lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
+        self.since = math.inf  # broken since then, inf: it is not
+        self._ended = -math.inf
+        self.reported = False
+
+    def find(self, state: State, share: float) -> str:
+        """What breaks this share of the limit in this state, or an empty text."""
+        view, limit = self._view, self.limit
+        if limit.check is not None:
+            return limit.check(view, state, share)
+        for i, holds in self._terms:
+            if not holds(state, state.reading, state.contacts, view, share):
+                assert limit.text is not None
+                return limit.text(view, state, i, share)
+        return ""
+
+    def cause(self, state: State) -> str:
+        """What stands now, and has for long enough; nothing is changed by asking."""
+        lasted = state.t - self.since >= self._lasts if self.since < math.inf else not self._lasts
+        return self.find(state, self.limit.share) if lasted else ""
+
+    def look(self, state: State) -> str:
+        """The same at this tick, taken in."""
+        if self.limit.remember is not None:
+            self.limit.remember(self._view, state)
+        found = self.find(state, self.limit.share * (_EASE if self.reported else 1.0))
+        if not found:
+            if self.since < math.inf:
+                self.since = math.inf
+                self._ended = state.t
+            if self.reported and state.t - self._ended > _AGAIN:
+                self.reported = False
+            return ""
+        self.since = min(self.since, state.t)
+        return found if state.t - self.since >= self._lasts else ""
+
+
+class Safety:
+    """Judges states and bounds goals. One thread, the loop's, may call it."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        has_servos: bool,
+        has_sensors: bool,
+        grasp: GraspState | None = None,
+        sensors: Sequence[FingerPerception] = (),
+    ) -> None:
+        """``grasp`` and ``sensors`` are the loop's own, looked at and never changed."""
+        view = self._view = View(settings, grasp, sensors)
+        limits, hand = settings.safety, settings.hand
+        self._limits = limits
+        self._has_servos, self._has_sensors = has_servos, has_sensors
+        there = {"": True, "servos": has_servos, "sensors": has_sensors}
+        rows = [limit for limit in LIMITS if limit.holds or limit.check is not None]
+        watches = [_Watch(limit, view) for limit in rows if there[limit.needs]]
+        self._each_tick = [each for each in watches if each.limit.holds and not each.limit.in_turn]
+        self._in_turn = [each for each in watches if each not in self._each_tick]
+        # In the table's order: the first one that stands is the fault's name.
+        self._faults = [watch for watch in watches if watch.limit.level == "fault"]
+        # While this one expression holds, none of each tick's limits is broken. A fault whose
+        # warning comes before it is broken only where that is.
+        share = {watch.limit.holds: watch.limit.share for watch in reversed(self._each_tick)}
+        terms = [
+            f"({term})"
+            for watch in self._each_tick
+            if watch.limit.share == share[watch.limit.holds]
+            for _, term in watch.limit.terms(view, str(watch.limit.share))
+        ]
+        self._holds = holding(" and ".join(terms))
+        self._turn = 0
+        self._busy = False  # a limit of each tick is broken, or was a moment ago
+        self._found: dict[_Watch, str] = {}  # faults that stand
+        self.warnings: list[Finding] = []  # to be reported; the loop empties it
+        self.limited: Counter[str] = Counter()  # ticks in which a goal was changed, by limit
+        self._hold_age = limits.frame_age_hold / settings.tactile.rate
+        dt = 1.0 / settings.loop.rate
+        self._step = limits.goal_speed * dt
+        # In position mode no current bounds what a jump does.
+        self._reach = 0.0 if settings.servos.mode == "position" else limits.goal_reach
+        self._rise = limits.current_rate * dt
+        self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]
+        self._sent_q = [0.0, 0.0]
+        self._sent_current = [0.0, 0.0]
+        self._sent_seq = -2
+
+    # Judging
+
+    def judge(self, state: State) -> Finding | None:
+        """Look at this tick's state; the first fault that stands, if any.
+
+        Warnings that are new are added to ``warnings``.
+        """
+        view = self._view
+        if self._has_servos:
+            view.motion.follow(state.t, state.reading)
+        if self._busy or not self._holds(state, state.reading, state.contacts, view, 1.0):
+            self._busy = False
+            for watch in self._each_tick:
+                self._look(watch, state)
+                self._busy = self._busy or watch.reported or watch.since < math.inf
+            view.bad_goal = False
+        if self._in_turn:
+            self._turn = (self._turn + 1) % len(self._in_turn)
+            self._look(self._in_turn[self._turn], state)
+        if not self._found:
+            return None
+        gripping = state.mode in GRIPPING
+        for watch in self._faults:
+            if watch in self._found and (gripping or not watch.limit.gripping):
+                return Finding(watch.limit.name, self._found[watch])
+        return None
+
+    def _look(self, watch: _Watch, state: State) -> None:
+        found = watch.look(state)
+        if watch.limit.level == "fault":
+            if found:
+                self._found[watch] = found
+            else:
+                self._found.pop(watch, None)
+        elif found and not watch.reported:
+            watch.reported = True
+            self.warnings.append(Finding(watch.limit.name, found))
+
+    def cause(self, state: State, gripping: bool = False) -> str:
+        """The first fault that stands in this state, or an empty text: what refuses a command.
+
+        With ``gripping`` the limits of a grip are judged, whatever the mode. Nothing is changed.
+        """
+        gripping = gripping or state.mode in GRIPPING
+        for watch in self._faults:
+            if (gripping or not watch.limit.gripping) and (found := watch.cause(state)):
+                return found
+        return ""
+
+    def must_hold(self, state: State) -> bool:
+        """Frames are late: nothing is moved on until one comes or a fault latches."""
+        if not self._has_sensors:
+            return False
+        oldest = state.t - self._hold_age
+        contacts = state.contacts
+        for i in self._view.fingers:
+            if contacts[i].t_sound < oldest and state.mode in GRIPPING:
+                self.limited["tactile.late"] += 1
+                return True
+        return False
+
+    def opens_first(self, finding: Finding, mode: Mode | str) -> bool:
+        """The hand shall open before this fault takes its torque."""
+        wanted = self._limits.frame_age_action == "open"
+        return wanted and finding.name == "tactile.silent" and mode in GRIPPING
+
+    # Goals
+
+    def write(self, servos: Servos, state: State) -> None:
+        """Bound the state's goal and send it; a non-finite goal is not sent.
+
+        Raises ServoError as `Servos.write` does.
+        """
+        self.bound(state)
+        if state.goal.valid:
+            servos.write(state.goal)
+
+    def bound(self, state: State) -> None:
+        """Bound the goal in place; a non-finite goal becomes invalid."""
+        goal = state.goal
+        q, current = goal.q, goal.current
+        present = state.reading.q
+        if state.seq - self._sent_seq != 1:  # torque was off: from the present angle, no current
+            self._sent_q[:] = present
+            self._sent_current[:] = (0.0, 0.0)
+        self._sent_seq = state.seq
+        sent, reach, most = self._sent_current, self._reach, self._limits.current_max
+        for i, low, high in self._ends:
+            wanted = current[i]
+            if (
+                not (low <= q[i] <= high and -reach <= q[i] - present[i] <= reach)
+                or not 0.0 <= wanted <= most
+                or wanted > sent[i] + self._rise
+            ):
+                self._bound_one(goal, i, low, high, present[i])
+                if not goal.valid:
+                    return
+            self._sent_q[i] = q[i]
+            sent[i] = current[i]
+
+    def _bound_one(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
+        q, current = goal.q[i], goal.current[i]
+        if not (math.isfinite(q) and math.isfinite(current)):
+            goal.valid = False
+            self._view.bad_goal = True
+            return
+        inside = min(max(q, low), high)
+        if inside != q:
+            self._count("goal.angle")
+        sent = self._sent_q[i]
+        lowest = min(sent, present - self._reach) - self._step
+        highest = max(sent, present + self._reach) + self._step
+        near = min(max(inside, lowest), highest)
+        if near != inside:
+            self._count("goal.step")
+        # The joint's limits have the last word.
+        goal.q[i] = min(max(near, low), high)
+        most = min(max(current, 0.0), self._limits.current_max)
+        if most != current:
+            self._count("goal.current")
+        slow = min(most, self._sent_current[i] + self._rise)
+        if slow != most:
+            self._count("goal.slew")
+        goal.current[i] = slow
+
+    def _count(self, name: str) -> None:
+        self.limited[name] += 1
