@@ -23,8 +23,9 @@ import zmq
 
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_keys, client_keys, nothing
-from softfinger.tools.terminal.feed import FINGERS, Feed, number, text
+from softfinger.tools.terminal.feed import Feed, number, text
 from softfinger.tools.terminal.feed_sockets import Commander, Subscriber
 from softfinger.tools.terminal.monitor_keys import HandKeys
 from softfinger.tools.terminal.monitor_page import Page

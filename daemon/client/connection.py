@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import msgpack
@@ -60,6 +61,15 @@ def subscribe(
         socket.close()
         raise
     return socket
+
+
+def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
+    """The messages that wait in a socket, at most ``limit``; never waits for one."""
+    for _ in range(limit):
+        try:
+            yield socket.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:

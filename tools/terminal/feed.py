@@ -1,9 +1,8 @@
-"""What the public wire says, kept for one who looks at it: the newest state and frames, the last
-events, statistics over the last second, a short history.
+"""What the live page shows of the stream: state, frames, last events, statistics, a history.
 
-Holds the subscriber's side of the stream, without its sockets (`feed_sockets`), and nothing that
-draws. Every message is taken as data of unknown origin: a missing or wrong-typed field is a
-NaN or an empty text, a message that can't be read is counted and skipped.
+Without the sockets (`feed_sockets`), and nothing that draws. Every message is data of unknown
+origin: a missing or wrong-typed field is NaN or an empty text, a message that can't be read is
+counted and skipped.
 """
 
 from __future__ import annotations
@@ -14,18 +13,27 @@ import statistics
 import time
 from bisect import insort
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.connection import unpack
+from softfinger.daemon.client.records import read
 from softfinger.daemon.control.modes import UNLEASED
 from softfinger.daemon.profile.settings import GRIP_SHARE
-
-FINGERS = ("left", "right")
-SCHEMA = 1  # of hand/state, the newest this module knows
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.schema import (
+    COMMAND,
+    EVENT,
+    SETTINGS,
+    STATE,
+    STATS,
+    TACTILE,
+    TactileFrame,
+)
 
 HISTORY_STEP = 0.2  # s in one column of the trends
 HISTORY_LENGTH = 600
@@ -63,23 +71,20 @@ def printable(value: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class TactileFrame:
-    """One frame as it came. ``scale`` is Pa per count, NaN when the message doesn't tell.
+class ShownFrame:
+    """A tactile frame as the page draws it."""
 
-    ``aspect`` is a cell's height over its width.
-    """
-
-    arrived: float
+    arrived: float  # monotonic s
     rows: int
     cols: int
-    scale: float
-    data: bytes
-    aspect: float = 1.0
+    scale: float  # Pa per count, NaN when unknown
+    counts: NDArray[np.uint16]  # [rows, cols]
+    aspect: float  # a cell's height over its width
 
     def grid(self) -> NDArray[np.float64]:
         """Pressures [rows, cols], Pa; counts where the scale isn't known."""
-        counts = np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
-        return counts * (1.0 if math.isnan(self.scale) else self.scale)
+        scale = 1.0 if math.isnan(self.scale) else self.scale
+        return self.counts.astype(np.float64) * scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +142,7 @@ class Feed:
     def __init__(self) -> None:
         self.state: dict[str, Any] | None = None
         self.state_at = -math.inf
-        self.frames: dict[str, TactileFrame] = {}
+        self.frames: dict[str, ShownFrame] = {}
         self.events: list[Event] = []
         self._news: deque[Event] = deque(maxlen=EVENTS)
         self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
@@ -156,27 +161,23 @@ class Feed:
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
         self._mono = math.nan
+        self.topics: dict[bytes, Callable[[dict[str, Any], float], None]] = {
+            STATE: self._take_state,
+            TACTILE: self._take_frame,
+            EVENT: self._take_event,
+            STATS: self._take_stats,
+            COMMAND: self._take_command,
+            SETTINGS: self._take_settings,
+        }
 
     def take(self, message: list[bytes], now: float) -> None:
         """One message off the wire, whatever it holds."""
         try:
-            topic, payload = message
-            record = msgpack.unpackb(payload)
-            if not isinstance(record, dict):
-                raise ValueError("not a map")
-            if topic == b"hand/state":
-                self._take_state(record, now)
-            elif topic == b"hand/tactile":
-                self._take_frame(record, now)
-            elif topic == b"hand/event":
-                self._take_event(record)
-            elif topic == b"hand/stats":
-                self._take_stats(record)
-            elif topic == b"hand/command":
-                self._take_command(record, now)
-            elif topic == b"hand/settings":
-                self._take_settings(record)
-        except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+            topic, record = unpack(message)
+            take = self.topics.get(topic)
+            if take is not None:
+                take(record, now)
+        except (ValueError, TypeError, RecursionError):
             self.skipped += 1
 
     def _take_state(self, record: dict[str, Any], now: float) -> None:
@@ -216,26 +217,20 @@ class Feed:
         self._bin.append((number(record, "left", "force"), number(record, "right", "force")))
 
     def _take_frame(self, record: dict[str, Any], now: float) -> None:
-        finger, data = record.get("finger"), record.get("data")
-        rows, cols = record.get("rows"), record.get("cols")
-        if finger not in FINGERS or not isinstance(data, bytes):
+        frame = read(TactileFrame, record)
+        if frame.finger not in FINGERS:
             raise ValueError("not a frame of one of the fingers")
-        if type(rows) is not int or type(cols) is not int or min(rows, cols) < 1:
-            raise ValueError("not a grid")
-        if len(data) != 2 * rows * cols:
-            raise ValueError("a grid of another size than told")
-        scale = number(record, "scale")
-        aspect = number(record, "pitch_y") / (number(record, "pitch") or math.nan)
-        self.frames[finger] = TactileFrame(
+        aspect = frame.pitch_y / (frame.pitch or math.nan)
+        self.frames[frame.finger] = ShownFrame(
             now,
-            rows,
-            cols,
-            scale if 0.0 < scale < math.inf else math.nan,
-            data,
+            frame.rows,
+            frame.cols,
+            frame.scale if 0.0 < frame.scale < math.inf else math.nan,
+            frame.counts,
             aspect if 0.01 < aspect < 100.0 else 1.0,
         )
 
-    def _take_event(self, record: dict[str, Any]) -> None:
+    def _take_event(self, record: dict[str, Any], _: float) -> None:
         # Told again for somebody who came later, it has its first seq and times; another daemon's
         # has other times.
         name = number(record, "seq"), number(record, "timestamp")
@@ -259,7 +254,7 @@ class Feed:
             insort(self.events, event, key=lambda each: each.timestamp)
         del self.events[:-EVENTS]
 
-    def _take_stats(self, record: dict[str, Any]) -> None:
+    def _take_stats(self, record: dict[str, Any], _: float) -> None:
         compute, late = (
             tuple(number(record, part, share) for share in ("p50", "p99", "max"))
             for part in ("compute", "wake")
@@ -283,7 +278,7 @@ class Feed:
         if name not in UNLEASED and self._lease > 0.0:
             self.commanding = Commanding(client, now + self._lease)
 
-    def _take_settings(self, record: dict[str, Any]) -> None:
+    def _take_settings(self, record: dict[str, Any], _: float) -> None:
         settings = json.loads(text(record, "settings") or "{}")
         self._lease = number(settings, "commands", "lease")
         warm = number(settings, "safety", "temperature_warn")

@@ -11,13 +11,9 @@ from typing import Any
 import msgpack
 import zmq
 
-from softfinger.daemon.client.connection import PATIENCE, SILENCE
+from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe
 from softfinger.tools.terminal.feed import Feed, field, text
 
-TOPICS = (
-    *(b"hand/state", b"hand/tactile", b"hand/event"),
-    *(b"hand/stats", b"hand/command", b"hand/settings"),
-)
 _DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
@@ -27,24 +23,12 @@ class Subscriber:
 
     def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
         self.feed = feed
-        self._socket = context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, _DRAIN_LIMIT)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
-        for topic in TOPICS:
-            self._socket.setsockopt(zmq.SUBSCRIBE, topic)
-        self._socket.connect(address)
+        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_LIMIT)
 
-    def drain(self, now: float) -> int:
-        """Take what waits; how many messages that was."""
-        for count in range(_DRAIN_LIMIT):
-            try:
-                message = self._socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                return count
+    def drain(self, now: float) -> None:
+        """Take what waits."""
+        for message in drain(self._socket, _DRAIN_LIMIT):
             self.feed.take(message, now)
-        return _DRAIN_LIMIT
 
     def close(self) -> None:
         """Close the socket."""

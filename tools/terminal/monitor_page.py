@@ -16,8 +16,10 @@ from rich.cells import cell_len
 from rich.segment import Segment
 from rich.style import Style
 
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import FINGERS, SCHEMA, Feed, TickStatistics, number, text
+from softfinger.tools.terminal.feed import Feed, TickStatistics, number, text
 from softfinger.tools.terminal.feed import field as value_at
 from softfinger.tools.terminal.feed_sockets import Reply
 from softfinger.tools.terminal.monitor_keys import key_line

@@ -8,20 +8,18 @@ counts, a shorter one for frames, of which the newest is drawn. Only what these 
 from __future__ import annotations
 
 import time
-from types import TracebackType
 from typing import Any
 
-import msgpack
 import zmq
 
-from softfinger.daemon.wire import schema
+from softfinger.daemon.client.connection import drain, subscribe, unpack
 from softfinger.daemon.wire.keys import ClientKeys
+from softfinger.daemon.wire.schema import TACTILE
 from softfinger.tools.viewing.bridge import TOPICS, Bridge
 from softfinger.tools.viewing.errors import ViewError
 
 _QUEUE = 40_000  # messages: 40 MB, 20 s of state and truth at 1 kHz
 _FRAMES = 1_000  # frames: 4 MB, 5 s of two sensors at 100 Hz; 131 MB of the largest grid
-_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 _AT_ONCE = 4_000  # messages read before the other socket has its turn
 
 
@@ -31,26 +29,20 @@ class LiveStream:
     def __init__(self, address: str, keys: ClientKeys | None = None) -> None:
         self.address = address
         self._context: zmq.Context[Any] = zmq.Context()
-        self._sockets: list[zmq.Socket[Any]] = []
-        self._poller = zmq.Poller()
-        small = [topic for topic in TOPICS if topic != schema.TACTILE]
+        small = [topic for topic in TOPICS if topic != TACTILE]
         try:
             if keys is not None:
                 keys.guard(self._context)
-            for topics, queue in ((small, _QUEUE), ([schema.TACTILE], _FRAMES)):
-                socket = self._context.socket(zmq.SUB)
-                self._sockets.append(socket)
-                self._poller.register(socket, zmq.POLLIN)
-                socket.setsockopt(zmq.LINGER, 0)
-                socket.setsockopt(zmq.RCVHWM, queue)
-                socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
-                socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
-                for topic in topics:
-                    socket.setsockopt(zmq.SUBSCRIBE, topic)
-                socket.connect(address)
+            self._sockets = (
+                subscribe(self._context, address, *small, queue=_QUEUE),
+                subscribe(self._context, address, TACTILE, queue=_FRAMES),
+            )
         except zmq.ZMQError as error:
             self.close()
             raise ViewError(f"{address}: {error}") from None
+        self._poller = zmq.Poller()
+        for socket in self._sockets:
+            self._poller.register(socket, zmq.POLLIN)
 
     def drain(self, bridge: Bridge, until: float) -> int:
         """Hand on what comes until the monotonic time ``until`` [s]; how many messages it was."""
@@ -62,7 +54,12 @@ class LiveStream:
                     return count
                 continue
             for socket in self._sockets:
-                count += _hand_on(socket, bridge)
+                for message in drain(socket, _AT_ONCE):
+                    count += 1
+                    try:
+                        bridge.take(*unpack(message))
+                    except ValueError:
+                        bridge.unreadable += 1
             if left <= 0.0:
                 return count
 
@@ -73,31 +70,5 @@ class LiveStream:
     def __enter__(self) -> LiveStream:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _hand_on(socket: zmq.Socket[Any], bridge: Bridge) -> int:
-    """What waits in one socket; how many messages it was."""
-    for count in range(_AT_ONCE):
-        try:
-            frames = socket.recv_multipart(zmq.NOBLOCK)
-        except zmq.Again:
-            return count
-        bridge.take(*_read(frames))
-    return _AT_ONCE
-
-
-def _read(frames: list[bytes]) -> tuple[bytes, Any]:
-    """Topic and map; None for a map that is none."""
-    if len(frames) != 2:
-        return TOPICS[0], None
-    try:
-        return frames[0], msgpack.unpackb(frames[1])
-    except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
-        return frames[0], None
