@@ -1,8 +1,7 @@
-"""The kernels of the grip laws and their memory's layout; what they are for: :mod:`control.grip`.
+"""The grip laws' state and kernels; what they are for stands in `control.grip`.
 
-Pure functions on arrays: ``g`` the laws' memory, ``h`` what the grip was told of the held object
-(`perception.contact_filter_kernels`), ``force`` and ``angle`` the memories of two references
-(`control.setpoint`).
+Kernels that Python calls take the laws' state, the grasp of this tick, and the windows of both
+setpoints. Pairs are (left, right). SI units.
 """
 
 from __future__ import annotations
@@ -12,19 +11,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.control.setpoint import SPEED, TARGET, advance, arrived
-from softfinger.daemon.perception.contact_filter_kernels import (
-    ANGLE_STD,
-    ARM,
-    JOINT,
-    LEVER,
-    NORMAL,
-    SLIDE,
-    TIP_SIZE,
-    TIP_STIFFNESS,
-    TURN,
-)
+from softfinger.daemon.control import setpoint, slip_monitor
+from softfinger.daemon.control.setpoint import SetpointState
+from softfinger.daemon.control.slip_monitor import SlipState
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Pair, Record, Records
 
 FloatArray = NDArray[np.float64]
 
@@ -35,200 +27,268 @@ _QUIET = 3.0  # standard deviations of the angle that the joints at rest don't f
 _STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
 _TURN_MIN = 0.1  # of the object over a joint's lean, likewise
 
-# Places in the laws' memory. What is set once:
-DT, FORCE_GAIN, FORCE_BANDWIDTH, ROTATE_BANDWIDTH, ROTATE_SPEED = 0, 1, 2, 3, 4
-DAMPING = 5  # 2 ζ √J, times √stiffness the damping [N·m·s/rad]
-FRICTION, FRICTION_SPEED = 6, 7  # of a joint [N·m], and from which speed on all of it [rad/s]
-TORQUE_MAX = 8  # N·m
-BY_ENERGY = 9  # 1: the lever is the tables' energy's
-REST = 10  # what is left of a turning a tick later without frames
-# What a command sets:
-JOINT_STIFFNESS = 11  # N·m/rad
-FORCE_RATE = 12  # N/s
-STEERING = 13  # 1: the object's angle is gone to
-# What the laws remember:
-INTEGRAL = 14  # N
-PUSH = 15  # N that the joints give, both laws' parts together
-LEAN = 16  # rad/s of the offset that turns the object
-OFFSET = 17  # goal of (q1 − q2)/2 [rad]
-SHIFT = 18  # of the offset, to share the force out between the tips [rad]
-CLOSED = 19  # goal of (q1 + q2)/2 in pure position control [rad]
-CLOSING_FRICTION = 20  # share of the joints' friction that is given for closing
-TORQUE = 21  # last of both joints [N·m]
-MEMORY = 23
+
+class GripLaw(Record):
+    """What is set once."""
+
+    dt: float  # [s]
+    force_gain: float
+    force_bandwidth: float  # [rad/s]
+    rotate_bandwidth: float  # [rad/s]
+    rotate_speed: float  # [rad/s]
+    damping: float  # 2 ζ √J, times √stiffness the damping [N·m·s/rad]
+    friction: float  # of a joint [N·m]
+    friction_speed: float  # from which on all of it is given [rad/s]
+    torque_max: float  # [N·m]
+    rest: float  # what is left of a turning a tick later without frames
+    by_energy: bool  # the lever is the tables' energy's
+    watched: bool  # the margin against slipping is kept
+
+
+class GripState(Record):
+    """What commands set and what the laws remember."""
+
+    law: GripLaw
+    force: SetpointState  # mean of the tips [N]
+    angle: SetpointState  # of the object [rad]
+    slip: SlipState
+    asked: float  # force [N]
+    force_rate: float  # [N/s]
+    joint_stiffness: float  # [N·m/rad]
+    steering: bool  # the object's angle is gone to, or kept
+    integral: float  # [N]
+    push: float  # that the joints give, both laws' parts together [N]
+    lean: float  # speed of the offset that turns the object [rad/s]
+    offset: float  # goal of (q1 − q2)/2 [rad]
+    shift: float  # of the offset, to share the force out between the tips [rad]
+    closed: float  # goal of (q1 + q2)/2 in pure position control [rad]
+    closing_friction: float  # share of the joints' friction that is given for closing
+    torque: Pair  # last of both joints [N·m]
+
+
+@kernel
+def start(
+    grips: Records[GripState],
+    grasps: Records[GraspState],
+    force_windows: FloatArray,
+    felt: float,
+) -> None:
+    """Take over from the approach with ``felt`` N on the tips."""
+    g = grips[0]
+    q = grasps[0].q
+    slip_monitor.forget(g.slip)
+    setpoint.reset(g.force, force_windows, felt)
+    g.integral = g.shift = g.closing_friction = 0.0
+    g.offset = 0.5 * (q[0] - q[1])
+    g.closed = 0.5 * (q[0] + q[1])
+    g.steering = False
+
+
+@kernel
+def begin_holding(grips: Records[GripState], grasps: Records[GraspState]) -> None:
+    """The grip is settled: from now on loads show."""
+    slip_monitor.begin(grips[0].slip, grasps[0])
 
 
 @kernel
 def squeeze(
-    g: FloatArray,
-    force: FloatArray,
-    angle: FloatArray,
-    h: FloatArray,
-    felt: float,
+    grips: Records[GripState],
+    grasps: Records[GraspState],
+    force_windows: FloatArray,
+    angle_windows: FloatArray,
     turned: float,
-    dq1: float,
-    dq2: float,
-) -> tuple[float, float]:
-    """Torques of both joints [N·m] for the mean force ``felt`` and the object's angle ``turned``.
+    dq: tuple[float, float],
+    holding: bool,
+) -> tuple[float, float, float, bool]:
+    """Torques of both joints [N·m], the force [N] that is gone to, and whether the object slipped.
 
-    An angle that is not known is NaN.
+    ``turned`` is the object's angle [rad], NaN where it is not known. ``dq``: joint velocities
+    [rad/s]. ``holding``: nothing but loads moves the joints.
     """
-    wanted = advance(force, g[FORCE_RATE])
-    g[PUSH] = wanted + _correction(g, force[TARGET], wanted, felt)
+    g = grips[0]
+    grasp = grasps[0]
+    if g.law.watched and slip_monitor.due(g.slip):
+        g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
+    wanted = setpoint.advance(g.force, force_windows, g.force_rate)
+    g.push = wanted + _correction(g, wanted, _felt(grasp))
     lean = 0.0
-    if g[STEERING] > 0.0:
-        lean = _steer(g, angle, h, turned)
-    g[LEAN] = lean
-    if arrived(force) and not (g[STEERING] > 0.0 and not arrived(angle)):
-        _share_out(g, h)
-    close = _closing(h, force[SPEED], lean)
-    g[CLOSING_FRICTION] = min(max(close / g[FRICTION_SPEED], -1.0), 1.0)
-    return _give(g, h, close, lean, dq1, dq2)
+    if g.steering:
+        lean = _steer(g, angle_windows, grasp, turned)
+    g.lean = lean
+    if setpoint.arrived(g.force) and not (g.steering and not setpoint.arrived(g.angle)):
+        _share_out(g, grasp)
+    close = _closing(grasp, g.force.speed, lean)
+    g.closing_friction = min(max(close / g.law.friction_speed, -1.0), 1.0)
+    torque1, torque2 = _torques(g, grasp, close, lean, dq)
+    return torque1, torque2, g.force.target, g.slip.turned
 
 
 @kernel
-def coast(g: FloatArray, h: FloatArray, dq1: float, dq2: float) -> tuple[float, float]:
+def coast(
+    grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
+) -> tuple[float, float]:
     """In the place of `squeeze` while frames are late: the push stays, turning comes to rest."""
-    g[LEAN] *= g[REST]
-    g[OFFSET] += g[LEAN] * g[DT]
-    return _give(g, h, _closing(h, 0.0, g[LEAN]), g[LEAN], dq1, dq2)
+    g = grips[0]
+    g.lean *= g.law.rest
+    g.offset += g.lean * g.law.dt
+    return _torques(g, grasps[0], _closing(grasps[0], 0.0, g.lean), g.lean, dq)
 
 
 @kernel
 def press(
-    g: FloatArray, force: FloatArray, h: FloatArray, finger: int, felt: float, dq: float
+    grips: Records[GripState],
+    grasps: Records[GraspState],
+    force_windows: FloatArray,
+    finger: int,
+    dq: float,
 ) -> float:
     """Torque [N·m] of one ``finger`` on an object that stands by itself."""
-    wanted = advance(force, g[FORCE_RATE])
-    g[PUSH] = wanted + _correction(g, force[TARGET], wanted, felt)
-    return _press(g, h, finger, force[SPEED], dq)
+    g = grips[0]
+    wanted = setpoint.advance(g.force, force_windows, g.force_rate)
+    g.push = wanted + _correction(g, wanted, grasps[0].tip[finger].force)
+    return _torque_alone(g, grasps[0], finger, g.force.speed, dq)
 
 
 @kernel
-def coast_alone(g: FloatArray, h: FloatArray, finger: int, dq: float) -> float:
+def coast_alone(
+    grips: Records[GripState], grasps: Records[GraspState], finger: int, dq: float
+) -> float:
     """In the place of `press` while frames are late."""
-    return _press(g, h, finger, 0.0, dq)
+    return _torque_alone(grips[0], grasps[0], finger, 0.0, dq)
 
 
 @kernel
 def place(
-    g: FloatArray,
-    force: FloatArray,
-    angle: FloatArray,
-    h: FloatArray,
-    felt: float,
+    grips: Records[GripState],
+    grasps: Records[GraspState],
+    force_windows: FloatArray,
+    angle_windows: FloatArray,
     turned: float,
 ) -> tuple[float, float]:
-    """Goals of both joints [rad] of pure position control: both references moved into angles."""
-    error = advance(force, g[FORCE_RATE]) - felt
-    arm = 0.5 * (h[ARM] + h[ARM + 1])
+    """Goals of both joints [rad] of pure position control: both setpoints moved into angles."""
+    g = grips[0]
+    grasp = grasps[0]
+    error = setpoint.advance(g.force, force_windows, g.force_rate) - _felt(grasp)
     lean = 0.0
-    if g[STEERING] > 0.0:
-        lean = _steer(g, angle, h, turned)
-    way = g[FORCE_BANDWIDTH] * error / (_mean_stiffness(h) * arm)
-    g[CLOSED] += (_closing(h, force[SPEED], lean) + way) * g[DT]
-    return g[CLOSED] + g[OFFSET], g[CLOSED] - g[OFFSET]
+    if g.steering:
+        lean = _steer(g, angle_windows, grasp, turned)
+    way = g.law.force_bandwidth * error / (_mean_stiffness(grasp) * _mean_arm(grasp))
+    g.closed += (_closing(grasp, g.force.speed, lean) + way) * g.law.dt
+    return g.closed + g.offset, g.closed - g.offset
 
 
 @inner_kernel
-def _mean_stiffness(h: FloatArray) -> float:
-    mean: float = 0.5 * (h[TIP_STIFFNESS] + h[TIP_STIFFNESS + TIP_SIZE])
+def _felt(grasp: GraspState) -> float:
+    felt: float = 0.5 * (grasp.tip[0].force + grasp.tip[1].force)
+    return felt
+
+
+@inner_kernel
+def _mean_arm(grasp: GraspState) -> float:
+    mean: float = 0.5 * (grasp.arm[0] + grasp.arm[1])
+    return mean
+
+
+@inner_kernel
+def _mean_stiffness(grasp: GraspState) -> float:
+    mean: float = 0.5 * (grasp.stiffness[0] + grasp.stiffness[1])
     return max(mean, _STIFFNESS_MIN)
 
 
 @inner_kernel
-def _turning(h: FloatArray) -> float:
+def _turning(grasp: GraspState) -> float:
     """How far the object turns when one joint leans forward and the other back."""
-    both: float = h[TURN] + h[TURN + 1]
+    both: float = grasp.turn[0] + grasp.turn[1]
     return max(both, _TURN_MIN)
 
 
 @inner_kernel
-def _correction(g: FloatArray, target: float, wanted: float, felt: float) -> float:
+def _correction(g: GripState, wanted: float, felt: float) -> float:
     """What the force felt asks for beyond the feed-forward [N]."""
+    law = g.law
     error = wanted - felt
     # Beyond what the servos may give, more error must not be stored.
-    full = abs(g[TORQUE]) >= g[TORQUE_MAX] or abs(g[TORQUE + 1]) >= g[TORQUE_MAX]
+    full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
-        integral = g[INTEGRAL] + g[FORCE_BANDWIDTH] * error * g[DT]
-        bound = _INTEGRAL_SHARE * target
-        g[INTEGRAL] = min(max(integral, -bound), bound)
-    correction: float = g[FORCE_GAIN] * error + g[INTEGRAL]
-    return correction
+        integral = g.integral + law.force_bandwidth * error * law.dt
+        bound = _INTEGRAL_SHARE * g.force.target
+        g.integral = min(max(integral, -bound), bound)
+    return law.force_gain * error + g.integral
 
 
 @inner_kernel
-def _steer(g: FloatArray, angle: FloatArray, h: FloatArray, turned: float) -> float:
+def _steer(g: GripState, windows: FloatArray, grasp: GraspState, turned: float) -> float:
     """Move the antisymmetric goal; returns its rate [rad/s]."""
-    wanted = advance(angle, g[ROTATE_SPEED])
-    turn = _turning(h)
-    lean: float = angle[SPEED] / turn
+    wanted = setpoint.advance(g.angle, windows, g.law.rotate_speed)
+    turn = _turning(grasp)
+    lean = g.angle.speed / turn
     if not math.isnan(turned):
         error = wanted - turned
-        if arrived(angle):  # what is no more than noise, joints at rest shall not follow
-            noise = _QUIET * h[ANGLE_STD]
+        if setpoint.arrived(g.angle):  # what is no more than noise, joints at rest shall not follow
+            noise = _QUIET * grasp.angle_std
             error -= min(max(error, -noise), noise)
-        g[OFFSET] += g[ROTATE_BANDWIDTH] * error / turn * g[DT]
-    g[OFFSET] += lean * g[DT]
+        g.offset += g.law.rotate_bandwidth * error / turn * g.law.dt
+    g.offset += lean * g.law.dt
     return lean
 
 
 @inner_kernel
-def _share_out(g: FloatArray, h: FloatArray) -> None:
+def _share_out(g: GripState, grasp: GraspState) -> None:
     """Take out what the object's rubbing on the table has put between the tips.
 
     The force law holds their mean; friction may keep the object where one tip is pressed more.
     Both fingers then shift sideways by a little, less than the object's angle is held to.
     """
-    arm = 0.5 * (h[ARM] + h[ARM + 1])
-    off = 0.5 * (h[NORMAL] - h[NORMAL + 1]) / (_mean_stiffness(h) * arm)
-    most = _SHARE_ANGLE / _turning(h)
-    shift = g[SHIFT] - 2.0 * math.pi * _SHARE_BANDWIDTH * off * g[DT]
+    off = 0.5 * (grasp.normal[0] - grasp.normal[1]) / (_mean_stiffness(grasp) * _mean_arm(grasp))
+    most = _SHARE_ANGLE / _turning(grasp)
+    shift = g.shift - 2.0 * math.pi * _SHARE_BANDWIDTH * off * g.law.dt
     shift = min(max(shift, -most), most)
-    g[OFFSET] += shift - g[SHIFT]
-    g[SHIFT] = shift
+    g.offset += shift - g.shift
+    g.shift = shift
 
 
 @inner_kernel
-def _closing(h: FloatArray, rate: float, lean: float) -> float:
+def _closing(grasp: GraspState, rate: float, lean: float) -> float:
     """Closing [rad/s] for a ``rate`` [N/s] of the force, what turning takes counted in."""
-    way = 2.0 * rate / _mean_stiffness(h)
-    way -= (h[ARM] - h[ARM + 1] + h[SLIDE] * (h[TURN] + h[TURN + 1])) * lean
-    closing: float = way / (h[ARM] + h[ARM + 1])
+    arm = grasp.arm
+    turn = grasp.turn
+    way = 2.0 * rate / _mean_stiffness(grasp)
+    way -= (arm[0] - arm[1] + grasp.slide * (turn[0] + turn[1])) * lean
+    closing: float = way / (arm[0] + arm[1])
     return closing
 
 
 @inner_kernel
-def _give(
-    g: FloatArray, h: FloatArray, close: float, lean: float, dq1: float, dq2: float
+def _torques(
+    g: GripState, grasp: GraspState, close: float, lean: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
     """Torques of two fingers at rates [rad/s] of closing and leaning that are wanted."""
-    push = g[PUSH]
-    arm = 0.5 * (h[ARM] + h[ARM + 1])
-    calm = g[DAMPING] * math.sqrt(_mean_stiffness(h) * arm * arm) * (close - 0.5 * (dq1 + dq2))
-    error = g[OFFSET] - 0.5 * (h[JOINT] - h[JOINT + 1])
-    turn = g[JOINT_STIFFNESS] * error
-    turn += g[DAMPING] * math.sqrt(g[JOINT_STIFFNESS]) * (lean - 0.5 * (dq1 - dq2))
-    lever = LEVER if g[BY_ENERGY] > 0.0 else ARM
-    g[TORQUE] = h[lever] * push + calm + turn + _friction(g, close + lean)
-    g[TORQUE + 1] = h[lever + 1] * push + calm - turn + _friction(g, close - lean)
-    return g[TORQUE], g[TORQUE + 1]
+    law = g.law
+    arm = _mean_arm(grasp)
+    calm = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
+    calm *= close - 0.5 * (dq[0] + dq[1])
+    error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
+    turn = g.joint_stiffness * error
+    turn += law.damping * math.sqrt(g.joint_stiffness) * (lean - 0.5 * (dq[0] - dq[1]))
+    lever = grasp.lever if law.by_energy else grasp.arm
+    g.torque[0] = lever[0] * g.push + calm + turn + _friction(law, close + lean)
+    g.torque[1] = lever[1] * g.push + calm - turn + _friction(law, close - lean)
+    return g.torque[0], g.torque[1]
 
 
 @inner_kernel
-def _press(g: FloatArray, h: FloatArray, finger: int, rate: float, dq: float) -> float:
+def _torque_alone(g: GripState, grasp: GraspState, finger: int, rate: float, dq: float) -> float:
     """Torque [N·m] of one finger whose force is to change by ``rate`` [N/s]."""
-    arm = h[ARM + finger]
-    stiffness = max(h[TIP_STIFFNESS + TIP_SIZE * finger], _STIFFNESS_MIN)
+    arm = grasp.arm[finger]
+    stiffness = max(grasp.stiffness[finger], _STIFFNESS_MIN)
     close = rate / (stiffness * arm)
-    calm = g[DAMPING] * math.sqrt(stiffness * arm * arm) * (close - dq)
-    torque: float = arm * g[PUSH] + calm + _friction(g, close)
-    g[TORQUE + finger] = torque
+    calm = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
+    torque: float = arm * g.push + calm + _friction(g.law, close)
+    g.torque[finger] = torque
     return torque
 
 
 @inner_kernel
-def _friction(g: FloatArray, rate: float) -> float:
+def _friction(law: GripLaw, rate: float) -> float:
     """What a joint's friction takes [N·m] at the ``rate`` [rad/s] that is wanted."""
-    friction: float = g[FRICTION] * min(max(rate / g[FRICTION_SPEED], -1.0), 1.0)
-    return friction
+    return law.friction * min(max(rate / law.friction_speed, -1.0), 1.0)

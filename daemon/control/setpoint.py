@@ -1,6 +1,6 @@
-"""Smooth references: a target that may jump at any tick in, a jerk-limited way to it out.
+"""Smooth setpoints: a target that may jump at any tick in, a jerk-limited way to it out.
 
-Holds `Reference`, the kernels on its memory, and nothing that knows what the value means.
+Knows nothing of what the value means.
 """
 
 from __future__ import annotations
@@ -9,76 +9,101 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Record, Records
 
 FloatArray = NDArray[np.float64]
 
-# Places in a reference's memory; the windows of both means follow behind.
-TARGET, VALUE, SPEED = 0, 1, 2
-_RAMP, _IDLE, _DT = 3, 4, 5  # _IDLE: ticks since the ramp arrived
-_FIRST, _SECOND = 6, 9  # of each mean: its window's length, the place in it, the window's sum
-_WINDOWS = 12
+
+class RunningMean(Record):
+    """The mean of the last ``length`` values, which are kept beside it."""
+
+    length: int
+    place: int  # of the oldest value
+    sum: float
 
 
-@kernel
-def reset(r: FloatArray, value: float) -> None:
+class SetpointState(Record):
+    """A setpoint and how it came there. The values under both means are kept beside it."""
+
+    target: float
+    value: float
+    speed: float  # [1/s]
+    ramp: float  # what goes to the target at the given rate
+    idle: int  # ticks since it arrived there
+    dt: float  # [s]
+    first: RunningMean
+    second: RunningMean
+
+
+@inner_kernel
+def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
     """Be at ``value``, at rest."""
-    r[TARGET] = r[_RAMP] = r[VALUE] = value
-    r[SPEED] = 0.0
-    r[_IDLE] = r[_FIRST] + r[_SECOND]
-    for mean in (_FIRST, _SECOND):
-        r[mean + 1] = 0.0
-        r[mean + 2] = value * r[mean]
-    for k in range(_WINDOWS, r.shape[0]):
-        r[k] = value
+    s.target = s.ramp = s.value = value
+    s.speed = 0.0
+    s.idle = s.first.length + s.second.length
+    s.first.place = 0
+    s.second.place = 0
+    s.first.sum = value * s.first.length
+    s.second.sum = value * s.second.length
+    windows[:] = value
 
 
-@kernel
-def arrived(r: FloatArray) -> bool:
+@inner_kernel
+def arrived(s: SetpointState) -> bool:
     """At the target, at rest."""
-    there: bool = r[_IDLE] >= r[_FIRST] + r[_SECOND] and r[_RAMP] == r[TARGET]
+    there: bool = s.idle >= s.first.length + s.second.length and s.ramp == s.target
     return there
 
 
 @inner_kernel
-def _mean(r: FloatArray, mean: int, window: int, value: float) -> float:
-    """Take ``value`` into a running mean whose window begins at ``window``."""
-    at = int(r[mean + 1])
-    r[mean + 2] += value - r[window + at]
-    r[window + at] = value
-    r[mean + 1] = at + 1.0 if at + 1.0 < r[mean] else 0.0
-    result: float = r[mean + 2] / r[mean]
+def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> float:
+    """Take ``value`` into a mean whose window begins at ``start``."""
+    place = mean.place
+    mean.sum += value - windows[start + place]
+    windows[start + place] = value
+    mean.place = place + 1 if place + 1 < mean.length else 0
+    result: float = mean.sum / mean.length
     return result
 
 
-@kernel
-def advance(r: FloatArray, rate: float) -> float:
-    """One tick on towards the target, at most ``rate`` a second; returns the value."""
-    left = r[TARGET] - r[_RAMP]
-    last: float = r[VALUE]
+@inner_kernel
+def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
+    """Go on by one tick towards the target, at most ``rate`` a second; the new value."""
+    left = s.target - s.ramp
+    last = s.value
     if left == 0.0:
-        length = r[_FIRST] + r[_SECOND]
-        if r[_IDLE] >= length:
+        length = s.first.length + s.second.length
+        if s.idle >= length:
             return last
-        r[_IDLE] += 1.0
-        if r[_IDLE] >= length:
-            last = r[TARGET]
-            reset(r, last)  # the running sums' rounding ends here
-            return last
+        s.idle += 1
+        if s.idle >= length:
+            reset(s, windows, s.target)  # the running sums' rounding ends here
+            return s.target
     else:
-        most = rate * r[_DT]
-        r[_IDLE] = 0.0
+        most = rate * s.dt
+        s.idle = 0
         if abs(left) <= most:
-            r[_RAMP] = r[TARGET]
+            s.ramp = s.target
         else:
-            r[_RAMP] += most if left > 0.0 else -most
-    smooth = _mean(r, _FIRST, _WINDOWS, r[_RAMP])
-    value = _mean(r, _SECOND, _WINDOWS + int(r[_FIRST]), smooth)
-    r[VALUE] = value
-    r[SPEED] = (value - last) / r[_DT]
-    return value
+            s.ramp += most if left > 0.0 else -most
+    smooth = _add(s.first, windows, 0, s.ramp)
+    s.value = _add(s.second, windows, s.first.length, smooth)
+    s.speed = (s.value - last) / s.dt
+    return s.value
 
 
-class Reference:
+@kernel
+def _reset(setpoints: Records[SetpointState], windows: FloatArray, value: float) -> None:
+    reset(setpoints[0], windows, value)
+
+
+@kernel
+def _step(setpoints: Records[SetpointState], windows: FloatArray, rate: float) -> bool:
+    advance(setpoints[0], windows, rate)
+    return arrived(setpoints[0])
+
+
+class Setpoint:
     """A ramp of bounded rate, averaged over two windows in turn.
 
     The first mean bounds the acceleration to rate/window, the second the jerk to
@@ -86,45 +111,42 @@ class Reference:
     its target 1.5 windows after the ramp is.
     """
 
-    def __init__(self, dt: float, window: float) -> None:
-        """``dt`` is the tick and ``window`` the first mean's length [s]."""
-        first, second = max(round(window / dt), 1), max(round(0.5 * window / dt), 1)
-        self.memory = np.zeros(_WINDOWS + first + second)
-        self.memory[_DT] = dt
-        self.memory[_FIRST] = first
-        self.memory[_SECOND] = second
+    def __init__(self, dt: float, window: float, state: SetpointState | None = None) -> None:
+        """``dt`` is the tick and ``window`` the first mean's length [s].
+
+        ``state`` is where it is kept: a part of a greater record, or one of its own.
+        """
+        self.state = SetpointState() if state is None else state
+        self.state.dt = dt
+        self.state.first.length = max(round(window / dt), 1)
+        self.state.second.length = max(round(0.5 * window / dt), 1)
+        self.windows = np.zeros(self.state.first.length + self.state.second.length)
         self.reset(0.0)
-        advance(self.memory, 0.0)  # nothing to do yet, but compiled now and by no tick
-        arrived(self.memory)
+        self.step(0.0)  # nothing to do yet, but compiled now and by no tick
 
     def reset(self, value: float) -> None:
         """Be at ``value``, at rest."""
-        reset(self.memory, value)
+        _reset(self.state.array, self.windows, value)
+
+    def step(self, rate: float) -> bool:
+        """Go on by one tick, at most ``rate`` a second; whether it is at the target, at rest."""
+        return _step(self.state.array, self.windows, rate)
 
     @property
     def target(self) -> float:
-        """Where it goes to; it may be set at any tick."""
-        return self.memory.item(TARGET)
+        """Where it goes; it may be set at any tick."""
+        return self.state.target
 
     @target.setter
     def target(self, value: float) -> None:
-        self.memory[TARGET] = value
+        self.state.target = value
 
     @property
     def value(self) -> float:
         """Where it is."""
-        return self.memory.item(VALUE)
+        return self.state.value
 
     @property
     def speed(self) -> float:
         """How fast it moves [1/s]."""
-        return self.memory.item(SPEED)
-
-    @property
-    def arrived(self) -> bool:
-        """At the target, at rest."""
-        return bool(arrived(self.memory))
-
-    def step(self, rate: float) -> float:
-        """One tick on towards the target, at most ``rate`` a second; returns the value."""
-        return advance(self.memory, rate)
+        return self.state.speed

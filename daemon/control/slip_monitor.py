@@ -20,22 +20,21 @@ What these sensors show, and what they don't:
   ``control.tip_friction`` must not be more than the real friction.
 - While the grip is built up or the object turns, currents also move the joints: the load of before
   stands. A load that grows by more than about 10 N a second is too fast for the grip.
-
-Holds the judgement alone; the grip law raises the force, within ``control.grip_raise_max``.
 """
 
 from __future__ import annotations
 
 import math
 
-from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
-from softfinger.daemon.types import Contact
+from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.compiled.layout import Pair, Record
 
 _EACH = 0.008  # s between two looks
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
 _LEARN = 1.0  # s in which the friction at rest is learnt
-_SCALE_OFF = 0.1  # share by which the torque constant may be off
+_SCALE_ERROR = 0.1  # share by which the torque constant may be off
 _KEPT = 1.0  # s that a raised grip is kept after the need for it has gone
 _BACK = 2.0  # s in which it then comes back by all of `grip_raise_max`
 _TURNED_MORE = 0.25  # share that the grip is raised by when the object turns in it
@@ -46,127 +45,161 @@ _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for les
 _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
 
-class SlipWatch:
-    """Watches one held object, tick by tick."""
+class SlipLaw(Record):
+    """What is set once."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._law = settings.control
-        self._every = max(round(_EACH * settings.loop.rate), 1)
-        self._dt = self._every / settings.loop.rate
-        self._width = settings.object.width
-        self._force_most = GRIP_SHARE * settings.safety.force_max
-        self._friction = 0.0  # what a joint's friction looks like, as a load [N]
-        self.forget()
-
-    def forget(self) -> None:
-        """Nothing is held any more, or something else."""
-        self._ticks = 0  # until the next look
-        self.load = 0.0  # N that each tip may bear along its face, hidden part included
-        self.turned = False  # the object has turned in the grip, at this tick
-        self._known = False  # what stood when holding began is known:
-        self._still = 0.0  # what of it does not grow with the grip [N]
-        self._share = 0.0  # and what does, as a share of the normal force
-        self._smooth = 0.0
-        self._age = 0.0  # s since holding began, up to `_LEARN`
-        self._stray = 0.0  # sum of unexplained turning that has been looked at [rad]
-        self._away = 0.0  # unexplained turning that is not forgotten yet [rad]
-        self._needed = 0.0  # force for the margin, kept for a while [N]
-        self._most = 0.0  # N that the grip may be raised to
-        self._idle = 0.0  # s since that was needed
-
-    def begin(self, held: GraspState) -> None:
-        """Holding begins, or begins again after a command: learn what is no load."""
-        # Where the faces lean towards each other, the object going out takes part of the turning.
-        lean = math.tan(0.5 * held.taper)
-        lever = self._width * _mean(held.turn) - lean * _mean(held.arm)
-        if lever <= 0.0:
-            self._known = False
-            return
-        normal = _mean(held.normal)
-        scale = _SCALE_OFF * normal * _mean(held.arm) / lever
-        self._friction = self._law.joint_friction / lever
-        found = self._smooth + self._share * normal
-        self._still = min(max(found, -self._friction), self._friction)
-        taken = min(max(found - self._still, -scale), scale)
-        self._share = taken / normal if normal > 0.0 else 0.0
-        self._smooth = found - taken
-        self._stray = held.stray
-        self._away = 0.0
-        self._age = _SMOOTH
-        self._known = True
-
-    def kept(self, asked: float) -> float:
-        """The grip force [N] for ``asked`` between two looks."""
-        return max(asked, min(self._needed, self._most))
-
-    def due(self) -> bool:
-        """Whether this tick takes a look: not every one does, loads are slower."""
-        self.turned = False
-        if self._ticks:
-            self._ticks -= 1
-            return False
-        self._ticks = self._every - 1
-        return True
-
-    def step(
-        self, held: GraspState, contacts: list[Contact], asked: float, holding: bool, closing: float
-    ) -> float:
-        """Look; the grip force [N] to go to: ``asked``, or more where the margin needs it.
-
-        ``holding`` says that nothing but loads moves the joints; ``closing``, -1 to 1, how much of
-        the joints' friction is given at present for closing.
-        """
-        law = self._law
-        self._most = most = max(min(asked + law.grip_raise_max, self._force_most), asked)
-        found = held.load - closing * self._friction - self._share * _mean(held.normal)
-        self._smooth += (found - self._smooth) * self._dt / _SMOOTH
-        if holding and self._known:
-            self._weigh(held)
-            self._watch_turning(held, contacts)
-        else:
-            self._stray = held.stray
-        # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
-        spare = law.tip_friction * (1.0 - law.slip_margin) - held.shear
-        # A grip that bears less than the joints' friction hides is told nothing by their torques.
-        told = self.load if law.tip_friction * asked > self._friction else 0.0
-        load = max(told, 0.5 * law.object_load)
-        needed = 0.0
-        if load > 0.0:
-            needed = load / max(spare, _LEAST_SPARE * law.tip_friction)
-        if self.turned:
-            needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, self._needed))
-        if needed >= self._needed:
-            self._needed = min(needed, most)
-            self._idle = 0.0
-        else:
-            self._idle += self._dt
-            if self._idle > _KEPT:
-                back = law.grip_raise_max / _BACK * self._dt
-                self._needed = max(self._needed - back, needed)
-        return min(max(asked, self._needed), most)
-
-    def _weigh(self, held: GraspState) -> None:
-        seen = abs(self._smooth - self._still)
-        self._age = min(self._age + self._dt, _LEARN)
-        if seen < self._friction:
-            # So little may as well be friction that gives way; what comes slower stays hidden.
-            still = self._still + (self._smooth - self._still) * self._dt / self._age
-            self._still = min(max(still, -self._friction), self._friction)
-        # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
-        # as much may be hidden.
-        sure = seen - (0.5 + max(1.0 - self._age / _LEARN, 0.0)) * self._friction
-        lever = max(held.load_lever, _LEAST_LEVER * self._width)
-        hidden = max(self._law.joint_friction / lever, self._friction)
-        self.load = min(max(4.0 * sure, 0.0), seen + hidden)
-
-    def _watch_turning(self, held: GraspState, contacts: list[Contact]) -> None:
-        self._away += held.stray - self._stray - self._away * self._dt / _FORGET
-        self._stray = held.stray
-        sheared = 0.5 * self._law.tip_friction * (contacts[0].d + contacts[1].d) / self._width
-        if abs(self._away) > _WELL * sheared + _SIGNS * held.angle_std:
-            self.turned = True
-            self._away = 0.0
+    every: int  # ticks between two looks
+    dt: float  # between two looks [s]
+    width: float  # of the object [m]
+    force_max: float  # [N]
+    friction: float  # Coulomb, tip on object
+    margin: float  # share of it that is kept unused
+    joint_friction: float  # [N·m]
+    object_load: float  # [N]
+    raise_max: float  # [N]
 
 
-def _mean(pair: list[float]) -> float:
-    return 0.5 * (pair[0] + pair[1])
+class SlipState(Record):
+    """What is known of one held object."""
+
+    law: SlipLaw
+    ticks: int  # until the next look
+    load: float  # that each tip may bear along its face, hidden part included [N]
+    turned: bool  # the object has turned in the grip, at this tick
+    friction: float  # what a joint's friction looks like, as a load [N]
+    known: bool  # what stood when holding began:
+    still: float  # what of it does not grow with the grip [N]
+    share: float  # and what does, as a share of the normal force
+    smooth: float  # the load, averaged [N]
+    age: float  # since holding began, up to `_LEARN` [s]
+    stray: float  # sum of unexplained turning that has been looked at [rad]
+    away: float  # unexplained turning that is not forgotten yet [rad]
+    needed: float  # force for the margin, kept for a while [N]
+    most: float  # that the grip may be raised to [N]
+    idle: float  # since that was needed [s]
+
+
+def set_law(law: SlipLaw, settings: Settings) -> None:
+    """Fill in what the settings say."""
+    control = settings.control
+    law.every = max(round(_EACH * settings.loop.rate), 1)
+    law.dt = law.every / settings.loop.rate
+    law.width = settings.object.width
+    law.force_max = GRIP_SHARE * settings.safety.force_max
+    law.friction, law.margin = control.tip_friction, control.slip_margin
+    law.joint_friction = control.joint_friction
+    law.object_load, law.raise_max = control.object_load, control.grip_raise_max
+
+
+@inner_kernel
+def forget(s: SlipState) -> None:
+    """Nothing is held any more, or something else."""
+    s.ticks = 0
+    s.turned = s.known = False
+    s.load = s.still = s.share = s.smooth = s.age = 0.0
+    s.stray = s.away = s.needed = s.most = s.idle = 0.0
+
+
+@inner_kernel
+def begin(s: SlipState, grasp: GraspState) -> None:
+    """Holding begins, or begins again after a command: learn what is no load."""
+    # Where the faces lean towards each other, the object going out takes part of the turning.
+    lean = math.tan(0.5 * grasp.taper)
+    lever = s.law.width * _mean(grasp.turn) - lean * _mean(grasp.arm)
+    s.known = lever > 0.0
+    if not s.known:
+        return
+    normal = _mean(grasp.normal)
+    scale = _SCALE_ERROR * normal * _mean(grasp.arm) / lever
+    s.friction = s.law.joint_friction / lever
+    found = s.smooth + s.share * normal
+    s.still = min(max(found, -s.friction), s.friction)
+    taken = min(max(found - s.still, -scale), scale)
+    s.share = taken / normal if normal > 0.0 else 0.0
+    s.smooth = found - taken
+    s.stray = grasp.stray
+    s.away = 0.0
+    s.age = _SMOOTH
+
+
+@inner_kernel
+def due(s: SlipState) -> bool:
+    """Whether this tick takes a look: not every one does, loads are slower."""
+    s.turned = False
+    if s.ticks > 0:
+        s.ticks -= 1
+        return False
+    s.ticks = s.law.every - 1
+    return True
+
+
+@inner_kernel
+def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: float) -> float:
+    """The grip force [N] to go to: ``asked``, or more where the margin needs it.
+
+    ``holding``: nothing but loads moves the joints. ``closing``, -1 to 1: how much of the joints'
+    friction is given at present for closing.
+    """
+    law = s.law
+    s.most = max(min(asked + law.raise_max, law.force_max), asked)
+    found = grasp.load - closing * s.friction - s.share * _mean(grasp.normal)
+    s.smooth += (found - s.smooth) * law.dt / _SMOOTH
+    if holding and s.known:
+        _weigh(s, grasp.load_lever)
+        _watch_turning(s, grasp)
+    else:
+        s.stray = grasp.stray
+    # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
+    spare = law.friction * (1.0 - law.margin) - grasp.shear
+    # Of a grip that bears less than the joints' friction hides their torques say nothing.
+    seen = s.load if law.friction * asked > s.friction else 0.0
+    load = max(seen, 0.5 * law.object_load)
+    needed = 0.0
+    if load > 0.0:
+        needed = load / max(spare, _LEAST_SPARE * law.friction)
+    if s.turned:
+        needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, s.needed))
+    if needed >= s.needed:
+        s.needed = min(needed, s.most)
+        s.idle = 0.0
+    else:
+        s.idle += law.dt
+        if s.idle > _KEPT:
+            s.needed = max(s.needed - law.raise_max / _BACK * law.dt, needed)
+    return min(max(asked, s.needed), s.most)
+
+
+@inner_kernel
+def _weigh(s: SlipState, load_lever: float) -> None:
+    """Tell the load from the joints' friction."""
+    dt = s.law.dt
+    seen = abs(s.smooth - s.still)
+    s.age = min(s.age + dt, _LEARN)
+    if seen < s.friction:
+        # So little may as well be friction that gives way; what comes slower stays hidden.
+        still = s.still + (s.smooth - s.still) * dt / s.age
+        s.still = min(max(still, -s.friction), s.friction)
+    # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
+    # as much may be hidden.
+    sure = seen - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * s.friction
+    lever = max(load_lever, _LEAST_LEVER * s.law.width)
+    hidden = max(s.law.joint_friction / lever, s.friction)
+    s.load = min(max(4.0 * sure, 0.0), seen + hidden)
+
+
+@inner_kernel
+def _watch_turning(s: SlipState, grasp: GraspState) -> None:
+    """Look for turning beyond what the tips' shear explains."""
+    s.away += grasp.stray - s.stray - s.away * s.law.dt / _FORGET
+    s.stray = grasp.stray
+    depth = grasp.tip[0].d + grasp.tip[1].d
+    sheared = 0.5 * s.law.friction * depth / s.law.width
+    if abs(s.away) > _WELL * sheared + _SIGNS * grasp.angle_std:
+        s.turned = True
+        s.away = 0.0
+
+
+@inner_kernel
+def _mean(pair: Pair) -> float:
+    mean: float = 0.5 * (pair[0] + pair[1])
+    return mean

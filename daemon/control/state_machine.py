@@ -11,10 +11,10 @@ import math
 
 from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.control.setpoint import Reference
-from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.control.setpoint import Setpoint
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, Contact, Event, Goal, State
+from softfinger.daemon.types import FINGERS, Event, Goal, State
 
 _REACH = 0.35  # rad beyond the present angle: far enough that the servo's current bound decides
 _ARRIVED = 0.03  # rad from the goal
@@ -23,7 +23,7 @@ _SETTLED_FORCE = 0.03  # share of the force target
 _SETTLED_ANGLE = 0.5 * math.pi / 180.0
 _SETTLED_FOR = 0.2  # s
 _TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
-_RAISED = 1.02  # of the force asked for: told as raised
+_RAISED = 1.02  # of the force asked for, above which the grip is reported as raised
 _LOST_AFTER = 0.1  # s without contact in a grip
 _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
 
@@ -38,7 +38,7 @@ class Control:
         """``state`` and ``grasp`` are looked at as they are at each tick, and never changed."""
         self._settings = settings
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self._grip = Grip(settings, self._fingers)
+        self._grip = Grip(settings, self._fingers, grasp)
         self._by_position = settings.control.law == "position" and len(self._fingers) == 2
         self._force = settings.control.force_default  # N that the next grip goes to
         self.mode = Mode.DISARMED
@@ -46,9 +46,9 @@ class Control:
         self.events: list[Event] = []
         self._reading, self._contacts, self._pose = state.reading, state.contacts, state.object
         self._touched = [state.contacts[index] for index in self._fingers]
-        self._grasp_state = grasp
+        self._held = grasp
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
-        self._ways = [Reference(dt, smooth), Reference(dt, smooth)]  # of the joints' goals
+        self._setpoints = [Setpoint(dt, smooth), Setpoint(dt, smooth)]  # of the joints
         self._next_angle: float | None = None  # rad to turn to once the grip holds
         self._raised = False  # the grip is firmer than was asked for
         self._touching = [False, False]
@@ -89,7 +89,7 @@ class Control:
         if self.mode is not Mode.MOVING:
             self._hold_here()
         for name, q in angles.items():
-            self._ways[FINGERS.index(name)].target = q
+            self._setpoints[FINGERS.index(name)].target = q
         self._enter(Mode.MOVING)
 
     def grasp(self, force: float) -> None:
@@ -132,7 +132,7 @@ class Control:
         tilt changes by both.
         """
         settings, present = self._settings, self._pose.angle
-        lean = 1.0 / max(self._grasp_state.turn[0] + self._grasp_state.turn[1], 0.1)
+        lean = 1.0 / max(self._held.turn[0] + self._held.turn[1], 0.1)
         low, high = -math.inf, math.inf
         for index, sense in ((0, 1.0), (1, -1.0)):
             contact, q = self._contacts[index], self._reading.q[index]
@@ -149,7 +149,7 @@ class Control:
         """Open to the hand's open angles."""
         self._hold_here()
         for index in self._fingers:
-            self._ways[index].target = self._settings.hand.open_angle[index]
+            self._setpoints[index].target = self._settings.hand.open_angle[index]
         self._gripping = False
         self._enter(Mode.RELEASING)
 
@@ -167,16 +167,16 @@ class Control:
             self._gripping = False
 
     def _hold_here(self) -> None:
-        for way, q in zip(self._ways, self._reading.q, strict=True):
-            way.reset(q)
+        for setpoint, q in zip(self._setpoints, self._reading.q, strict=True):
+            setpoint.reset(q)
 
     # One tick
 
     def step(self, dt: float, goal: Goal) -> None:
         """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
         goal.valid = self.torque
+        goal.force = goal.angle = math.nan
         if not self.torque:
-            goal.force = goal.angle = math.nan
             return
         mode = self.mode
         if mode is Mode.MOVING or mode is Mode.RELEASING:
@@ -186,21 +186,11 @@ class Control:
         if self._gripping:
             self._hold(dt, goal)
         else:
-            closing = mode is Mode.GRASPING
-            bound = self._approach_current() if closing else self._rest_current
-            for index in self._fingers:
-                goal.q[index] = self._ways[index].value
-                goal.current[index] = bound
-        self._tell_goal(goal)
-
-    def _tell_goal(self, goal: Goal) -> None:
-        """What the grip goes to, for those who look on; nothing here follows it."""
-        grip = self._grip
-        goal.force = goal.angle = math.nan
+            self._rest(
+                goal, self._approach_current() if mode is Mode.GRASPING else self._rest_current
+            )
         if self._gripping:
-            goal.force = grip.force.target
-            if grip.steering:
-                goal.angle = grip.angle.target
+            goal.force, goal.angle = self._grip.given, self._grip.kept_angle
         elif self.mode is Mode.GRASPING:
             goal.force = self._force
 
@@ -210,24 +200,31 @@ class Control:
         Those that stand for torques do not: a grip goes on to damp its joints, and a turn rests.
         """
         if goal.valid and self._gripping and self._lost == 0.0 and not self._by_position:
-            self._pull(self._grip.coast(self._reading, self._grasp_state), goal)
+            self._pull(self._grip.coast(self._reading), goal)
+
+    def _rest(self, goal: Goal, current: float) -> None:
+        """Joints go with their setpoints, with so much ``current`` [A] at most."""
+        for index in self._fingers:
+            goal.q[index] = self._setpoints[index].value
+            goal.current[index] = current
 
     def _travel(self, dt: float) -> None:
-        if self._ramp(self._settings.control.move_speed):
+        if not self._advance_setpoints(self._settings.control.move_speed):
             return
         self._waiting += dt
-        off = max(abs(self._reading.q[i] - self._ways[i].target) for i in self._fingers)
+        off = max(abs(self._reading.q[i] - self._setpoints[i].target) for i in self._fingers)
         if off < _ARRIVED or self._waiting > _GRACE:
             if off >= _ARRIVED:
                 text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
                 self.events.append(("warning", "short", text))
             self._enter(Mode.ARMED)
 
-    def _ramp(self, speed: float) -> bool:
-        """Move the goals one tick toward their targets; False when all are there."""
+    def _advance_setpoints(self, speed: float) -> bool:
+        """One tick of the joints' setpoints; True when all have arrived."""
+        arrived = True
         for index in self._fingers:
-            self._ways[index].step(speed)
-        return not all(self._ways[index].arrived for index in self._fingers)
+            arrived = self._setpoints[index].step(speed) and arrived
+        return arrived
 
     def _approach(self, dt: float) -> None:
         """Close until every finger touches; a finger that touches waits for the other."""
@@ -236,20 +233,25 @@ class Control:
             contact = self._contacts[index]
             touches = contact.valid and contact.contact and contact.force > law.contact_force
             if touches and not self._touching[index]:
-                self._ways[index].reset(self._reading.q[index])
+                self._setpoints[index].reset(self._reading.q[index])
             self._touching[index] = touches
             if not touches:
-                self._ways[index].target = self._settings.hand.q_max[index]
+                self._setpoints[index].target = self._settings.hand.q_max[index]
         if all(self._touching[index] for index in self._fingers):
-            if self._is_empty(dt):
-                return
-            felt = sum(self._contacts[i].force for i in self._fingers) / len(self._fingers)
-            self._gripping = True
-            self._grip.start(self._grasp_state, felt, self._force)
-        elif not self._ramp(law.approach_speed) and self._waited(dt) > _GRACE:
-            self.events.append(("warning", "grasp", "nothing to grasp within the joints' limits"))
-            self._hold_here()
-            self._enter(Mode.ARMED)
+            if not self._is_empty(dt):
+                self._gripping = True
+                self._grip.start(self._felt(), self._force)
+        elif self._advance_setpoints(law.approach_speed):
+            self._waiting += dt
+            if self._waiting > _GRACE:
+                text = "nothing to grasp within the joints' limits"
+                self.events.append(("warning", "grasp", text))
+                self._hold_here()
+                self._enter(Mode.ARMED)
+
+    def _felt(self) -> float:
+        """Mean force of the tips [N]."""
+        return sum(contact.force for contact in self._touched) / len(self._touched)
 
     def _approach_current(self) -> float:
         """A tip that meets the object before it is felt shall not press beyond the force wanted."""
@@ -257,25 +259,25 @@ class Control:
         pressed = 0.5 * self._force * self._settings.hand.finger_length + law.joint_friction
         return min(law.approach_current, pressed / law.torque_constant)
 
-    def _waited(self, dt: float) -> float:
-        self._waiting += dt
-        return self._waiting
-
     def _hold(self, dt: float, goal: Goal) -> None:
-        contacts = self._touched
-        grip = self._grip
-        grip.holding = self.mode is Mode.HOLDING
-        if self._loses(dt, contacts, goal):
-            return
+        holding = self.mode is Mode.HOLDING
+        for contact in self._touched:
+            if not contact.contact:
+                self._lose(dt, goal)
+                return
+        self._lost = 0.0
         self._is_empty(dt)
         if self._by_position:
-            goal.q[:] = grip.angles(self._contacts, self._pose, self._grasp_state)
+            goal.q[:] = self._grip.angles(self._pose)
             goal.current[0] = goal.current[1] = self._settings.safety.current_max
         else:
-            torques = grip.torques(self._reading, self._contacts, self._pose, self._grasp_state)
-            self._pull(torques, goal)
-        self._watch_slip()
-        self._watch_settling(dt, contacts)
+            self._pull(self._grip.torques(self._reading, self._pose, holding), goal)
+        if self._grip.slipped or self._raised or self._grip.given != self._grip.asked:
+            self._watch_slip()
+        if self.mode is Mode.ROTATING:
+            self._watch_turning()
+        if self.mode is Mode.GRASPING or self.mode is Mode.ROTATING:
+            self._watch_settling(dt)
 
     def _pull(self, torques: tuple[float, float], goal: Goal) -> None:
         for index in self._fingers:
@@ -283,29 +285,20 @@ class Control:
             goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
             goal.current[index] = abs(current)
 
-    def _loses(self, dt: float, contacts: list[Contact], goal: Goal) -> bool:
+    def _lose(self, dt: float, goal: Goal) -> None:
         """Without a contact the joints hold where they are; when it stays away the grip ends."""
-        lost = False
-        for contact in contacts:
-            lost = lost or not contact.contact
-        if not lost:
-            self._lost = 0.0
-            return False
         if self._lost == 0.0:
             self._hold_here()
             # A board that went blind must not make the joints press harder than they did.
             pressed = max(goal.current[index] for index in self._fingers)
             self._rest_current = min(pressed, self._settings.safety.current_move)
-        for index in self._fingers:
-            goal.q[index] = self._ways[index].value
-            goal.current[index] = self._rest_current
+        self._rest(goal, self._rest_current)
         self._lost += dt
         if self._lost > _LOST_AFTER:
             self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
             rest = self._rest_current
             self._enter(Mode.ARMED)
             self._rest_current = rest
-        return True
 
     def _is_empty(self, dt: float) -> bool:
         """Whether there seems to be nothing between the tips; when that stays, the hand opens.
@@ -328,49 +321,47 @@ class Control:
         return True
 
     def _watch_slip(self) -> None:
-        """Tell when the grip is raised by itself. Turning ends where the tips would slip."""
-        law = self._settings.control
-        most = law.tip_friction * (1.0 - law.slip_margin)
+        """Report when the grip is raised against slip."""
         grip = self._grip
-        if grip.slip.turned:
+        if grip.slipped:
             self.events.append(("warning", "slip", "the object turns in the grip"))
-        asked, given = grip.force_target, grip.force.target
-        if given > _RAISED * asked and not self._raised:
-            self._raised = True
-            text = f"grip raised above {asked:.1f} N: each tip may bear {grip.slip.load:.1f} N"
-            self.events.append(("warning", "slip", f"{text} along its face"))
-        elif given <= asked:
+        if grip.given <= grip.asked:
             self._raised = False
-        if self.mode is Mode.ROTATING and self._grasp_state.shear * grip.turning_on > most:
-            if not self._turn_ended:
-                angle = math.degrees(self._pose.angle)
-                text = f"turning ended at {angle:.1f}°: the tips would slip"
-                self.events.append(("warning", "slip", text))
-            self._turn_ended = True
-            grip.steer(self._pose.angle, self._pose.angle)
+        elif grip.given > _RAISED * grip.asked and not self._raised:
+            self._raised = True
+            text = f"grip raised above {grip.asked:.1f} N: each tip may bear {grip.slip.load:.1f} N"
+            self.events.append(("warning", "slip", f"{text} along its face"))
 
-    def _watch_settling(self, dt: float, contacts: list[Contact]) -> None:
-        if self.mode not in (Mode.GRASPING, Mode.ROTATING):
+    def _watch_turning(self) -> None:
+        """Turning ends where the tips would slip."""
+        grip, law, angle = self._grip, self._settings.control, self._pose.angle
+        most = law.tip_friction * (1.0 - law.slip_margin)
+        if not self._held.shear * grip.turning_on > most:
             return
-        # The mean, since what the object rubs on may take some force between the tips.
-        target = self._grip.force.target
-        felt = sum(contact.force for contact in contacts) / len(contacts)
-        settled = abs(felt - target) < _SETTLED_FORCE * target
+        if not self._turn_ended:
+            text = f"turning ended at {math.degrees(angle):.1f}°: the tips would slip"
+            self.events.append(("warning", "slip", text))
+        self._turn_ended = True
+        grip.steer(angle, angle)
+
+    def _watch_settling(self, dt: float) -> None:
+        """Pass into holding once the force, or the angle while turning, has stayed at its goal."""
+        grip, pose = self._grip, self._pose
         if self.mode is Mode.ROTATING:
-            settled = abs(self._pose.angle - self._grip.angle_target) < _SETTLED_ANGLE
+            settled = abs(pose.angle - grip.kept_angle) < _SETTLED_ANGLE
+        else:
+            # The mean, since what the object rubs on may take some force between the tips.
+            settled = abs(self._felt() - grip.given) < _SETTLED_FORCE * grip.given
         self._waiting = self._waiting + dt if settled else 0.0
-        if self._waiting > _SETTLED_FOR:
-            if self._pose.valid and not self._grip.steering:
-                self._grip.steer(self._pose.angle, self._pose.angle)
-            self._grip.slip.begin(self._grasp_state)
-            self._enter(Mode.HOLDING)
-            self._turn_next()
-
-    def _turn_next(self) -> None:
-        """Carry out a turn that waited for the grip."""
-        angle, self._next_angle = self._next_angle, None
-        if angle is None:
+        if self._waiting <= _SETTLED_FOR:
             return
+        if pose.valid and math.isnan(grip.kept_angle):
+            grip.steer(pose.angle, pose.angle)
+        grip.begin_holding()
+        self._enter(Mode.HOLDING)
+        if self._next_angle is None:
+            return
+        angle, self._next_angle = self._next_angle, None  # a turn that waited for the grip
         if refusal := self.why_not_turn(angle):
             self.events.append(("warning", "rotate", f"rotate: {refusal}"))
         else:

@@ -174,14 +174,14 @@ def _control(scene: Scene) -> None:
         for finger in fingers:
             contact_filter.correct(finger, frame, touch, contacts[finger])
         contact_filter.publish(0.01 * k, contacts, pose)
-    grasp = contact_filter.grasp
-    grip = Grip(settings, fingers)
-    grip.start(grasp, 1.0, 2.0)
+    grip = Grip(settings, fingers, contact_filter.grasp)
+    grip.start(1.0, 2.0)
     grip.steer(0.0, 0.1)
-    grip.torques(reading, contacts, pose, grasp)
-    grip.coast(reading, grasp)
+    grip.begin_holding()
+    grip.torques(reading, pose, True)
+    grip.coast(reading)
     if len(fingers) == len(FINGERS):
-        grip.angles(contacts, pose, grasp)
+        grip.angles(pose)
 
 
 def _many(scene: Scene) -> None:

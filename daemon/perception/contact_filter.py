@@ -3,8 +3,7 @@
 A frame is exact but late and rare; joints are fresh but coarse. While an object is held, joint
 motion carries d and the object's angle φ on by the rolling constraints (`hand.grasp_state`). A
 frame is compared with what was predicted for the instant at which it was sampled, and the
-difference, weighed by both variances, corrects the present. Holds this filter and nothing that acts
-on it.
+difference, weighed by both variances, corrects the present.
 
 A reading says only within which count a joint is: the tracked angle runs on with the measured
 velocity and is held inside that count, so that it is exact at each count's edge.
@@ -25,11 +24,13 @@ but turning it ends at the tips' limits.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception import contact_filter_kernels
+from softfinger.daemon.perception import contact_filter_kernels as kernels
+from softfinger.daemon.perception.contact_filter_kernels import FilterState, Past
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
@@ -41,117 +42,56 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 FloatArray = NDArray[np.float64]
 
 
-class _Number:
-    """One number that a `GraspState` was told."""
-
-    def __init__(self, place: int) -> None:
-        self._place = place
-
-    def __get__(self, grasp: GraspState, owner: type[GraspState]) -> float:
-        return grasp.told.item(self._place)
-
-    def __set__(self, grasp: GraspState, value: float) -> None:
-        grasp.told[self._place] = value
-
-
-class _Pair:
-    """Two of them, (left, right), ``step`` places apart."""
-
-    def __init__(self, place: int, step: int = 1) -> None:
-        self._places = slice(place, place + step + 1, step)
-
-    def __get__(self, grasp: GraspState, owner: type[GraspState]) -> list[float]:
-        pair: list[float] = grasp.told[self._places].tolist()
-        return pair
-
-    def __set__(self, grasp: GraspState, value: list[float]) -> None:
-        grasp.told[self._places] = value
-
-
-class GraspState:
-    """How the held object answers the joints: what a grip law needs. Pairs are (left, right).
-
-    It is one array that a kernel writes and others read; the names are for people and slow work.
-    """
-
-    __slots__ = ("told",)
-
-    q = _Pair(contact_filter_kernels.JOINT)  # tracked joints [rad]
-    arm = _Pair(contact_filter_kernels.ARM)  # ∂(d1 + d2)/∂q, the force's lever [m]
-    turn = _Pair(contact_filter_kernels.TURN)  # φ̇ = turn1 q̇1 − turn2 q̇2
-    slide = _Number(contact_filter_kernels.SLIDE)  # ∂(d1 + d2)/∂φ [m/rad]
-    taper = _Number(
-        contact_filter_kernels.OBJECT_TAPER
-    )  # rad between the object's faces, as both tips feel them
-    lever = _Pair(contact_filter_kernels.LEVER)  # torque over force by the energy [m]
-    stiffness = _Pair(
-        contact_filter_kernels.TIP_STIFFNESS, contact_filter_kernels.TIP_SIZE
-    )  # ∂F/∂d [N/m]
-    shear = _Number(
-        contact_filter_kernels.SHEAR
-    )  # shear over normal force, by the object's balance, unloaded
-    normal = _Pair(contact_filter_kernels.NORMAL)  # normal forces [N]
-    load = _Number(
-        contact_filter_kernels.LOAD
-    )  # what each tip bears along its face, by the joints' torques [N]
-    load_lever = _Number(
-        contact_filter_kernels.LOAD_LEVER
-    )  # and the lever of that load about the pivots [m]
-    stray = _Number(
-        contact_filter_kernels.STRAYED
-    )  # turning of the object that no joint explains, summed [rad]
-    angle_std = _Number(contact_filter_kernels.ANGLE_STD)  # of the object's angle [rad]
-
-    def __init__(self) -> None:
-        self.told = np.zeros(contact_filter_kernels.TOLD_SIZE)
-
-
 class ContactFilter:
     """The filter of one hand. Costs nothing but a comparison while no tip is touched."""
 
     def __init__(self, settings: Settings, tables: tuple[ContactTable, ContactTable]) -> None:
-        """``tables``: what each tip feels, which may be of different materials."""
-        hand = settings.hand
+        """``tables``: each tip's, which may be of different materials."""
+        hand, gear = settings.hand, settings.servos.gear_ratio
+        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._with_object = settings.scene.object_model
+        self._age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
         self._tables = tables[0].data, tables[1].data
-        self._m = np.zeros(contact_filter_kernels.MEMORY)
-        self._m[: contact_filter_kernels.COUNT + 2] = (
-            0.5 * hand.pivot_separation,
-            hand.finger_length,
-            hand.finger_offset,
-            settings.tip.radius,
-            2.0 * math.pi / (COUNTS_PER_TURN * settings.servos.gear_ratio),
-            float(len(settings.scene.fingers) == 1),
+        self._state = state = FilterState()
+        state.half_separation = 0.5 * hand.pivot_separation
+        state.length = hand.finger_length
+        state.offset = hand.finger_offset
+        state.radius = settings.tip.radius
+        state.count = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
+        state.slow = 0.5 * VELOCITY_UNIT / gear
+        state.torque_constant = settings.control.torque_constant
+        state.taper = state.assumed_taper = settings.object.taper
+        state.alone = len(self._fingers) == 1
+        state.t = -math.inf
+        self._history: Any = np.zeros(
+            round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
         )
-        self._torque_constant = settings.control.torque_constant
-        self._m[contact_filter_kernels.SLOW] = 0.5 * VELOCITY_UNIT / settings.servos.gear_ratio
-        self._m[contact_filter_kernels.TOLD] = self._m[contact_filter_kernels.TAPER] = (
-            settings.object.taper
-        )
-        self._m[contact_filter_kernels.T] = -math.inf
-        self._history = np.full(
-            (
-                round(contact_filter_kernels.HISTORY * settings.loop.rate) + 2,
-                contact_filter_kernels.H_SIZE,
-            ),
-            -math.inf,
-        )
+        self._history["t"] = -math.inf
+        self.grasp = state.grasp
+        published: Any = state.grasp.array
+        self._tips = published["tip"][0]  # a view: both tips are read at once
+        self._read = False  # the joints are known
         self._live = [False, False]  # tips that touch and are carried on by the joints
         self._sound = [False, False]  # the newest frame's estimate can be used
-        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self._age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
-        self.grasp = GraspState()
 
     def switch_off(self) -> None:
         """Pass frames on as they are, late and rare: to show what prediction is worth."""
-        self._m[contact_filter_kernels.RAW] = 1.0
+        self._state.raw = True
 
     def advance(self, reading: Reading) -> None:
         """Carry the estimates on to the instant of a good reading."""
-        q, dq, current = reading.q, reading.dq, reading.current
-        self._m[contact_filter_kernels.TORQUE] = self._torque_constant * current[0]
-        self._m[contact_filter_kernels.TORQUE + 1] = self._torque_constant * current[1]
-        contact_filter_kernels.advance(self._m, self._history, reading.t, q[0], q[1], dq[0], dq[1])
+        self._read = True
+        q1, q2 = reading.q
+        dq1, dq2 = reading.dq
+        current1, current2 = reading.current
+        kernels.advance(
+            self._state.array,
+            self._history,
+            reading.t,
+            (q1, q2),
+            (dq1, dq2),
+            (current1, current2),
+        )
 
     def correct(
         self, finger: int, frame: Frame, estimate: ContactEstimate, contact: Contact
@@ -162,55 +102,50 @@ class ContactFilter:
         if not sound:
             return  # no news: the contact is carried on, and its age tells safety
         contact.t_sound = frame.t_arrival
+        contact.contact, contact.gain = estimate.contact, estimate.gain
+        contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
         # Before a first reading nothing is known of the joints: the frame stands for itself.
-        live = self._live[finger] = (
-            estimate.contact and self._m[contact_filter_kernels.T] > -math.inf
-        )
+        live = self._live[finger] = estimate.contact and self._read
         if not live:
-            self._m[contact_filter_kernels.LIVE + finger] = self._m[
-                contact_filter_kernels.D + finger
-            ] = 0.0
+            tip = self._state.tip[finger]
+            tip.live, tip.d.mean = False, 0.0
             _fill_from_frame(contact, estimate, self._tables[finger])
             return
-        contact.contact = True
-        contact.tilt_y, contact.gain, contact.misfit = (
-            estimate.tilt_y,
-            estimate.gain,
-            estimate.misfit,
-        )
-        d_std, theta_std = estimate.d_std, estimate.tilt_x_std
-        contact_filter_kernels.correct(
-            self._m,
+        kernels.correct(
+            self._state.array,
             self._history,
             finger,
             frame.t_sample,
-            estimate.d,
-            estimate.tilt_x,
-            estimate.tilt_y,
-            estimate.gain,
-            d_std * d_std,
-            theta_std * theta_std,
+            (
+                estimate.d,
+                estimate.tilt_x,
+                estimate.tilt_y,
+                estimate.gain,
+                estimate.d_std,
+                estimate.tilt_x_std,
+            ),
         )
 
     def publish(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
         """Write the estimates of time ``t`` into contacts and pose."""
-        left, right = self._live
-        pose.valid = held = left and right and self._with_object
+        live = self._live
+        pose.valid = live[0] and live[1] and self._with_object
         pose.angle = pose.width = 0.0
-        if left or right:
-            told = self.grasp.told
-            contact_filter_kernels.tell(self._m, *self._tables, told)
-            seen = told[: contact_filter_kernels.ANGLE_STD].tolist()
-            if left:
-                _fill_one(contacts[0], seen[: contact_filter_kernels.TIP_SIZE])
-            if right:
-                _fill_one(
-                    contacts[1],
-                    seen[contact_filter_kernels.TIP_SIZE : 2 * contact_filter_kernels.TIP_SIZE],
-                )
-            if held:
-                pose.angle = seen[contact_filter_kernels.OBJECT_ANGLE]
-                pose.width = seen[contact_filter_kernels.OBJECT_WIDTH]
+        if live[0] or live[1]:
+            angle, width = kernels.publish(self._state.array, *self._tables)
+            for contact, carried, tip in zip(contacts, live, self._tips.tolist(), strict=True):
+                if carried:
+                    (
+                        contact.d,
+                        contact.theta,
+                        contact.force,
+                        contact.energy,
+                        contact.d_std,
+                        contact.theta_std,
+                        contact.inside,
+                    ) = tip
+            if pose.valid:
+                pose.angle, pose.width = angle, width
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
@@ -221,42 +156,17 @@ class ContactFilter:
 
 
 def _fill_from_frame(contact: Contact, estimate: ContactEstimate, table: FloatArray) -> None:
-    """Make ``contact`` what one frame's estimate says by itself, whatever the joints do.
-
-    ``table``: the contact table's data.
-    """
-    contact.contact = estimate.contact
-    contact.gain = estimate.gain
-    contact.misfit = estimate.misfit
-    if not estimate.contact:
-        contact.d = contact.theta = contact.tilt_y = 0.0
-        contact.force = contact.energy = 0.0
-        contact.d_std = contact.theta_std = 0.0
-        contact.inside = True
-        return
-    contact.d = estimate.d
-    contact.theta = estimate.tilt_x
-    contact.tilt_y = estimate.tilt_y
-    contact.d_std = estimate.d_std
-    contact.theta_std = estimate.tilt_x_std
-    force, energy, _, _, _, _, inside = lookup(
-        table, contact.d, total_tilt(contact.theta, contact.tilt_y)
-    )
-    # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
-    contact.force = contact.gain * force
-    contact.energy = contact.gain * energy
-    contact.inside = inside
-
-
-def _fill_one(contact: Contact, told: list[float]) -> None:
-    (
-        contact.d,
-        contact.theta,
-        contact.force,
-        contact.energy,
-        _,
-        contact.d_std,
-        contact.theta_std,
-        inside,
-    ) = told
-    contact.inside = inside > 0.0
+    """Make ``contact`` what one frame's estimate says by itself; ``table``: its tip's data."""
+    touches = estimate.contact
+    contact.d = estimate.d if touches else 0.0
+    contact.theta = estimate.tilt_x if touches else 0.0
+    contact.tilt_y = estimate.tilt_y if touches else 0.0
+    contact.d_std = estimate.d_std if touches else 0.0
+    contact.theta_std = estimate.tilt_x_std if touches else 0.0
+    contact.force = contact.energy = 0.0
+    contact.inside = True
+    if touches:
+        tilt = total_tilt(contact.theta, contact.tilt_y)
+        force, energy, _, _, _, _, contact.inside = lookup(table, contact.d, tilt)
+        # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
+        contact.force, contact.energy = contact.gain * force, contact.gain * energy

@@ -1,337 +1,422 @@
-"""The kernels that carry contacts on between frames and correct them, and their memory's layout.
+"""The contact filter's state and kernels; what they are for stands in `perception.contact_filter`.
 
-Pure functions on one array; what they are for stands in :mod:`perception.contact_filter`.
+Pairs are (left, right). SI units.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.external_load import load_by_torques
 from softfinger.kinematics.hand.grasp_state import held_motion, holding_levers, total_tilt
 
 FloatArray = NDArray[np.float64]
+Two = tuple[float, float]  # (left, right)
 
-HISTORY = 0.5  # s of joint motion that are kept: frames older than that are taken as so old
+HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
 _DRIFT_ANGLE = 4e-3  # rad/√s, likewise
 _DRIFT_TAPER = 1e-3  # rad/√s, what the taper does: tips come to other parts of the faces
-_TAPER_OFF = 0.1  # rad that `object.taper` may be off
+_TAPER_ERROR = 0.1  # rad that `object.taper` may be off
 _SHARE = 0.05  # error of a predicted motion, as a share of it
 _OUTLIER = 9.0  # variances off: the prediction was wrong, not the frame
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
 _STEP_VARIANCE = 1.0 / 12.0  # of a count
 
-# Places in the filter's memory; pairs are (left, right).
-_B, _L, _E, _A, COUNT, _ALONE = 0, 1, 2, 3, 4, 5
-T, _NEWEST = 6, 7
-_Q, D, _ANGLE = 8, 10, 12  # tracked joints [rad]; estimates [m], [rad]
-_VAR = 13  # variances of d, d, φ just after a frame, drift added
-_WAY = 16  # sums of predicted motion of d, d, φ
-_SINCE = 19  # their lengths since the last frame's instant
-_GAIN, _TILT, LIVE = 22, 24, 26
-_UNSEEN = 28  # motion of the joints since the last frame that the velocity can't show [rad]
-SLOW = 30  # half a count of velocity [rad/s]
-RAW = 31  # 1: frames as they are, carried on by nothing
-STRAY = 32  # sum of what frames have corrected of φ [rad]
-TORQUE = 33  # of the joints [N·m]
-TAPER, TOLD = 35, 36  # α as found and as told [rad]
-_TAPER_VAR, _TAPER_COV = 37, 38  # variance of α, covariance with φ
-MEMORY = 39
 
-# Columns of the history.
-_H_T, _H_WAY, _H_Q, H_SIZE = 0, 1, 4, 6
+class Quantity(Record):
+    """A tip's d [m] or the object's angle φ [rad]: carried on by joints, corrected by frames."""
 
-# Places in what a tick is told; pairs are (left, right).
-TIP_D, TIP_THETA, TIP_FORCE, TIP_ENERGY = 0, 1, 2, 3  # of the left tip; the right tip's follow
-TIP_STIFFNESS, TIP_D_STD, TIP_THETA_STD, TIP_INSIDE = 4, 5, 6, 7
-TIP_SIZE = 8
-OBJECT_ANGLE, OBJECT_WIDTH, ANGLE_STD = 16, 17, 18
-ARM, TURN, LEVER, JOINT, NORMAL = 19, 21, 23, 25, 27
-SLIDE, OBJECT_TAPER, SHEAR, LOAD, LOAD_LEVER, STRAYED = 29, 30, 31, 32, 33, 34
-TOLD_SIZE = 35
+    mean: float
+    variance: float  # just after the last frame, drift added
+    way: float  # sum of predicted motion
+    since: float  # its length since the last frame's instant
+
+
+class TrackedTip(Record):
+    """What the filter keeps of one tip and its joint."""
+
+    d: Quantity
+    gain: float
+    tilt_y: float
+    q: float  # tracked joint [rad]
+    unseen: float  # joint motion since the last frame that the velocity can't show [rad]
+    torque: float  # of the joint [N·m]
+    live: bool  # touches, and is carried on
+
+
+class PublishedTip(Record):
+    """One tip's contact at this tick; names as in `types.Contact`."""
+
+    d: float
+    theta: float
+    force: float
+    energy: float
+    d_std: float
+    theta_std: float
+    inside: bool
+
+
+class GraspState(Record):
+    """How the held object answers the joints at this tick: what a grip law needs."""
+
+    tip: Annotated[Records[PublishedTip], 2]
+    angle_std: float  # standard deviation of the object's angle [rad]
+    taper: float  # α between the object's faces, as both tips feel them [rad]
+    stray: float  # turning of the object that no joint explains, summed [rad]
+    q: Pair  # tracked joints [rad]
+    arm: Pair  # ∂(d1 + d2)/∂q, the force's lever [m]
+    turn: Pair  # φ̇ = turn1 q̇1 − turn2 q̇2
+    slide: float  # ∂(d1 + d2)/∂φ [m/rad]
+    lever: Pair  # torque over force by the energy [m]
+    stiffness: Pair  # ∂F/∂d [N/m]
+    normal: Pair  # normal forces [N]
+    shear: float  # shear over normal force, by the object's balance, unloaded
+    load: float  # what each tip bears along its face, by the joints' torques [N]
+    load_lever: float  # of that load about the pivots [m]
+
+
+class Past(Record):
+    """Predicted motion until one instant: a row of the history."""
+
+    t: float
+    d: Pair
+    angle: float
+    q: Pair
+
+
+class FilterState(Record):
+    """What is set once, what the filter remembers, and what it publishes."""
+
+    half_separation: float  # of the hand, in m as its other lengths
+    length: float
+    offset: float
+    radius: float
+    count: float  # of a joint's encoder [rad]
+    slow: float  # half a count of velocity [rad/s]
+    torque_constant: float  # [N·m/A]
+    assumed_taper: float  # `object.taper` [rad]
+    alone: bool  # one finger
+    raw: bool  # frames as they are, carried on by nothing
+    t: float  # of the last reading [s]
+    newest: int  # row of the history
+    tip: Annotated[Records[TrackedTip], 2]
+    angle: Quantity
+    taper: float  # α as found [rad]
+    taper_variance: float
+    taper_covariance: float  # with φ
+    stray: float  # sum of what frames have corrected of φ [rad]
+    grasp: GraspState
 
 
 @inner_kernel
-def _variance(m: FloatArray, which: int) -> float:
-    """Variance of d1, d2 or φ: what the last frame left and what the joints may miss."""
-    since = m[_SINCE + which]
+def _variance(quantity: Quantity, step: float) -> float:
+    """What the last frame left, and what joints read in steps of ``step`` may miss since."""
+    since = quantity.since
     missed = _SHARE * since
-    variance: float = m[_VAR + which] + missed * missed
+    variance: float = quantity.variance + missed * missed
     if since > 0.0:
-        step = m[COUNT] * (1.0 if which == 2 else m[_L])
         variance += min(since * since, _STEP_VARIANCE * step * step)
     return variance
 
 
 @inner_kernel
-def _side_variance(m: FloatArray, sense: float) -> float:
+def _face_variance(f: FilterState, sense: float) -> float:
     """Variance of the angle φ + sense α/2 of one face; ``sense`` is −1 for the left tip's."""
-    variance: float = _variance(m, 2) + sense * m[_TAPER_COV] + 0.25 * m[_TAPER_VAR]
-    return max(variance, 0.0)
+    angle = _variance(f.angle, f.count)
+    return max(angle + sense * f.taper_covariance + 0.25 * f.taper_variance, 0.0)
 
 
 @inner_kernel
-def _free_taper(m: FloatArray, sense: float, angle: float, variance: float) -> None:
-    """Take the taper as told, with only the face of ``sense`` known, by ``angle``."""
-    spread = _TAPER_OFF * _TAPER_OFF
-    m[TAPER] = m[TOLD]
-    m[_ANGLE] = angle - 0.5 * sense * m[TOLD]
-    m[_VAR + 2] = variance + 0.25 * spread
-    m[_TAPER_VAR] = spread
-    m[_TAPER_COV] = -0.5 * sense * spread
+def _assume_taper(f: FilterState, sense: float, angle: float, variance: float) -> None:
+    """Take the taper that is assumed, where only the face of ``sense`` is known, by ``angle``."""
+    spread = _TAPER_ERROR * _TAPER_ERROR
+    f.taper = f.assumed_taper
+    f.angle.mean = angle - 0.5 * sense * f.assumed_taper
+    f.angle.variance = variance + 0.25 * spread
+    f.taper_variance = spread
+    f.taper_covariance = -0.5 * sense * spread
 
 
 @inner_kernel
-def _credited(m: FloatArray, finger: int, way: float, shown: float, dt: float) -> float:
+def _credited(tip: TrackedTip, slow: float, way: float, shown: float, dt: float) -> float:
     """What of a tracked joint's ``way`` the estimates have not felt yet.
 
     A joint that creeps through its count comes up by a whole one at the edge; frames have seen most
     of that on the way. Beyond the motion ``shown`` by the velocity only so much is new as may have
     stayed below half a count of velocity since the last frame.
     """
-    unseen = m[_UNSEEN + finger] + m[SLOW] * dt
+    unseen = tip.unseen + slow * dt
     more = min(max(way - shown, -unseen), unseen)
-    m[_UNSEEN + finger] = unseen - abs(more)
-    credited: float = shown + more
-    return credited
+    tip.unseen = unseen - abs(more)
+    return shown + more
+
+
+@inner_kernel
+def _move(quantity: Quantity, way: float) -> None:
+    quantity.mean += way
+    quantity.way += way
+    quantity.since += abs(way)
 
 
 @kernel
 def advance(
-    m: FloatArray, history: FloatArray, t: float, q1: float, q2: float, dq1: float, dq2: float
+    filters: Records[FilterState], history: Records[Past], t: float, q: Two, dq: Two, current: Two
 ) -> None:
-    """Carry the estimates on to time ``t`` by the joints' reading."""
-    dt = t - m[T]
+    """Carry the estimates on to time ``t`` by the joints' reading [rad, rad/s, A]."""
+    f = filters[0]
+    left = f.tip[0]
+    right = f.tip[1]
+    left.torque = f.torque_constant * current[0]
+    right.torque = f.torque_constant * current[1]
+    dt = t - f.t
     if dt <= 0.0:
         return
-    m[T] = t
+    f.t = t
     if dt > HISTORY:
         dt = 0.0
-        m[_Q] = q1
-        m[_Q + 1] = q2
-    half = 0.5 * m[COUNT]
-    way1 = min(max(m[_Q] + dq1 * dt, q1 - half), q1 + half) - m[_Q]
-    way2 = min(max(m[_Q + 1] + dq2 * dt, q2 - half), q2 + half) - m[_Q + 1]
-    seen1 = _credited(m, 0, way1, dq1 * dt, dt)
-    seen2 = _credited(m, 1, way2, dq2 * dt, dt)
-    both = m[LIVE] > 0.0 and m[LIVE + 1] > 0.0
-    if (both or m[_ALONE] > 0.0) and m[RAW] == 0.0:
-        arm1, arm2, turn1, turn2, slide, _, _ = held_motion(
-            m[_Q],
-            m[_Q + 1],
-            m[D],
-            m[D + 1],
-            m[_ANGLE],
-            m[TAPER],
-            m[_B],
-            m[_L],
-            m[_E],
-            m[_A],
-        )
+        left.q = q[0]
+        right.q = q[1]
+    half = 0.5 * f.count
+    way1 = min(max(left.q + dq[0] * dt, q[0] - half), q[0] + half) - left.q
+    way2 = min(max(right.q + dq[1] * dt, q[1] - half), q[1] + half) - right.q
+    seen1 = _credited(left, f.slow, way1, dq[0] * dt, dt)
+    seen2 = _credited(right, f.slow, way2, dq[1] * dt, dt)
+    both = left.live and right.live
+    if (both or f.alone) and not f.raw:
+        arm1, arm2, turn1, turn2, slide, _, _ = _motion(f)
         if both:
             turn = turn1 * seen1 - turn2 * seen2
             deeper1 = deeper2 = 0.5 * (arm1 * seen1 + arm2 * seen2 + slide * turn)
         else:
             turn = 0.0
-            deeper1 = arm1 * seen1 if m[LIVE] > 0.0 else 0.0
-            deeper2 = arm2 * seen2 if m[LIVE + 1] > 0.0 else 0.0
-        m[D] += deeper1
-        m[D + 1] += deeper2
-        m[_ANGLE] += turn
-        m[_WAY] += deeper1
-        m[_WAY + 1] += deeper2
-        m[_WAY + 2] += turn
-        m[_SINCE] += abs(deeper1)
-        m[_SINCE + 1] += abs(deeper2)
-        m[_SINCE + 2] += abs(turn)
-    m[_Q] += way1
-    m[_Q + 1] += way2
-    m[_VAR] += _DRIFT_D * _DRIFT_D * dt
-    m[_VAR + 1] += _DRIFT_D * _DRIFT_D * dt
-    m[_VAR + 2] += _DRIFT_ANGLE * _DRIFT_ANGLE * dt
-    m[_TAPER_VAR] += _DRIFT_TAPER * _DRIFT_TAPER * dt
-    newest = (int(m[_NEWEST]) + 1) % history.shape[0]
-    m[_NEWEST] = newest
-    history[newest, _H_T] = t
-    for j in range(3):
-        history[newest, _H_WAY + j] = m[_WAY + j]
-    history[newest, _H_Q] = m[_Q]
-    history[newest, _H_Q + 1] = m[_Q + 1]
+            deeper1 = arm1 * seen1 if left.live else 0.0
+            deeper2 = arm2 * seen2 if right.live else 0.0
+        _move(left.d, deeper1)
+        _move(right.d, deeper2)
+        _move(f.angle, turn)
+    left.q += way1
+    right.q += way2
+    left.d.variance += _DRIFT_D * _DRIFT_D * dt
+    right.d.variance += _DRIFT_D * _DRIFT_D * dt
+    f.angle.variance += _DRIFT_ANGLE * _DRIFT_ANGLE * dt
+    f.taper_variance += _DRIFT_TAPER * _DRIFT_TAPER * dt
+    f.newest = (f.newest + 1) % len(history)
+    row = history[f.newest]
+    row.t = t
+    row.angle = f.angle.way
+    for k in range(2):
+        row.d[k] = f.tip[k].d.way
+        row.q[k] = f.tip[k].q
 
 
 @inner_kernel
-def _past(history: FloatArray, newest: int, t: float) -> tuple[int, int, float]:
+def _motion(f: FilterState) -> tuple[float, float, float, float, float, float, float]:
+    left = f.tip[0]
+    right = f.tip[1]
+    return held_motion(
+        left.q,
+        right.q,
+        left.d.mean,
+        right.d.mean,
+        f.angle.mean,
+        f.taper,
+        f.half_separation,
+        f.length,
+        f.offset,
+        f.radius,
+    )
+
+
+@inner_kernel
+def _rows_at(history: Records[Past], newest: int, t: float) -> tuple[int, int, float]:
     """Rows before and after time ``t``, and the later one's share; the ends for a time beyond."""
-    size = history.shape[0]
+    size = len(history)
     later = newest
     for back in range(size):
         row = (newest - back) % size
-        if history[row, _H_T] == -math.inf:
+        if history[row].t == -math.inf:
             break  # nothing was read before: a frame may be older than the first reading
-        if history[row, _H_T] <= t:
-            span = history[later, _H_T] - history[row, _H_T]
-            share = (t - history[row, _H_T]) / span if span > 0.0 else 0.0
+        if history[row].t <= t:
+            span = history[later].t - history[row].t
+            share = (t - history[row].t) / span if span > 0.0 else 0.0
             return row, later, share
         later = row
     return later, later, 0.0
 
 
 @inner_kernel
-def _weigh(m: FloatArray, which: int, moved: float, found: float, variance: float) -> float:
-    """Correct d1 or d2 by what a frame ``found``, ``moved`` ago by the joints; its weight."""
-    own = _variance(m, which)
-    place = D + which
-    miss = found - (m[place] - moved)
+def _weigh(
+    quantity: Quantity, step: float, raw: bool, moved: float, found: float, variance: float
+) -> float:
+    """Correct d by what a frame ``found``, ``moved`` ago by the joints; the frame's weight."""
+    own = _variance(quantity, step)
+    miss = found - (quantity.mean - moved)
     if miss * miss > _OUTLIER * (own + variance):
         own = miss * miss
-    weight = own / (own + variance) if m[RAW] == 0.0 else 1.0
-    m[place] += weight * miss
-    m[_VAR + which] = weight * variance
-    m[_SINCE + which] = abs(moved)
+    weight = 1.0 if raw else own / (own + variance)
+    quantity.mean += weight * miss
+    quantity.variance = weight * variance
+    quantity.since = abs(moved)
     return weight
 
 
 @inner_kernel
-def _weigh_angle(m: FloatArray, sense: float, turned: float, found: float, variance: float) -> None:
+def _weigh_angle(
+    f: FilterState, sense: float, turned: float, found: float, variance: float
+) -> None:
     """Correct φ and α by the angle of one face that a frame ``found``, ``turned`` ago."""
-    if m[RAW] > 0.0:
-        other = m[_ANGLE] - 0.5 * sense * m[TAPER]
-        m[_ANGLE] = 0.5 * (found + other)
-        m[TAPER] = sense * (found - other)
-        m[_VAR + 2] = 0.5 * variance
-        m[_TAPER_VAR] = 2.0 * variance
-        m[_TAPER_COV] = 0.0
-        m[_SINCE + 2] = abs(turned)
+    if f.raw:
+        other = f.angle.mean - 0.5 * sense * f.taper
+        f.angle.mean = 0.5 * (found + other)
+        f.taper = sense * (found - other)
+        f.angle.variance = 0.5 * variance
+        f.taper_variance = 2.0 * variance
+        f.taper_covariance = 0.0
+        f.angle.since = abs(turned)
         return
-    own = _variance(m, 2)
-    joint = m[_TAPER_COV]
-    spread = m[_TAPER_VAR]
-    miss = found - (m[_ANGLE] + 0.5 * sense * m[TAPER] - turned)
-    if miss * miss > _OUTLIER * (_side_variance(m, sense) + variance):
+    own = _variance(f.angle, f.count)
+    joint = f.taper_covariance
+    spread = f.taper_variance
+    miss = found - (f.angle.mean + 0.5 * sense * f.taper - turned)
+    if miss * miss > _OUTLIER * (_face_variance(f, sense) + variance):
         own += _BY_TURNING * miss * miss
         spread += 4.0 * (1.0 - _BY_TURNING) * miss * miss
     by_angle = own + 0.5 * sense * joint
     by_taper = joint + 0.5 * sense * spread
     inverse = 1.0 / (by_angle + 0.5 * sense * by_taper + variance)
-    m[_ANGLE] += by_angle * inverse * miss
-    m[TAPER] += by_taper * inverse * miss
-    m[_VAR + 2] = own - by_angle * by_angle * inverse
-    m[_TAPER_COV] = joint - by_angle * by_taper * inverse
-    m[_TAPER_VAR] = spread - by_taper * by_taper * inverse
-    m[_SINCE + 2] = abs(turned)
+    f.angle.mean += by_angle * inverse * miss
+    f.taper += by_taper * inverse * miss
+    f.angle.variance = own - by_angle * by_angle * inverse
+    f.taper_covariance = joint - by_angle * by_taper * inverse
+    f.taper_variance = spread - by_taper * by_taper * inverse
+    f.angle.since = abs(turned)
 
 
 @kernel
 def correct(
-    m: FloatArray,
-    history: FloatArray,
+    filters: Records[FilterState],
+    history: Records[Past],
     finger: int,
     t: float,
-    d: float,
-    theta: float,
-    tilt: float,
-    gain: float,
-    d_variance: float,
-    theta_variance: float,
+    found: tuple[float, float, float, float, float, float],
 ) -> None:
-    """Take in one finger's frame of time ``t``."""
-    row, later, share = _past(history, int(m[_NEWEST]), t)
-    moved = m[_WAY + finger] - _between(history, row, later, share, _H_WAY + finger)
-    turned = m[_WAY + 2] - _between(history, row, later, share, _H_WAY + 2)
-    q = _between(history, row, later, share, _H_Q + finger)
+    """Take in what one finger's frame of time ``t`` has ``found``.
+
+    That is d, θ, tilt_y, gain, and the standard deviations of d and θ.
+    """
+    f = filters[0]
+    tip = f.tip[finger]
+    other = f.tip[1 - finger]
+    d, theta, tilt_y, gain, d_std, theta_std = found
+    d_variance = d_std * d_std
+    row, later, share = _rows_at(history, f.newest, t)
+    before = history[row]
+    after = history[later]
+    moved = tip.d.way - _between(before.d[finger], after.d[finger], share)
+    turned = f.angle.way - _between(before.angle, after.angle, share)
+    q = _between(before.q[finger], after.q[finger], share)
     angle = theta - q if finger == 0 else theta + q
     sense = -1.0 if finger == 0 else 1.0
-    step = m[COUNT]
-    angle_variance = theta_variance + _STEP_VARIANCE * step * step
-    m[_UNSEEN + finger] = min(m[_UNSEEN + finger], m[SLOW] * max(m[T] - t, 0.0))
-    if m[LIVE + finger] == 0.0:
-        m[D + finger] = d + moved
-        m[_GAIN + finger] = gain
-        m[_VAR + finger] = d_variance
-        m[_SINCE + finger] = abs(moved)
-        if m[LIVE + 1 - finger] == 0.0:
-            _free_taper(m, sense, angle + turned, angle_variance)
-            m[_SINCE + 2] = abs(turned)
+    angle_variance = theta_std * theta_std + _STEP_VARIANCE * f.count * f.count
+    tip.unseen = min(tip.unseen, f.slow * max(f.t - t, 0.0))
+    tip.tilt_y = tilt_y
+    if not tip.live:
+        tip.live = True
+        tip.d.mean = d + moved
+        tip.d.variance = d_variance
+        tip.d.since = abs(moved)
+        tip.gain = gain
+        if not other.live:
+            _assume_taper(f, sense, angle + turned, angle_variance)
+            f.angle.since = abs(turned)
         else:
-            other = m[_ANGLE] - 0.5 * sense * m[TAPER]
-            _free_taper(m, -sense, other, _side_variance(m, -sense))
-            _weigh_angle(m, sense, turned, angle, angle_variance)
-        m[LIVE + finger] = 1.0
-    else:
-        # The errors of d and gain in a frame make up for each other: both get the same weight.
-        weight = _weigh(m, finger, moved, d, d_variance)
-        m[_GAIN + finger] += weight * (gain - m[_GAIN + finger])
-        before = m[_ANGLE]
-        _weigh_angle(m, sense, turned, angle, angle_variance)
-        m[STRAY] += m[_ANGLE] - before
-    m[_TILT + finger] = tilt
+            face = f.angle.mean - 0.5 * sense * f.taper
+            _assume_taper(f, -sense, face, _face_variance(f, -sense))
+            _weigh_angle(f, sense, turned, angle, angle_variance)
+        return
+    # The errors of d and gain in a frame make up for each other: both get the same weight.
+    weight = _weigh(tip.d, f.count * f.length, f.raw, moved, d, d_variance)
+    tip.gain += weight * (gain - tip.gain)
+    predicted = f.angle.mean
+    _weigh_angle(f, sense, turned, angle, angle_variance)
+    f.stray += f.angle.mean - predicted
 
 
 @inner_kernel
-def _between(history: FloatArray, row: int, later: int, share: float, column: int) -> float:
-    first: float = history[row, column]
-    last: float = history[later, column]
+def _between(first: float, last: float, share: float) -> float:
     return first + share * (last - first)
 
 
 @kernel
-def tell(m: FloatArray, table1: FloatArray, table2: FloatArray, told: FloatArray) -> None:
-    """Write what the estimates mean into ``told``."""
-    taper = m[TAPER]
-    d1 = m[D]
-    d2 = m[D + 1]
-    motion = held_motion(m[_Q], m[_Q + 1], d1, d2, m[_ANGLE], taper, m[_B], m[_L], m[_E], m[_A])
-    theta1 = m[_ANGLE] - 0.5 * taper + m[_Q]
-    theta2 = m[_ANGLE] + 0.5 * taper - m[_Q + 1]
+def publish(filters: Records[FilterState], table1: FloatArray, table2: FloatArray) -> Two:
+    """Write what the estimates mean into ``grasp``; the object's angle [rad] and width [m]."""
+    f = filters[0]
+    grasp = f.grasp
+    left = f.tip[0]
+    right = f.tip[1]
+    taper = f.taper
+    angle = f.angle.mean
+    motion = _motion(f)
+    theta1 = angle - 0.5 * taper + left.q
+    theta2 = angle + 0.5 * taper - right.q
     for finger in range(2):
+        tip = f.tip[finger]
+        seen = grasp.tip[finger]
         theta = theta1 if finger == 0 else theta2
         table = table1 if finger == 0 else table2
         force, energy, stiffness, _, _, _, inside = lookup(
-            table, m[D + finger], total_tilt(theta, m[_TILT + finger])
+            table, tip.d.mean, total_tilt(theta, tip.tilt_y)
         )
-        gain = m[_GAIN + finger]
-        tip = TIP_SIZE * finger
-        told[tip + TIP_D] = max(m[D + finger], 0.0)
-        told[tip + TIP_THETA] = theta
-        told[tip + TIP_FORCE] = gain * force
-        told[tip + TIP_ENERGY] = gain * energy
-        told[tip + TIP_STIFFNESS] = gain * stiffness
-        told[tip + TIP_D_STD] = math.sqrt(_variance(m, finger))
-        told[tip + TIP_THETA_STD] = math.sqrt(_side_variance(m, -1.0 if finger == 0 else 1.0))
-        told[tip + TIP_INSIDE] = 1.0 if inside else 0.0
-        told[JOINT + finger] = m[_Q + finger]
-    told[ANGLE_STD] = math.sqrt(_variance(m, 2))
-    told[OBJECT_ANGLE] = m[_ANGLE]
-    told[OBJECT_TAPER] = taper
-    told[STRAYED] = m[STRAY]
-    told[ARM], told[ARM + 1], told[TURN], told[TURN + 1], told[SLIDE], told[OBJECT_WIDTH], _ = (
-        motion
-    )
+        seen.d = max(tip.d.mean, 0.0)
+        seen.theta = theta
+        seen.force = tip.gain * force
+        seen.energy = tip.gain * energy
+        seen.d_std = math.sqrt(_variance(tip.d, f.count * f.length))
+        seen.theta_std = math.sqrt(_face_variance(f, -1.0 if finger == 0 else 1.0))
+        seen.inside = inside
+        grasp.stiffness[finger] = tip.gain * stiffness
+        grasp.q[finger] = tip.q
+    grasp.angle_std = math.sqrt(_variance(f.angle, f.count))
+    grasp.taper = taper
+    grasp.stray = f.stray
+    arm1, arm2, turn1, turn2, grasp.slide, width, _ = motion
+    grasp.arm[0] = arm1
+    grasp.arm[1] = arm2
+    grasp.turn[0] = turn1
+    grasp.turn[1] = turn2
     lever1, lever2, shear, normal1, normal2 = holding_levers(
-        table1, table2, d1, d2, theta1, theta2, taper, motion
+        table1, table2, left.d.mean, right.d.mean, theta1, theta2, taper, motion
     )
     out_of_grip = 0.5 * math.tan(0.5 * taper) * (normal1 + normal2)
-    gain1 = m[_GAIN]
-    gain2 = m[_GAIN + 1]
-    told[LEVER] = lever1
-    told[LEVER + 1] = lever2
-    told[SHEAR] = 0.0
+    grasp.lever[0] = lever1
+    grasp.lever[1] = lever2
+    grasp.shear = 0.0
     if normal1 + normal2 > 0.0:
-        told[SHEAR] = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
-    told[NORMAL] = gain1 * normal1
-    told[NORMAL + 1] = gain2 * normal2
-    if gain1 > 0.0 and gain2 > 0.0:
-        torque1 = m[TORQUE] / gain1
-        torque2 = m[TORQUE + 1] / gain2
+        grasp.shear = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
+    grasp.normal[0] = left.gain * normal1
+    grasp.normal[1] = right.gain * normal2
+    if left.gain > 0.0 and right.gain > 0.0:
         rolled = (shear - out_of_grip, shear + out_of_grip)
-        load, lever = load_by_torques(
-            table1, table2, d1, d2, theta1, theta2, taper, motion, rolled, torque1, torque2
+        load, grasp.load_lever = load_by_torques(
+            table1,
+            table2,
+            left.d.mean,
+            right.d.mean,
+            theta1,
+            theta2,
+            taper,
+            motion,
+            rolled,
+            left.torque / left.gain,
+            right.torque / right.gain,
         )
-        told[LOAD] = 0.5 * (gain1 + gain2) * load
-        told[LOAD_LEVER] = lever
+        grasp.load = 0.5 * (left.gain + right.gain) * load
+    return angle, width

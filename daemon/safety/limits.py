@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
-from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion

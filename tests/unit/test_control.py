@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softfinger.daemon.control.setpoint import Reference
+from softfinger.daemon.control.setpoint import Setpoint
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
@@ -307,14 +307,14 @@ def test_prediction_is_within_its_own_uncertainty_in_motion(
         for _ in range(500):
             loop.advance(loop.period)
             hand.advance(loop.state.reading.t)
-            contact, frame = loop.state.contacts[0], loop._frames[0]
+            contact, alone = loop.state.contacts[0], loop.perception.fingers[0].estimate
             off.append(
                 (
                     (contact.d - hand.d[0]) / contact.d_std,
                     (contact.theta - hand.theta[0]) / contact.theta_std,
                 )
             )
-            frames.append((frame.theta - hand.theta[0], contact.theta - hand.theta[0]))
+            frames.append((alone.tilt_x - hand.theta[0], contact.theta - hand.theta[0]))
         share = np.sqrt(np.mean(np.square(off), axis=0))
         assert (share < 1.5).all(), share
         assert (share > 0.2).all(), share
@@ -324,29 +324,34 @@ def test_prediction_is_within_its_own_uncertainty_in_motion(
         assert loop.state.object.width == pytest.approx(0.040, abs=1e-4)
 
 
-def test_a_reference_keeps_its_bounds_whatever_the_targets() -> None:
+def step(setpoint: Setpoint, rate: float) -> float:
+    setpoint.step(rate)
+    return setpoint.value
+
+
+def test_a_setpoint_keeps_its_bounds_whatever_the_targets() -> None:
     rng = np.random.default_rng(2)
     dt, window, rate = 0.002, 0.1, 2.0
-    reference = Reference(dt, window)
+    setpoint = Setpoint(dt, window)
     way = []
     for tick in range(4000):
         if tick % rng.integers(1, 200) == 0:
-            reference.target = rng.uniform(-1.0, 1.0)
-        way.append(reference.step(rate))
-    way += [reference.step(rate) for _ in range(1200)]
+            setpoint.target = rng.uniform(-1.0, 1.0)
+        way.append(step(setpoint, rate))
+    way += [step(setpoint, rate) for _ in range(1200)]
     speed = np.diff(way) / dt
     assert np.abs(speed).max() <= rate * 1.0001
     assert np.abs(np.diff(speed)).max() / dt <= 2.0 * rate / window * 1.0001
     assert np.abs(np.diff(speed, 2)).max() / dt**2 <= 8.0 * rate / window**2 * 1.0001
     assert np.abs(way).max() <= 1.0
-    assert reference.arrived
-    assert reference.value == reference.target
+    assert setpoint.step(rate)
+    assert setpoint.value == setpoint.target
 
 
-def test_a_step_of_the_reference_never_overshoots() -> None:
-    reference = Reference(0.002, 0.1)
-    reference.target = 1.0
-    way = [reference.step(4.0) for _ in range(500)]
+def test_a_step_of_the_setpoint_never_overshoots() -> None:
+    setpoint = Setpoint(0.002, 0.1)
+    setpoint.target = 1.0
+    way = [step(setpoint, 4.0) for _ in range(500)]
     assert all(np.diff(way) >= 0.0)
     assert way[-1] == 1.0
     arrival = next(k for k, value in enumerate(way) if value == 1.0)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.grip import Grip
-from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Contact, ObjectPose, Reading
+from softfinger.daemon.types import ObjectPose, Reading
 
 DT = 0.002
 
@@ -103,8 +103,8 @@ class Twin:
         return self.pull
 
 
-def some_held(generator: np.random.Generator) -> GraspState:
-    held = GraspState()
+def change(held: GraspState, generator: np.random.Generator) -> None:
+    """Another object, but for the forces of the tips."""
     held.q = list(generator.uniform(-0.2, 0.2, 2))
     held.arm = list(generator.uniform(0.06, 0.09, 2))
     held.turn = list(generator.uniform(0.5, 1.0, 2))
@@ -113,6 +113,13 @@ def some_held(generator: np.random.Generator) -> GraspState:
     held.normal = list(generator.uniform(5.0, 9.0, 2))
     held.slide = generator.uniform(-0.02, 0.02)
     held.angle_std = generator.uniform(0.0, 0.02)
+
+
+def some_held(generator: np.random.Generator, force: float = 0.0) -> GraspState:
+    held = GraspState()
+    change(held, generator)
+    for finger in range(2):
+        held.tip[finger].force = force
     return held
 
 
@@ -121,11 +128,11 @@ def test_the_torques_are_those_of_the_law_in_plain_python(law: str) -> None:
     generator = np.random.default_rng(5)
     # Without a margin to keep, the force that is gone to is the one that was asked for.
     settings = Settings.model_validate({"control": {"law": law, "grip_raise_max": 0.0}})
-    grip = Grip(settings, [0, 1])
     held = some_held(generator)
+    grip = Grip(settings, [0, 1], held)
     window = settings.control.smooth_time
     twin = Twin(settings, Smooth(window, 1.0), Smooth(window, 0.05), 0.5 * (held.q[0] - held.q[1]))
-    grip.start(held, 1.0, 8.0)
+    grip.start(1.0, 8.0)
     twin.force.target, twin.rate = 8.0, 7.0 / settings.control.force_time
     reading = Reading()
     for k in range(2000):
@@ -136,12 +143,12 @@ def test_the_torques_are_those_of_the_law_in_plain_python(law: str) -> None:
             twin.rate = abs(6.0 - grip.force.value) / settings.control.force_time
             grip.retarget(6.0)
             twin.force.target = 6.0
-        held = some_held(generator)
+        change(held, generator)
         forces = generator.uniform(5.0, 9.0, 2)
         reading.dq[:] = generator.uniform(-0.3, 0.3, 2)
         pose = ObjectPose(True, generator.uniform(0.0, 0.2), 0.03)
-        contacts = [Contact(force=forces[0], d=3e-3), Contact(force=forces[1], d=3e-3)]
-        found = grip.torques(reading, contacts, pose, held)
+        held.tip[0].force, held.tip[1].force = forces
+        found = grip.torques(reading, pose, False)
         expected = twin.torques(held, forces.mean(), pose.angle, (reading.dq[0], reading.dq[1]))
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-11)
     assert twin.force.arrived
@@ -151,17 +158,17 @@ def test_the_torques_are_those_of_the_law_in_plain_python(law: str) -> None:
 
 def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest() -> None:
     generator = np.random.default_rng(6)
-    grip = Grip(Settings(), [0, 1])
-    held = some_held(generator)
+    held = some_held(generator, 8.0)
+    grip = Grip(Settings(), [0, 1], held)
     held.slide, held.arm = 0.0, [0.08, 0.08]
-    contacts, reading = [Contact(force=8.0), Contact(force=8.0)], Reading()
-    grip.start(held, 8.0, 8.0)
+    reading = Reading()
+    grip.start(8.0, 8.0)
     grip.steer(0.0, 0.3)
     for _ in range(100):
-        grip.torques(reading, contacts, ObjectPose(True, 0.0, 0.03), held)
+        grip.torques(reading, ObjectPose(True, 0.0, 0.03), False)
     pushes, leans = [], []
     for _ in range(400):
-        left, right = grip.coast(reading, held)
+        left, right = grip.coast(reading)
         pushes.append(left / held.arm[0] + right / held.arm[1])
         leans.append(left - right)
     assert np.ptp(pushes) < 1e-6 * pushes[0]
@@ -171,15 +178,13 @@ def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest() -> None:
 @pytest.mark.parametrize("finger", [0, 1])
 def test_one_finger_presses_and_the_other_gets_nothing(finger: int) -> None:
     settings = Settings.model_validate({"scene": {"fingers": (("left", "right")[finger],)}})
-    grip = Grip(settings, [finger])
-    held = some_held(np.random.default_rng(7))
-    contacts, reading = [Contact(), Contact()], Reading()
-    contacts[finger].force = 5.0
-    grip.start(held, 5.0, 5.0)
+    held, reading = some_held(np.random.default_rng(7), 5.0), Reading()
+    grip = Grip(settings, [finger], held)
+    grip.start(5.0, 5.0)
     reading.dq[finger] = 0.1
     law = settings.control
     arm, stiffness = held.arm[finger], held.stiffness[finger]
     damping = 2.0 * law.damping_ratio * math.sqrt(law.joint_inertia * stiffness) * arm
-    for torques in (grip.torques(reading, contacts, ObjectPose(), held), grip.coast(reading, held)):
+    for torques in (grip.torques(reading, ObjectPose(), False), grip.coast(reading)):
         assert torques[finger] == pytest.approx(arm * 5.0 - damping * 0.1)
         assert torques[1 - finger] == 0.0

@@ -17,7 +17,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Safety as Limits
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softfinger.daemon.control.slip_monitor import SlipWatch
-from softfinger.daemon.perception.contact_filter import GraspState
+from softfinger.daemon.control.grip import Grip
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Contact
-from softfinger.tools.benchmarks.control_rig import Watched, push_along
+from softfinger.daemon.types import ObjectPose, Reading
+from softfinger.tools.benchmarks.control_rig import Watched as Hand
+from softfinger.tools.benchmarks.control_rig import push_along
 from tests.unit.test_control import PAPER, grasped
 
 FORCE = 10.0
@@ -26,7 +27,7 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(
 ) -> None:
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
-        with Watched(sections | {"control": {"grip_raise_max": raised}}) as hand:
+        with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             before = hand.plant.object_pose.copy()
             used = push_along(hand, way * 0.5 * BORNE, rate=9.0)
@@ -42,7 +43,7 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(
 
 
 def test_the_grip_comes_back_when_the_load_has_gone() -> None:
-    with Watched(PAPER) as hand:
+    with Hand(PAPER) as hand:
         grasped(hand)
         push_along(hand, BORNE, rate=9.0)
         assert hand.plant.force.mean() > 1.2 * FORCE
@@ -55,7 +56,7 @@ def test_the_grip_comes_back_when_the_load_has_gone() -> None:
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
 @pytest.mark.parametrize("force", [10.0, 5.0, 2.0])
 def test_turning_alone_raises_nothing(force: float, sections: dict[str, dict[str, Any]]) -> None:
-    with Watched(sections) as hand:
+    with Hand(sections) as hand:
         grasped(hand, force)
         for angle in (0.17, -0.17, 0.0):
             hand.command("rotate", angle=angle)
@@ -65,7 +66,7 @@ def test_turning_alone_raises_nothing(force: float, sections: dict[str, dict[str
 
 def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
     for raised, held in ((0.0, False), (10.0, True)):
-        with Watched({"control": {"grip_raise_max": raised}}) as hand:
+        with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             start = hand.plant.object_pose[2]
             # Both tips' friction bears about 0.25 N·m over the object's width.
@@ -77,74 +78,64 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
             assert (hand.plant.force.mean() > 1.2 * FORCE) == held
 
 
-def held(load: float, normal: float = 10.0) -> GraspState:
-    made = GraspState()
-    made.load, made.load_lever = load, 0.03
-    made.arm, made.turn = [0.079, 0.079], [0.75, 0.75]
-    made.normal, made.stiffness = [normal, normal], [6e3, 6e3]
-    return made
+class Watched:
+    """A grip of a made-up object, whose loads are set."""
 
+    def __init__(self, asked: float = FORCE, **control: float) -> None:
+        self.held = held = GraspState()
+        held.load_lever = 0.03
+        held.arm, held.turn, held.stiffness = [0.079, 0.079], [0.75, 0.75], [6e3, 6e3]
+        for finger in range(2):
+            held.tip[finger].d, held.tip[finger].force = 4e-3, asked
+        self.grip = Grip(Settings.model_validate({"control": control}), [0, 1], held)
+        self.grip.start(asked, asked)
 
-def watch(**control: float) -> SlipWatch:
-    return SlipWatch(Settings.model_validate({"control": control}))
-
-
-CONTACTS = [Contact(d=4e-3), Contact(d=4e-3)]
-
-
-def step(slip: SlipWatch, *seen: Any) -> float:
-    """One tick of a grip of so much force asked for."""
-    return slip.step(*seen) if slip.due() else slip.kept(seen[2])
-
-
-def run(slip: SlipWatch, load: float, seconds: float) -> float:
-    force = 0.0
-    for _ in range(round(seconds * 500)):
-        force = step(slip, held(load), CONTACTS, FORCE, True, 0.0)
-    return force
+    def run(self, load: float, ticks: int, holding: bool = True, normal: float = 10.0) -> float:
+        """So many ticks under a load; the force [N] that is gone to."""
+        self.held.load, self.held.normal = load, [normal, normal]
+        for _ in range(ticks):
+            self.grip.torques(Reading(), ObjectPose(), holding)
+        return self.grip.given
 
 
 def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is() -> None:
-    slip = watch()
-    for _ in range(500):
-        step(slip, held(1.5), CONTACTS, FORCE, False, 0.0)
-    slip.begin(held(1.5))
-    assert run(slip, 1.5, 1.0) == FORCE
-    assert slip.load == 0.0
+    watched = Watched(friction_speed=1e6)  # nothing is given for what closing takes
+    watched.run(1.5, 500, holding=False)
+    watched.grip.begin_holding()
+    assert watched.run(1.5, 500) == FORCE
+    assert watched.grip.slip.load == 0.0
     # As much more as friction may hide of it: 0.05 N·m over 30 mm.
     hidden = 0.05 / 0.03
-    expected = (6.0 - slip._still + hidden) / (0.6 * 0.8)
-    assert run(slip, 6.0, 1.0) == pytest.approx(expected, rel=0.01)
+    expected = (6.0 - watched.grip.slip.still + hidden) / (0.6 * 0.8)
+    assert watched.run(6.0, 500) == pytest.approx(expected, rel=0.01)
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() -> None:
     for more, expected in ((2.0, 12.0), (100.0, 27.0), (0.0, 10.0)):
-        slip = watch(grip_raise_max=more)
-        slip.begin(held(0.0))
-        assert run(slip, 50.0, 1.0) == pytest.approx(expected)
+        watched = Watched(grip_raise_max=more)
+        watched.grip.begin_holding()
+        assert watched.run(50.0, 500) == pytest.approx(expected)
 
 
 def test_a_wrong_torque_constant_is_no_load() -> None:
-    slip = watch()
+    watched = Watched()
     # 8 % of 10 N at 79 mm looks like 2.1 N on a lever of 30 mm.
     wrong = 0.08 * 10.0 * 0.079 / 0.03
-    for _ in range(500):
-        step(slip, held(wrong), CONTACTS, FORCE, False, 0.0)
-    slip.begin(held(wrong))
-    assert run(slip, wrong, 1.0) == FORCE
+    watched.run(wrong, 500, holding=False)
+    watched.grip.begin_holding()
+    assert watched.run(wrong, 500) == FORCE
     for normal in np.linspace(10.0, 20.0, 200):
-        force = step(slip, held(wrong * normal / 10.0, normal), CONTACTS, FORCE, True, 0.0)
+        force = watched.run(wrong * normal / 10.0, 1, normal=normal)
     assert force == FORCE
 
 
 def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques() -> None:
-    slip = watch()
-    slip.begin(held(0.0, 2.0))
-    for _ in range(1000):
-        assert step(slip, held(4.0, 2.0), CONTACTS, 2.0, True, 0.0) == 2.0
+    watched = Watched(2.0)
+    watched.held.normal = [2.0, 2.0]
+    watched.grip.begin_holding()
+    assert {watched.run(4.0, 1, normal=2.0) for _ in range(1000)} == {2.0}
 
 
-def test_nothing_is_judged_before_holding_begins() -> None:
-    slip = watch()
-    for _ in range(500):
-        assert step(slip, held(20.0), CONTACTS, FORCE, False, 0.0) == FORCE
+def test_no_load_shows_before_holding_begins() -> None:
+    watched = Watched()
+    assert {watched.run(20.0, 1, holding=False) for _ in range(500)} == {FORCE}
