@@ -8,7 +8,7 @@ import math
 import sys
 from typing import Any
 
-from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.client.command_client import UNCONFIRMED, NoAnswer, send
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.profile.settings import CommandSettings
@@ -18,7 +18,8 @@ _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
 set compliance=RAD/NM, stop, clear, status. Numbers are SI; an angle may carry its unit, as in
 angle=10deg.
-Exit status: 0 done, 1 refused, 2 no answer or not understood here."""
+Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was heard, but
+the servos have not confirmed torque off yet."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"send: {error}", file=sys.stderr)
         return 2
     print(json.dumps(reply, ensure_ascii=False))
+    if reply.get("torque_off") == "unconfirmed":
+        print(f"send: {UNCONFIRMED}", file=sys.stderr)
+        return 3
     return 0 if reply.get("ok") else 1
 
 

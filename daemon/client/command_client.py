@@ -20,7 +20,8 @@ _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
-_LOCALLY = 0.5  # s for a daemon to answer past all other clients
+LOCALLY = 0.5  # s for a daemon to answer past all other clients
+UNCONFIRMED = "the servos have not confirmed torque off yet"  # to ``torque_off``: ``unconfirmed``
 
 
 class NoAnswer(SoftfingerError):
@@ -36,7 +37,7 @@ def send(
     A ``stop`` to a daemon of this user on this machine goes past all other clients.
     """
     if request.get("command") == "stop":
-        stopped = stop_locally(address, min(timeout, _LOCALLY))
+        stopped = stop_locally(address, min(timeout, LOCALLY))
         if stopped is not None:
             return stopped
     answer = f"answer to {request['command']} from {address}"

@@ -113,9 +113,7 @@ def bind_error(address: str, key: str, number: int | None, reason: str) -> Addre
 
 def _lock(path: str, address: str, key: str) -> int:
     try:
-        descriptor = os.open(
-            path + ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
-        )
+        descriptor = os.open(path + ".lock", _LOCK, 0o600)
     except OSError as error:
         raise AddressError(f"{key}: can't bind {address}: {error.strerror}") from None
     try:

@@ -26,7 +26,9 @@ from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import until
 from tests.harness.daemon_process import Running, softfinger
+from tests.harness.terminal_process import TerminalProcess
 from tests.harness.zmtp_client import RawClient
+from tests.process.test_strangers import place
 
 
 @pytest.fixture
@@ -188,41 +190,67 @@ def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, 
     assert ticking.loop.state.mode == "disarmed"
 
 
-def test_its_folder_and_file_are_the_users_alone(own_folder: Path) -> None:
-    local = LocalStop("tcp://127.0.0.1:9")
+def test_the_live_page_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
+    stream, commands = addresses
+    where = ["--state", stream, "--commands", commands]
+    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
+        page.shows("DISARMED")
+        send(commands, {"command": "arm"}, timeout=60.0)
+        page.shows("ARMED")
+        os.kill(gateway_of(ticking).process, signal.SIGSTOP)
+        try:
+            page.type(b" ")
+            page.shows("✓ stop: ok")
+            assert ticking.loop.state.mode == "disarmed"
+        finally:
+            os.kill(gateway_of(ticking).process, signal.SIGCONT)
+
+
+def test_its_folder_and_file_are_the_users_alone(
+    own_folder: Path, addresses: tuple[str, str]
+) -> None:
+    local = LocalStop(addresses[1])
+    host, port = place(addresses[1])
     assert stat.S_IMODE(own_folder.stat().st_mode) == 0o700
-    assert stat.S_IMODE((own_folder / "stop-127.0.0.1-9").stat().st_mode) == 0o600
+    assert stat.S_IMODE((own_folder / f"stop-{host}-{port}").stat().st_mode) == 0o600
     with pytest.raises(AddressError, match="is another softfinger running"):
-        LocalStop("tcp://127.0.0.1:9")
+        LocalStop(addresses[1])
     local.close()
     assert list(own_folder.iterdir()) == []
 
 
 def test_a_folder_that_others_may_enter_is_not_taken(
-    own_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    own_folder: Path,
+    addresses: tuple[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     own_folder.mkdir(mode=0o755)
     monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
     with pytest.raises(AddressError, match="is not this user's alone"):
-        LocalStop("tcp://127.0.0.1:9")
+        LocalStop(addresses[1])
     own_folder.rmdir()
     own_folder.symlink_to(tmp_path)
     with pytest.raises(AddressError, match="is not this user's alone"):
-        LocalStop("tcp://127.0.0.1:9")
-    assert stop_locally("tcp://127.0.0.1:9", 0.1) is None
+        LocalStop(addresses[1])
+    assert stop_locally(addresses[1], 0.1) is None
 
 
-def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(own_folder: Path) -> None:
-    killed = LocalStop("tcp://127.0.0.1:9")
+def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(
+    own_folder: Path, addresses: tuple[str, str]
+) -> None:
+    killed = LocalStop(addresses[1])
     killed._socket.close()
-    assert stop_locally("tcp://127.0.0.1:9", 0.1) is None
-    LocalStop("tcp://127.0.0.1:9").close()
+    assert stop_locally(addresses[1], 0.1) is None
+    LocalStop(addresses[1]).close()
 
 
-def test_a_stop_for_another_machine_stops_nothing_here(own_folder: Path) -> None:
-    local = LocalStop("tcp://127.0.0.1:9")
-    for address in ("tcp://hand.example:9", "tcp://192.0.2.1:9", "tcp://127.0.0.2:9"):
-        assert stop_locally(address, 0.1) is None
+def test_a_stop_for_another_machine_stops_nothing_here(
+    own_folder: Path, addresses: tuple[str, str]
+) -> None:
+    local = LocalStop(addresses[1])
+    for host in ("hand.example", "192.0.2.1", "127.0.0.2"):
+        assert stop_locally(f"tcp://{host}:{place(addresses[1])[1]}", 0.1) is None
     assert not local.take()
     local.close()
 

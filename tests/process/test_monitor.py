@@ -221,6 +221,14 @@ def test_beside_another_commander_of_a_real_daemon(
         page.shows("○ lost")
 
 
+def test_a_stop_that_the_servos_have_not_confirmed(fake: FakeDaemon) -> None:
+    fake.replies["stop"] = {"ok": True, "mode": "disarmed", "torque_off": "unconfirmed"}
+    with TerminalProcess(command(fake)) as page:
+        page.shows("HOLDING")
+        page.type(b" ")
+        page.shows("✗ stop: the servos have not confirmed torque off yet")
+
+
 def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:
     fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
     with TerminalProcess(command(fake)) as page:

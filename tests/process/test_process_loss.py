@@ -17,7 +17,7 @@ import pytest
 
 from softfinger.daemon.simulation.emulator.control_port import send_words
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running, ask
+from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 WATCHDOG = 1.0  # s, well above what a busy machine holds the daemon up
@@ -177,7 +177,10 @@ def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig: Rig) -> None:
     # A stop of which no write arrives, though readings do, and feed the servos' watchdogs.
     rig.at_work()
     send_words(rig.folder, "lose-writes=1")
-    assert rig.send("stop")["torque_off"] == "unconfirmed"
+    told = softfinger("send", "stop", "--address", rig.commands)
+    assert told.returncode == 3
+    assert json.loads(told.stdout)["torque_off"] == "unconfirmed"
+    assert "have not confirmed torque off" in told.stderr
     until(rig.stopped)
     assert rig.status()["torque"], "they are stopped, and it is not confirmed to be off"
     send_words(rig.folder, "lose-writes=0")

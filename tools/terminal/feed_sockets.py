@@ -1,4 +1,4 @@
-"""The sockets of one who looks at the hand and commands it, without ever waiting.
+"""The sockets of one who looks at the hand and commands it, without waiting.
 
 `Subscriber` takes the stream into a feed, `Commander` sends what a person asks for.
 """
@@ -11,7 +11,9 @@ from typing import Any
 import msgpack
 import zmq
 
+from softfinger.daemon.client.command_client import LOCALLY, UNCONFIRMED
 from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe
+from softfinger.daemon.wire.local_stop import stop_locally
 from softfinger.tools.terminal.feed import Feed, field, text
 
 _DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
@@ -55,10 +57,11 @@ class _Pending:
 
 
 class Commander:
-    """Sends commands without ever waiting. The newest reply is kept in ``reply``.
+    """Sends commands without waiting for their replies. The newest one is kept in ``reply``.
 
     Each command has a request socket of its own: an answer that never comes holds nothing up,
-    a stop least of all.
+    a stop least of all. To a daemon of this user on this machine, a stop goes past all clients; its
+    answer comes at the next tick, and a daemon that stands still is given a moment for it.
     """
 
     OPEN_LIMIT = 8  # commands under way; further ones are dropped, except stop
@@ -75,6 +78,11 @@ class Commander:
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
             self.reply = Reply(now, False, f"{label}: dropped, the daemon doesn't answer")
             return
+        if command == "stop":
+            stopped = stop_locally(self._address, LOCALLY)
+            if stopped is not None:
+                self.reply = self._judge(now, label, stopped)
+                return
         request = self._context.socket(zmq.REQ)
         request.setsockopt(zmq.LINGER, 0)
         request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
@@ -107,13 +115,18 @@ class Commander:
             each.socket.close()
         self._pending = waiting
 
-    @staticmethod
-    def _read(now: float, label: str, payload: bytes) -> Reply:
+    def _read(self, now: float, label: str, payload: bytes) -> Reply:
         try:
             record = msgpack.unpackb(payload)
         except (ValueError, RecursionError, msgpack.UnpackException):
             record = None
+        return self._judge(now, label, record)
+
+    @staticmethod
+    def _judge(now: float, label: str, record: Any) -> Reply:
         if field(record, "ok") is True:
+            if text(record, "torque_off") == "unconfirmed":
+                return Reply(now, False, f"{label}: {UNCONFIRMED}")
             return Reply(now, True, f"{label}: ok")
         why = text(record, "error") or "an answer that can't be read"
         said = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
