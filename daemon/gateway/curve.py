@@ -26,11 +26,11 @@ from softfinger.daemon.wire.keys import DOMAIN, ServerKeys, load_server
 from softfinger.daemon.wire.sockets import IpcFile, bind_error
 
 _NOW = int(zmq.NOBLOCK)
-_READ = 64  # messages at a look
+_READ = 64  # subscriptions at a look
+_READING = 0.004  # s of reading requests before all else is looked at again
 _PARTS = 3  # of a request: its client, REQ's empty one, the request
 _QUEUE = 64  # requests of one client in its socket
 _CLIENTS = 256  # who are remembered
-_READ_PURGING = 4096  # and of those that are refused
 _PURGE = 0.02  # s after a stop in which all requests are refused, …
 _PURGE_LONGEST = 0.25  # … and while there are any
 _LOOK = 0.5  # s between looks at the folder of keys
@@ -171,12 +171,12 @@ class KeyedCommands(_Door):
 
     def tend(self) -> None:
         self._keys.look(self.now)
-        purging = self.epoch != self._coming
-        if purging and self._is_purged():
+        if self.epoch != self._coming and self._is_purged():
             self._begin()
-            purging = False
         self._empty = False
-        for _ in range(_READ_PURGING if purging else _READ):
+        heard = set()
+        until = time.monotonic() + _READING
+        while time.monotonic() < until:
             parts = self._parts()
             if parts is None:
                 self._empty = True
@@ -184,8 +184,10 @@ class KeyedCommands(_Door):
             route, *envelope, payload = (part.bytes for part in parts)
             if len(envelope) <= 1 and route:
                 client = self._client(route, str(parts[-1].get("User-Id")))
-                client.pace.begin_read()
-                client.pace.behind = False
+                if client not in heard:
+                    heard.add(client)
+                    client.pace.begin_read()
+                    client.pace.behind = False
                 self._requests.take(client, envelope, payload, self.now)
 
     def _is_purged(self) -> bool:
