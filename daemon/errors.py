@@ -13,6 +13,7 @@ __all__ = [
     "HandClosed",
     "HandFault",
     "KeyFileError",
+    "NoDescriptor",
     "NoStream",
     "NotInTime",
     "RecordingError",
@@ -34,6 +35,10 @@ class AddressError(SoftfingerError):
 
 class KeyFileError(SoftfingerError):
     """Keys can't be made or read. The message says which file, and what mends it."""
+
+
+class NoDescriptor(KeyFileError):
+    """Keys can't be read since no more files can be opened, which says nothing of the keys."""
 
 
 class ServoError(SoftfingerError):

@@ -20,6 +20,11 @@ from softfinger.daemon.gateway.service import StartAnew, open_service
 _MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
 _DESCRIPTORS = 64  # that are not clients'
 _CLIENTS = 1024
+# With keys libzmq has the connections, and ends when it is out of memory: there is room for all.
+_MOST_WITH_KEYS = 256
+_FOR_KEYS = 48 << 20  # bytes for …
+_CONNECTION = 100_000  # bytes of each, and for each message that waits for it …
+_WAITING = 128  # … two of libzmq's records
 _HUNG = 3.0  # s without a step after which the process is ended
 _STEPS = 0.5  # s between two words that it lives
 
@@ -39,7 +44,7 @@ def main(words: list[str]) -> int:
 
 def _serve(end: socket.socket, config: Config) -> int:
     try:
-        service = open_service(end, config, _be_bounded())
+        service = open_service(end, config, _be_bounded(config))
     except (AddressError, KeyFileError) as error:
         end.send(link.FAILED + str(error).encode()[: link.LARGEST // 2])
         return 1
@@ -59,14 +64,17 @@ def _serve(end: socket.socket, config: Config) -> int:
     return 0
 
 
-def _be_bounded() -> int:
+def _be_bounded(config: Config) -> int:
     """Bound memory, be the first to go when the system has none, and be no real-time process.
 
     Returns how many clients there is room for.
     """
     resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY, _MEMORY))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _CLIENTS + _CLIENTS // 4 + _DESCRIPTORS
+    clients = _CLIENTS + _CLIENTS // 4
+    if config.keys:
+        clients = min(_FOR_KEYS // (_CONNECTION + _WAITING * config.queue), _MOST_WITH_KEYS)
+    wanted = clients + _DESCRIPTORS
     if most != resource.RLIM_INFINITY:
         wanted = min(wanted, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))

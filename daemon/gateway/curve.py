@@ -18,7 +18,7 @@ import zmq
 import zmq.utils.z85
 from zmq.auth.thread import ThreadAuthenticator
 
-from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.daemon.gateway.admission import Pace
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.service import Service, StartAnew
@@ -63,7 +63,10 @@ class Keys(ThreadAuthenticator):
             return
         self._at = now + _LOOK
         try:
-            found = load_server(self._folder)
+            try:
+                found = load_server(self._folder)
+            except NoDescriptor:  # strangers hold them all: nobody is let in who was not before
+                found = self.server.left(self._folder)
         except KeyFileError as error:
             raise StartAnew(str(error)) from None
         gone = [name for key, name in self.server.clients.items() if key not in found.clients]

@@ -17,6 +17,7 @@ may add a key of his own.
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
@@ -27,7 +28,7 @@ from typing import Any
 import zmq
 import zmq.utils.z85
 
-from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.errors import KeyFileError, NoDescriptor
 
 LOCAL = "local"  # the client that every folder of keys has
 DOMAIN = b"softfinger"
@@ -46,6 +47,15 @@ class ServerKeys:
     public: bytes
     secret: bytes
     clients: dict[bytes, str]  # public key → name
+
+    def left(self, folder: Path) -> ServerKeys:
+        """Without the clients whose files are gone. It opens nothing. Raises KeyFileError."""
+        clients = _place(folder) / "clients"
+        _check_above(clients / "any")
+        kept = {
+            key: name for key, name in self.clients.items() if (clients / f"{name}.key").exists()
+        }
+        return ServerKeys(self.public, self.secret, kept)
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
         """Before bind: only clients whom the context's authenticator lets in."""
@@ -140,12 +150,14 @@ def _write(path: Path, public: bytes, secret: bytes = b"") -> None:
 def load_server(folder: Path) -> ServerKeys:
     """The daemon's keys, from the folder of `make_keys` or its ``server``. Raises KeyFileError."""
     check_curve()
-    place = folder if (folder / "server.key_secret").exists() else folder / "server"
+    place = _place(folder)
     public, secret = _pair(place / "server.key_secret")
     _check_above(place / "clients" / "any")
-    clients = {}
-    for path in sorted((place / "clients").glob("*.key")):
-        clients[_keys(path)["public"]] = path.stem
+    try:
+        files = sorted((place / "clients").glob("*.key"))
+    except OSError as error:
+        raise _unreadable(place / "clients", error) from None
+    clients = {_keys(path)["public"]: path.stem for path in files}
     if not clients:
         raise KeyFileError(f"{place / 'clients'}: no client's key; `softfinger keys` makes them")
     return ServerKeys(public, secret, clients)
@@ -157,6 +169,16 @@ def load_client(folder: Path) -> ClientKeys:
     place = folder if (folder / "client.key_secret").exists() else folder / LOCAL
     public, secret = _pair(place / "client.key_secret")
     return ClientKeys(_keys(place / "server.key")["public"], public, secret)
+
+
+def _place(folder: Path) -> Path:
+    """The server's folder, which ``folder`` is or holds."""
+    return folder if (folder / "server.key_secret").exists() else folder / "server"
+
+
+def _unreadable(path: Path, error: OSError) -> KeyFileError:
+    kind = NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
+    return kind(f"{path}: can't be read: {error.strerror}; `softfinger keys` makes such files")
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
@@ -173,9 +195,7 @@ def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
             _check(path, os.fstat(file.fileno()), secret)
             text = file.read(_LARGEST)
     except OSError as error:
-        raise KeyFileError(
-            f"{path}: can't be read: {error.strerror}; `softfinger keys` makes such files"
-        ) from None
+        raise _unreadable(path, error) from None
     except UnicodeDecodeError:
         raise KeyFileError(f"{path}: no key file") from None
     found = {name: value.encode() for name, value in _KEY.findall(text)}
@@ -202,9 +222,7 @@ def _check_above(path: Path) -> None:
         try:
             status = folder.stat()
         except OSError as error:
-            raise KeyFileError(
-                f"{folder}: can't be read: {error.strerror}; `softfinger keys` makes such files"
-            ) from None
+            raise _unreadable(folder, error) from None
         _check(folder, status)
 
 

@@ -22,6 +22,7 @@ from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.keys import make_keys
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import until
@@ -114,12 +115,20 @@ def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
         gateway.close()
 
 
-def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, str]) -> None:
-    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
+@pytest.mark.parametrize(("queue", "guarded", "most"), [(100, False, 1344), (2000, True, 210)])
+def test_its_memory_has_a_bound_and_it_yields_to_the_loop(
+    addresses: tuple[str, str], tmp_path: Path, queue: int, guarded: bool, most: int
+) -> None:
+    if guarded:
+        make_keys(tmp_path, [])
+    keys = str(tmp_path) if guarded else ""
+    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, queue, keys=keys)).wait()
     try:
         limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
         (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
         assert int(data.split()[3]) <= 128 << 20
+        (files,) = [line for line in limits.splitlines() if line.startswith("Max open files")]
+        assert int(files.split()[3]) <= most
         assert os.sched_getscheduler(gateway.process) == os.SCHED_OTHER
     finally:
         gateway.close()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import stat
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,9 @@ import zmq.auth
 
 from softfinger.daemon.client import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
-from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.errors import KeyFileError, NoDescriptor
+from softfinger.daemon.gateway.curve import Keys
+from softfinger.daemon.gateway.service import StartAnew
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import until
 from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
@@ -110,6 +114,37 @@ def test_keys_that_somebody_else_may_write_or_owns_are_refused(
         os.chown(path, 4_243, -1)
     with pytest.raises(KeyFileError, match="belongs to user"):
         load_server(folder)
+
+
+@contextmanager
+def no_descriptor_left() -> Iterator[None]:
+    """As where strangers' connections hold them all."""
+    fewest, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, most))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (fewest, most))
+
+
+def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
+    folder: Path, context: zmq.Context[Any]
+) -> None:
+    keys = Keys(context, folder)
+    clients = folder / "server" / "clients"
+    try:
+        with no_descriptor_left():
+            with pytest.raises(NoDescriptor):
+                load_server(folder)
+            keys.look(1.0)
+            (clients / "alice.key").unlink()
+            with pytest.raises(StartAnew, match="shut out: alice"):
+                keys.look(2.0)
+            clients.chmod(0o777)
+            with pytest.raises(StartAnew, match="may be written by others"):
+                keys.look(3.0)
+    finally:
+        keys.stop()
 
 
 # --- sockets ----------------------------------------------------------------------------------
