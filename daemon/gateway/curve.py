@@ -169,13 +169,18 @@ class KeyedCommands(_Door):
         self._coming = 0  # the epoch that begins when all of before has been refused
         self._passed_at = 0.0  # when the last one did
         self._empty = True  # at the last look
-        self._replies: list[list[bytes]] = []
+        self._replies: list[list[bytes]] = []  # held back since …
+        self._held_since = 0.0
         super().__init__(service, keys, config, zmq.ROUTER, _QUEUE, 4 * config.max_bytes)
 
     def tend(self) -> None:
         self._keys.look(self.now)
-        if self.epoch != self._coming and self._is_purged():
-            self._begin()
+        if self.epoch != self._coming:
+            if self._is_purged():
+                self.epoch = self._coming
+                self._answer_held()
+            elif self._replies and time.monotonic() - self._held_since > _PURGE_LONGEST:
+                self._answer_held()  # others stop without pause: what comes next is refused, too
         self._empty = False
         heard = set()
         until = time.monotonic() + _READING
@@ -197,11 +202,10 @@ class KeyedCommands(_Door):
         past = time.monotonic() - self._passed_at
         return past > _PURGE and (self._empty or past > _PURGE_LONGEST)
 
-    def _begin(self) -> None:
-        self.epoch = self._coming
+    def _answer_held(self) -> None:
         replies, self._replies = self._replies, []
         for reply in replies:
-            self.answer(reply)
+            self._send(reply)
 
     def _client(self, route: bytes, name: str) -> _Client:
         client = self._clients.get(route)
@@ -214,9 +218,14 @@ class KeyedCommands(_Door):
 
     def answer(self, message: list[bytes]) -> None:
         """Send a reply, once what came before a stop has been refused."""
-        if self.epoch != self._coming:
-            self._replies.append(message)
+        if self.epoch == self._coming:
+            self._send(message)
             return
+        if not self._replies:
+            self._held_since = time.monotonic()
+        self._replies.append(message)
+
+    def _send(self, message: list[bytes]) -> None:
         try:
             self._socket.send_multipart(message, _NOW)
         except zmq.ZMQError:

@@ -279,6 +279,24 @@ def test_what_waits_with_keys_dies_with_a_stop_and_the_stops_own_client_goes_on(
     assert names[names.index("stop") :] == ["stop", "status"]
 
 
+def test_who_stops_is_answered_while_others_stop_without_pause(
+    guarded: Guarded, others: zmq.Context[Any], addresses: tuple[str, str], folder: Path
+) -> None:
+    stopper = others.socket(zmq.REQ)
+    stopper.setsockopt(zmq.LINGER, 0)
+    load_client(folder / "alice").guard(stopper)
+    stopper.connect(addresses[1])
+    stopper.send(msgpack.packb({"command": "stop"}))
+
+    def answered() -> int:
+        guarded.served.server.begin_epoch()  # as each stop does
+        guarded.step()
+        return stopper.poll(0)
+
+    until(answered)
+    assert msgpack.unpackb(stopper.recv())["ok"]
+
+
 # --- the daemon -------------------------------------------------------------------------------
 
 
