@@ -19,7 +19,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
-	@$(BIN)/softfinger run --config config/demo.toml --monitor $(ARGS)
+	@$(BIN)/softfinger run --config demo --monitor $(ARGS)
 
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
@@ -40,7 +40,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 	@echo "Setting up $(VENV) once: numpy, numba and six small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --editable .
-	@$(BIN)/softfinger compile --config config/demo.toml
+	@$(BIN)/softfinger compile --config demo
 	@touch $@
 
 $(TO_TEST): $(TO_RUN)

@@ -31,7 +31,12 @@ def add_profile(parser: argparse.ArgumentParser) -> None:
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """``--config`` and ``--set``, for a subcommand whose ``--dir`` is its own."""
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="PROFILE",
+        help="settings: a TOML file, or a name as sim, demo, paper, small, hil",
+    )
     parser.add_argument(
         "--set",
         action="append",

@@ -11,6 +11,8 @@ import re
 import sys
 from pathlib import Path
 
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.load import find
 from softfinger.daemon.wire.own_files import write_text
 
 UNIT = "softfinger.service"
@@ -93,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``install-service``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    parser.add_argument("--config", type=Path, metavar="FILE", help="the hand's profile")
+    parser.add_argument("--config", type=Path, metavar="PROFILE", help="the hand's profile")
     parser.add_argument("--user", default="", help="whom it runs as; root when not given")
     parser.add_argument("--udev", action="store_true", help="the udev rules instead of the unit")
     parser.add_argument(
@@ -125,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
     except FileExistsError:
         print(f"install-service: {path} is there already; --force writes over it", file=sys.stderr)
         return 1
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, SettingsError) as error:
         print(f"install-service: {error}", file=sys.stderr)
         return 1
     print(path)
@@ -136,9 +138,9 @@ def unit(config: Path | None, user: str) -> str:
     """The unit's text. Raises ValueError for a user or profile that is not there."""
     words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task"]
     if config is not None:
-        if not config.is_file():
+        if not find(config).is_file():
             raise ValueError(f"{config}: no such profile")
-        words += ["--config", str(config.resolve())]
+        words += ["--config", str(find(config).resolve())]
     line = ""
     if user:
         try:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 
+from softfinger.daemon.backends import make_sensor
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import ServoError, TactileError
-from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
@@ -14,7 +15,6 @@ from softfinger.daemon.servos.checks import Examined, check_angle, examine
 from softfinger.daemon.servos.control_table import JointScale, ServoModel, by_name
 from softfinger.daemon.servos.protocol import open_line
 from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, search
-from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.types import FINGERS
 
 _PATIENCE = 0.05  # s for a reply: a factory-new servo behind a slow adapter answers within it

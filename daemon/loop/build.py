@@ -14,17 +14,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from softfinger.daemon.backends import SERVOS, TACTILE, make_sensor, make_servos
+from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
-from softfinger.daemon.loop.clock import LoopClock, make_clock
 from softfinger.daemon.loop.loop import EventSink, Loop
 from softfinger.daemon.loop.warm_up import Scene, warm_up
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import FingerModel, make_material, make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import make_servos
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, HandFacts
 from softfinger.daemon.wire.command_server import CommandServer
@@ -117,7 +116,7 @@ class Daemon:
         Its tips are of the settings' material, whatever a calibration says of them.
         """
         settings = self.settings
-        if "simulated" not in (settings.servos.backend, settings.tactile.backend):
+        if not (SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand):
             return None
         from softfinger.daemon.simulation.physics.hand import SimulatedHand
 

@@ -1,7 +1,7 @@
 """How late this machine is with the loop's ticks: told now and then, and named as a fault's cause.
 
 All times are the machine's own. A hand on real time has then been left alone for as long; a
-simulated one on its own time has waited (`loop.clock.HandClock`).
+simulated one on its own time has waited (`clock.HandClock`).
 """
 
 from __future__ import annotations

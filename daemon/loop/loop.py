@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from softfinger.daemon.clock import LoopClock
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskOver
 from softfinger.daemon.errors import Refused, ServoError
-from softfinger.daemon.loop.clock import LoopClock
 from softfinger.daemon.loop.lateness import Lateness
 from softfinger.daemon.loop.publishing import Broadcast
 from softfinger.daemon.loop.requests import Requests

@@ -1,7 +1,7 @@
 """How the process is made fit for a steady tick: each measure is asked for once, after warm-up.
 
 Holds the measures of the settings' section ``[realtime]``, what became of each, and nothing that
-the tick itself does (the spin before a deadline is `loop.clock`'s). No measure is needed: what
+the tick itself does (the spin before a deadline is `daemon.clock`'s). No measure is needed: what
 the system does not allow is told, with what is lost and the command that grants it.
 """
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softfinger.daemon.backends import SERVOS, TACTILE
 from softfinger.daemon.perception.calibration_file import Converter, calibration_for
 from softfinger.daemon.profile.factory import (
     FingerModel,
@@ -73,7 +74,7 @@ def parts(settings: Settings) -> list[Part]:
     One has the estimator, the longest; the other the contact table and then what looks up in it,
     whose kernels it has compiled in part by then.
     """
-    simulated = "simulated" in (settings.servos.backend, settings.tactile.backend)
+    simulated = SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand
     found = [_TABLE]
     if settings.tactile.backend != "none":
         found.append(_ESTIMATOR)

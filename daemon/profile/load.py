@@ -15,10 +15,12 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+import softfinger
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import contradictions, shown
 
+_PROFILES = Path(softfinger.__file__).parent / "config"
 _DEEPEST = 8  # tables and arrays in each other
 _EXPECTED = (
     ("Input should ", ""),
@@ -34,14 +36,14 @@ _EXPECTED = (
 def load(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
 ) -> Settings:
-    """Read and check a profile; None gives the built-in simulated hand.
+    """Read and check a profile, a file's path or one of `names`; None: the built-in simulated hand.
 
     ``directory`` replaces ``{dir}`` in the ports. ``changes``, as ``loop.rate=1000``, go over the
     file. Raises SettingsError with one line for every unknown key, wrong type, broken bound and
     contradiction.
     """
     name = str(path) if path else "built-in settings"
-    data = _read(path, name) if path else {}
+    data = _read(find(path), name) if path else {}
     changed = {_change(data, change) for change in changes}
     wrong: set[str] = set()
     problems: list[str] = []
@@ -59,6 +61,27 @@ def load(
             )
         )
     return settings if directory is None else _with_directory(settings, directory)
+
+
+def names() -> list[str]:
+    """The profiles that come with the package."""
+    return sorted(path.stem for path in _PROFILES.glob("*.toml"))
+
+
+def find(path: Path) -> Path:
+    """The file of a profile: of a bare name the package's, else the path as it is.
+
+    Raises SettingsError for a bare name that neither is one of `names` nor a file here.
+    """
+    if path.suffix or path.parent != Path() or path.exists():
+        return path
+    file = _PROFILES / f"{path.name}.toml"
+    if not file.exists():
+        raise SettingsError(
+            f"{path}: found no such profile, expected the path of a file or one of "
+            f"{', '.join(names())}"
+        )
+    return file
 
 
 def _read(path: Path, name: str) -> dict[str, Any]:

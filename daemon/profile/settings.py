@@ -7,14 +7,16 @@ rates Hz; pairs are (left, right).
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from softfinger.daemon.backends import SERVOS, TACTILE
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-# Every number has an end on both sides: what no hand has is a slip of the pen, and must not reach
+# Every number has an end on both sides: implausible values are typing errors, and must not reach
 # an integral. Bounds are closed or open as the quantity is.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
@@ -31,13 +33,22 @@ Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
 Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Finger = Literal["left", "right"]
-FINGER_NAMES = ("left", "right")
 Index = Annotated[int, Field(ge=0, le=255)]
 Cells = tuple[tuple[Index, Index], ...]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
-SIMULATED = ("simulated", "replay", "none")  # backends behind which there is no metal
+def _one_of(names: Collection[str]) -> AfterValidator:
+    """A text that is one of ``names``, in pydantic's words for a Literal."""
+
+    def check(name: str) -> str:
+        if name not in names:
+            *most, last = map(repr, names)
+            known = f"{', '.join(most)} or {last}"
+            raise PydanticCustomError("one_of", "Input should be {known}", {"known": known})
+        return name
+
+    return AfterValidator(check)
 
 
 def _known(name: str) -> str:
@@ -105,7 +116,7 @@ class Table(Section):
 class ServoSettings(Section):
     """The joints."""
 
-    backend: Literal["simulated", "dynamixel", "none"] = "simulated"
+    backend: Annotated[str, _one_of(SERVOS)] = "simulated"
     port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
     baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000
     model: Model = "XM430-W350"
@@ -125,7 +136,7 @@ class ServoSettings(Section):
 class TactileSettings(Section):
     """The pressure grids under the tips."""
 
-    backend: Literal["simulated", "flexitac", "glove", "cobs", "replay", "none"] = "simulated"
+    backend: Annotated[str, _one_of(TACTILE)] = "simulated"
     port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
     rows: Annotated[int, Field(ge=4, le=256)] = 44
@@ -355,4 +366,4 @@ class Settings(Section):
     @property
     def simulated(self) -> bool:
         """Neither real servos nor real sensors take part."""
-        return self.servos.backend in SIMULATED and self.tactile.backend in SIMULATED
+        return not (SERVOS[self.servos.backend].metal or TACTILE[self.tactile.backend].metal)

@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.profile.settings import FINGER_NAMES, GRIP_SHARE, SIMULATED, Settings
+from softfinger.daemon.backends import SERVOS, TACTILE
+from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
+from softfinger.daemon.types import FINGERS
 
 _LONGEST = 60  # characters of a value that are shown
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
@@ -56,13 +58,13 @@ def _backends(settings: Settings) -> Iterator[str]:
     both = f"servos.backend, tactile.backend: found {servos} and {tactile}"
     if servos == tactile == "none":
         yield f"{both}, expected at least one"
-    elif "none" not in (servos, tactile) and (servos in SIMULATED) != (tactile in SIMULATED):
+    elif "none" not in (servos, tactile) and SERVOS[servos].metal != TACTILE[tactile].metal:
         yield f"{both}, expected both real or both simulated (none takes one out)"
 
 
 def _joints(settings: Settings) -> Iterator[str]:
     hand = settings.hand
-    for index, finger in enumerate(FINGER_NAMES):
+    for index, finger in enumerate(FINGERS):
         low, open_, high = hand.q_min[index], hand.open_angle[index], hand.q_max[index]
         if not low < high:
             yield f"hand.q_max: found {high:g} for {finger}, expected above q_min {low:g}"
@@ -121,7 +123,7 @@ def _cells(settings: Settings) -> Iterator[str]:
         for cell in cells:
             if cell[0] >= tactile.rows or cell[1] >= tactile.cols:
                 yield (
-                    f"tactile.dead: found {shown(cell)} for {FINGER_NAMES[index]}, "
+                    f"tactile.dead: found {shown(cell)} for {FINGERS[index]}, "
                     f"expected a cell of {tactile.rows} × {tactile.cols}"
                 )
 
@@ -130,7 +132,7 @@ def _recordings(settings: Settings) -> Iterator[str]:
     if settings.tactile.backend != "replay":
         return
     for name in settings.scene.fingers:
-        if not settings.tactile.recording[FINGER_NAMES.index(name)]:
+        if not settings.tactile.recording[FINGERS.index(name)]:
             yield f'tactile.recording: found "" for {name}, expected a recording'
 
 
@@ -198,9 +200,9 @@ def _addresses(settings: Settings) -> Iterator[str]:
 
 def _folder(settings: Settings) -> Iterator[str]:
     ports = []
-    if settings.servos.backend == "dynamixel":
+    if SERVOS[settings.servos.backend].metal:
         ports.append(("servos.port", settings.servos.port))
-    if settings.tactile.backend not in SIMULATED:
+    if TACTILE[settings.tactile.backend].metal:
         ports += [("tactile.port", port) for port in settings.tactile.port]
     for key, port in ports:
         if "{dir}" in port:

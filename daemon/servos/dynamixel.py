@@ -19,8 +19,8 @@ from collections import deque
 
 from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding

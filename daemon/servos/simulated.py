@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import RecordingError, TactileError
-from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.recording import Recording, load_recording
 from softfinger.daemon.types import FINGERS, Frame

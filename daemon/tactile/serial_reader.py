@@ -15,8 +15,8 @@ import threading
 
 import serial
 
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.types import Frame

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.loop.clock import Clock
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics import layout

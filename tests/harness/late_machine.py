@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):

@@ -11,7 +11,7 @@ import threading
 import numpy as np
 import pytest
 
-from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
 from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard

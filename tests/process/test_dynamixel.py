@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import port as port_module

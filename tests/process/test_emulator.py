@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 
+from softfinger.daemon.backends import make_sensor
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.factory import make_estimator, make_material
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
@@ -32,7 +33,6 @@ from softfinger.daemon.simulation.emulator.emulator import (
     with_board,
 )
 from softfinger.daemon.simulation.emulator.link_folder import LINKS, FolderError, LinkFolder
-from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.tactile.flexitac import FlexiTac
 from softfinger.tools.cli import main
 from tests.conftest import until

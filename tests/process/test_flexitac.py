@@ -17,8 +17,8 @@ import serial
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.loop.clock import RealClock
 from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.flexitac import MARKER, FlexiTac, FlexiTacDecoder
 from softfinger.daemon.types import Frame

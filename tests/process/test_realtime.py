@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.loop.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
 from softfinger.daemon.profile.settings import Settings
 

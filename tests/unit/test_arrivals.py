@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
 from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard

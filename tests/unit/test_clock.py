@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from softfinger.daemon.loop.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
+from softfinger.daemon.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
 from softfinger.daemon.profile.settings import Settings
 from tests.harness.late_machine import LateMachine
 

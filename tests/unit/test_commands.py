@@ -15,11 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import AddressError, Refused
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
-from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.command_server import decode
 from softfinger.daemon.wire.sockets import Listener

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.gateway.zmtp import GREETING, Broken, Parser, frame
-from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import EVENT, STATE

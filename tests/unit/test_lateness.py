@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from softfinger.daemon.clock import HandClock
 from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.clock import HandClock
 from softfinger.daemon.loop.lateness import EVERY, FIRST, RECENT, Lateness
 from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings

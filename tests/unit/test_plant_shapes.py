@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.loop.clock import VirtualClock
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings, Simulation
 from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.hand import SimulatedHand

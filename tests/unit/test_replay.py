@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.tactile.recording import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -41,6 +41,25 @@ def test_sim_profile_equals_the_built_in_hand_and_names_every_key() -> None:
 def test_every_profile_loads(path: Path, tmp_path: Path) -> None:
     settings = load(path, tmp_path)
     assert "{dir}" not in settings.servos.port + "".join(settings.tactile.port)
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_bare_name_is_a_profile_of_the_package_wherever_that_is(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load(Path(name), tmp_path) == load(CONFIG / f"{name}.toml", tmp_path)
+    (tmp_path / name).write_text("loop.rate = 123.0\n")  # a file here goes before it
+    assert load(Path(name)).loop.rate == 123.0
+
+
+def test_an_unknown_name_is_told_with_the_known_ones() -> None:
+    with pytest.raises(SettingsError) as caught:
+        load(Path("hill"))
+    assert str(caught.value) == (
+        "hill: found no such profile, expected the path of a file or one of "
+        "demo, hil, paper, sim, small"
+    )
 
 
 def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path: Path) -> None:

@@ -7,14 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from softfinger.daemon.backends import make_sensor, make_servos
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.loop.clock import VirtualClock
 from softfinger.daemon.profile.factory import make_estimator, make_material
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos import make_servos
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.hand import SimulatedHand
-from softfinger.daemon.tactile import make_sensor
 from softfinger.daemon.tactile.simulated import SimulatedTactile
 from softfinger.daemon.types import Goal, Reading
 from softfinger.kinematics.contact.closed_form import Fingertip

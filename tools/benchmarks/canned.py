@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.clock import Clock
 from softfinger.daemon.types import Frame, Goal, Reading
 
 _KEPT = 16  # frames that take turns

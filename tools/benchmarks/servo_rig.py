@@ -13,7 +13,7 @@ from typing import Any
 
 import dynamixel_sdk as sdk
 
-from softfinger.daemon.loop.clock import RealClock
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
