@@ -15,7 +15,8 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire.schema import INPUT, SCHEMA, STATE, TOPICS, Field, Topic
+from softfinger.daemon.wire.fields import Field, Topic
+from softfinger.daemon.wire.schema import INPUT, NO_FRAME, SCHEMA, STATE, TOPICS
 
 pack = msgpack.Packer(use_bin_type=True).pack
 
@@ -63,7 +64,7 @@ def _compiled(topic: Topic, result: str) -> Callable[..., Any]:
     lines = [f"def made({topic.arguments}):"]
     lines += [f"    {name} = {source}" for name, source in topic.names.items()]
     scope: dict[str, Callable[..., Any]] = {}
-    known = {"SCHEMA": SCHEMA, "FINGERS": FINGERS, "json": json}
+    known = {"SCHEMA": SCHEMA, "NO_FRAME": NO_FRAME, "FINGERS": FINGERS, "json": json}
     exec("\n".join([*lines, f"    return {result}"]), known, scope)
     return scope["made"]
 
