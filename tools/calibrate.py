@@ -358,7 +358,8 @@ def _modulus(
     import numpy as np
 
     from softfinger.daemon.perception.calibration_file import ModulusStep, now
-    from softfinger.daemon.profile.factory import make_grid, make_tip
+    from softfinger.daemon.perception.finger_model import calibrated_grid
+    from softfinger.daemon.profile.factory import make_tip
     from softfinger.kinematics.estimation.calibration import CalibrationError, fit_law, fit_modulus
 
     d = loads.truths.get("d")
@@ -386,7 +387,7 @@ def _modulus(
     strain: list[float] = []
     stress: list[float] = []
     if arguments.law:
-        grid = make_grid(settings, finger, calibration)
+        grid = calibrated_grid(settings, finger, calibration)
         told = converter.live & ~full
         law = fit_law(pressure, d - found.offset, theta, make_tip(settings), grid, told)
         strain, stress = law.strain.tolist(), law.stress.tolist()

@@ -20,8 +20,9 @@ from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.loop import EventSink, Loop
 from softfinger.daemon.loop.warm_up import Scene, warm_up
+from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.factory import FingerModel, make_material, make_table
+from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.tactile.base import TactileSensor

@@ -16,8 +16,8 @@ from typing import Any
 
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
+from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings, Task
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State

@@ -17,12 +17,8 @@ import numpy as np
 
 from softfinger.daemon.backends import SERVOS, TACTILE
 from softfinger.daemon.perception.calibration_file import Converter, calibration_for
-from softfinger.daemon.profile.factory import (
-    FingerModel,
-    make_estimator,
-    make_material,
-    make_models,
-)
+from softfinger.daemon.perception.finger_model import FingerModel, make_estimator, make_models
+from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel_cache import kernel_folder

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.perception.calibration_file import Converter, least_end
 from softfinger.daemon.perception.contact_filter import ContactFilter
-from softfinger.daemon.profile.factory import FingerModel, make_estimator
+from softfinger.daemon.perception.finger_model import FingerModel, make_estimator
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State

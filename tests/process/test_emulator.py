@@ -21,7 +21,8 @@ from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHand
 from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.profile.factory import make_estimator, make_material
+from softfinger.daemon.perception.finger_model import make_estimator
+from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator import emulator as module

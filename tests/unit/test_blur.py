@@ -9,7 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.factory import make_estimator, make_grid, make_material
+from softfinger.daemon.perception.finger_model import make_estimator
+from softfinger.daemon.profile.factory import make_grid, make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
 from softfinger.kinematics.compiled.simd_sums import LANES

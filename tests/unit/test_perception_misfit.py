@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from softfinger import Fingertip, Material, SensorGrid
+from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.factory import make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.supervisor import Safety
 from softfinger.daemon.tactile.replay import GivenFrames

@@ -16,8 +16,9 @@ from softfinger.daemon.perception.calibration_file import (
     save_calibration,
     sensor_of,
 )
+from softfinger.daemon.perception.finger_model import make_estimator, make_models
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.factory import make_estimator, make_material, make_models
+from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, State
 

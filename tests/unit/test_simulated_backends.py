@@ -10,7 +10,8 @@ import pytest
 from softfinger.daemon.backends import make_sensor, make_servos
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.profile.factory import make_estimator, make_material
+from softfinger.daemon.perception.finger_model import make_estimator
+from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.hand import SimulatedHand

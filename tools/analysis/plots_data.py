@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
 from softfinger.daemon.loop.process_replay import with_calibrations
-from softfinger.daemon.profile.factory import FingerModel, make_models
+from softfinger.daemon.perception.finger_model import FingerModel, make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema

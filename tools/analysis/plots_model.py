@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.profile.factory import FingerModel
+from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.analysis.plots_data import FloatArray, Run

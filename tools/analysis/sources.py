@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.profile.factory import FingerModel, make_models
+from softfinger.daemon.perception.finger_model import FingerModel, make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.recording import load_recording
 from softfinger.daemon.types import FINGERS

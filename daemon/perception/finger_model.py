@@ -1,0 +1,108 @@
+"""What one finger's frames and contacts are understood by, from settings and calibration files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
+from softfinger.daemon.profile.factory import make_grid, make_material, make_table, make_tip
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+
+@dataclass(frozen=True)
+class FingerModel:
+    """One finger's tip and sensor; ``calibration`` is None where there is none."""
+
+    finger: int
+    material: Material
+    table: ContactTable
+    grid: SensorGrid
+    calibration: Calibration | None = None
+
+    @property
+    def own_material(self) -> bool:
+        """The tip's law was measured, and is not the settings'."""
+        return self.calibration is not None and self.calibration.modulus is not None
+
+
+def make_models(
+    settings: Settings, cache: Path | None, on_event: Callable[[str, str, str], None] | None = None
+) -> tuple[FingerModel, FingerModel]:
+    """Both fingers' models; a finger whose tip's modulus is not calibrated has the settings' law.
+
+    A finger that takes no part, or has no sensor, goes by the settings alone. Raises as
+    `profile.factory.make_table` and `calibration_file.calibration_for`.
+    """
+    made: list[FingerModel] = []
+    common: tuple[Material, ContactTable] | None = None
+    for finger, name in enumerate(FINGERS):
+        calibration = None
+        if name in settings.scene.fingers and settings.tactile.backend != "none":
+            calibration = calibration_for(settings, finger)
+        if calibration is not None and calibration.modulus is not None:
+            material = calibration.modulus.material()
+            table = make_table(settings, material, cache, on_event)
+        else:
+            if common is None:
+                law = make_material(settings.material)
+                common = law, make_table(settings, law, cache, on_event)
+            material, table = common
+        grid = calibrated_grid(settings, finger, calibration)
+        made.append(FingerModel(finger, material, table, grid, calibration))
+        if calibration is not None and on_event is not None:
+            on_event("info", "calibration", f"{name}: {calibration.summary()}")
+    return made[0], made[1]
+
+
+def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
+    """The sensor's cells, where the calibration says if it does. Raises SettingsError."""
+    if calibration is None or calibration.centre is None:
+        return make_grid(settings, finger)
+    return make_grid(settings, finger, calibration.centre.centre, calibration.centre.rotation)
+
+
+def make_estimator(
+    settings: Settings,
+    material: Material,
+    finger: int = 0,
+    live: NDArray[np.bool_] | None = None,
+    calibration: Calibration | None = None,
+) -> ContactEstimator:
+    """An estimator of its own for each finger, since it starts from its last estimate.
+
+    ``live`` tells the cells that there are, beside the settings' dead ones. With a ``calibration``
+    its frames are the pressures [Pa] of a `Converter`, without one they are counts.
+    """
+    tactile = settings.tactile
+    alive = np.ones((tactile.rows, tactile.cols), np.bool_) if live is None else live.copy()
+    for row, col in tactile.dead[finger]:
+        alive[row, col] = False
+    saturation, threshold, quantum = float(tactile.full_count), float(tactile.threshold), 0.0
+    if calibration is not None:
+        converter = Converter(calibration, tactile.pascal_per_count)
+        alive &= converter.live
+        saturation, quantum = converter.saturation, converter.quantum
+        # The estimator takes half a count off a threshold, in the frame's unit.
+        threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
+    return ContactEstimator(
+        make_tip(settings),
+        material,
+        calibrated_grid(settings, finger, calibration),
+        noise=tactile.noise,
+        method=settings.estimator.method,
+        free_gain=settings.estimator.free_gain,
+        live=alive,
+        saturation=saturation,
+        threshold=threshold,
+        quantum=quantum,
+    )
