@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
-import resource
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgpack
 import pytest
@@ -116,33 +115,25 @@ def test_keys_that_somebody_else_may_write_or_owns_are_refused(
         load_server(folder)
 
 
-@contextmanager
-def no_descriptor_left() -> Iterator[None]:
-    """As where strangers' connections hold them all."""
-    fewest, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (0, most))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (fewest, most))
-
-
 def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
-    folder: Path, context: zmq.Context[Any]
+    folder: Path, context: zmq.Context[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def no_descriptor_left(path: Path, *_: object, **__: object) -> NoReturn:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
+
     keys = Keys(context, folder)
     clients = folder / "server" / "clients"
     try:
-        with no_descriptor_left():
-            with pytest.raises(NoDescriptor):
-                load_server(folder)
-            keys.look(1.0)
-            (clients / "alice.key").unlink()
-            with pytest.raises(StartAnew, match="shut out: alice"):
-                keys.look(2.0)
-            clients.chmod(0o777)
-            with pytest.raises(StartAnew, match="may be written by others"):
-                keys.look(3.0)
+        monkeypatch.setattr(Path, "open", no_descriptor_left)
+        with pytest.raises(NoDescriptor):
+            load_server(folder)
+        keys.look(1.0)
+        (clients / "alice.key").unlink()
+        with pytest.raises(StartAnew, match="shut out: alice"):
+            keys.look(2.0)
+        clients.chmod(0o777)
+        with pytest.raises(StartAnew, match="may be written by others"):
+            keys.look(3.0)
     finally:
         keys.stop()
 
