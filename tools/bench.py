@@ -1,4 +1,4 @@
-"""``softfinger bench``: run time of this very machine, printed as a table and kept as JSON."""
+"""``softfinger bench``: run time of this very machine, printed as tables and kept as JSON."""
 
 from __future__ import annotations
 
@@ -9,98 +9,152 @@ import os
 import platform
 import sys
 from pathlib import Path
-from types import ModuleType
+from typing import TYPE_CHECKING
 
 from softfinger.daemon.wire.own_files import write_text
 
+if TYPE_CHECKING:
+    from softfinger.tools.benchmarks.report import Row, Table
+
 MEASUREMENTS = {
-    "contact": "the contact model, run time against error",
-    "estimator": "pressure grid to d and tilt, run time against error",
+    "contact": "the contact model, run time against error, beside SciPy",
+    "estimator": "pressure grid to d and tilt, run time against error, beside OpenCV and others",
     "tick": "one tick without serial",
     "scenes": "the tick of each kind of scene, and what each skipping step saves",
     "control": "grasping, turning and holding on the simulated hand",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
-    "hil": "one tick over the stand-in hand's ptys",
-    "startup": "start to the first published state",
+    "hil": "one tick over the emulated hand's ptys",
+    "wakeup": "wake-ups of the loop beside cyclictest and time.sleep",
+    "startup": "start to the first published state, memory",
 }
-# Too long for a run that names nothing.
-ON_DEMAND = {
-    "sustained": "a minute of 500 Hz on two servos at 2 Mbaud",
-    "wakeup": "wake-ups of the loop beside cyclictest and time.sleep, three minutes",
-    "recording": "ten readers and a recorder at 1 kHz for ten minutes; recordings read again",
-    "neighbours": "the tick beside busy processes, many subscribers and noisy sensors",
+CAMPAIGNS = {
     "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, ten minutes",
-    "faults": "every fault on the stand-in hand and what comes of it, an hour for 100 trials each",
+    "faults": "every fault on the emulated hand and what comes of it, an hour for 100 trials each",
 }
+PAGE = ("contact", "estimator", "tick", "servos", "hil", "wakeup", "startup")
+_CAMPAIGN = "campaign"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``bench``."""
-    known = ", ".join(f"{name} ({text})" for name, text in MEASUREMENTS.items())
-    more = ", ".join(f"{name} ({text})" for name, text in ON_DEMAND.items())
+    single = ", ".join(f"{name} ({text})" for name, text in MEASUREMENTS.items())
+    long = ", ".join(f"{name} ({text})" for name, text in CAMPAIGNS.items())
     parser.add_argument(
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"what to measure: {known}; all of these if none is named; or {more}",
+        help=f"what to measure: {single}; without a name one page of the figures that matter, in "
+        f"some two minutes; or '{_CAMPAIGN}' and one of {long}",
     )
     parser.add_argument(
-        "--trials", type=_count, default=100, metavar="N", help="of each fault, for faults"
+        "--trials", type=_count, metavar="N", help="of each case of a campaign, for its default"
     )
     parser.add_argument(
-        "--only", default="", metavar="PATTERN", help="faults whose name it is found in, for faults"
+        "--only", default="", metavar="PATTERN", help="cases of a campaign with this in their name"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw what has a picture: contact (extra 'plot')"
+        "--plot", type=Path, metavar="FILE", help="draw run time against error (extra 'plot')"
+    )
+    parser.add_argument(
+        "--against", type=Path, metavar="OLD.json", help="tell what is slower than in that file"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print, and write the JSON file."""
-    from softfinger.tools.benchmarks.report import Row, table
+    """Measure, print, and write the files that were asked for."""
+    from softfinger.tools.benchmarks.report import Table, slower, yardstick
 
-    names = arguments.names or list(MEASUREMENTS)
-    texts = MEASUREMENTS | ON_DEMAND
-    unknown = [name for name in names if name not in texts]
-    if unknown:
-        known = ", ".join(texts)
-        print(f"bench: found {unknown[0]!r}, expected one of {known}", file=sys.stderr)
+    campaign = arguments.names[:1] == [_CAMPAIGN]
+    texts = CAMPAIGNS if campaign else MEASUREMENTS
+    names = arguments.names[1:] if campaign else arguments.names or list(PAGE)
+    try:
+        _check(names, texts, arguments)
+        old = _read(arguments.against) if arguments.against else []
+    except ValueError as error:
+        print(f"bench: {error}", file=sys.stderr)
         return 2
-    modules = {
-        name: importlib.import_module(f"softfinger.tools.benchmarks.{name}") for name in names
-    }
-    if "faults" in modules and not modules["faults"].known(arguments.only):
-        print(f"bench: --only {arguments.only}: it is found in no fault's name", file=sys.stderr)
-        return 2
-    if arguments.plot and (reason := _no_plot(modules)):
-        print(f"bench: {reason}", file=sys.stderr)
-        return 2
-    report, plain, failed = [], [], False
-    for name, module in modules.items():
+    rows: list[Row] = []
+    drawn: list[Table] = []
+    page: list[Row] = []
+    failed = False
+    for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        options = {key: getattr(arguments, key) for key in getattr(module, "OPTIONS", ())}
-        rows = module.measure(**options)
-        report += [{"measurement": name, **each.as_dict()} for each in rows]
-        plain += [each for each in rows if isinstance(each, Row)]
-        own = [each for each in rows if not isinstance(each, Row)]
-        failed = failed or any(getattr(each, "failed", False) for each in own)
-        if own:
-            print(module.table(own), end="\n\n")
-        if own and arguments.plot:
-            module.plot(own, arguments.plot)
-    if plain:
-        print(table(plain))
+        module = importlib.import_module(f"softfinger.tools.benchmarks.{name}")
+        if campaign:
+            tables = module.measure(arguments.trials, arguments.only)
+        else:
+            tables = module.measure(brief=not arguments.names)
+        for table in [*tables, Table("", [yardstick()])]:
+            rows += [{"measurement": name, "table": table.title, **row} for row in table.rows]
+            failed = failed or table.failed
+        drawn += [table for table in tables if table.error]
+        if arguments.names:
+            print(*tables, sep="\n\n", end="\n\n")
+        else:
+            page += _key_figures(tables, module.PAGE)
+    if page:
+        print(Table("", page))
+    if arguments.plot:
+        from softfinger.tools.benchmarks.picture import draw
+
+        draw(drawn, arguments.plot)
     if arguments.json:
         content = {
             "machine": platform.machine(),
             "cores": os.cpu_count(),
             "python": platform.python_version(),
-            "rows": report,
+            "rows": rows,
         }
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
+    if old:
+        print(slower(old, rows))
     return 1 if failed else 0
+
+
+def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
+    """What can be refused before anything is measured. Raises ValueError."""
+    if not names:
+        raise ValueError(f"'{_CAMPAIGN}' alone, expected one of {', '.join(texts)} after it")
+    for name in names:
+        if name not in texts:
+            hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
+            raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
+        if texts is CAMPAIGNS:
+            module = importlib.import_module(f"softfinger.tools.benchmarks.{name}")
+            if not module.known(arguments.only):
+                raise ValueError(f"--only {arguments.only}: it is found in no case of {name}")
+    if arguments.plot:
+        from softfinger.tools.paper.style import NoMatplotlib, settings
+
+        if not {"contact", "estimator"} & set(names):
+            raise ValueError("--plot: only contact and estimator have a picture")
+        try:
+            settings()
+        except NoMatplotlib as error:
+            raise ValueError(f"--plot: {error}") from None
+
+
+def _read(path: Path) -> list[Row]:
+    """The rows of an earlier run. Raises ValueError."""
+    try:
+        found: list[Row] = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        if not all({"measurement", "table", "name"} <= row.keys() for row in found):
+            raise KeyError("rows")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"--against {path}: no figures of `bench --json`: {error}") from None
+    return found
+
+
+def _key_figures(tables: list[Table], chosen: dict[str, tuple[str, ...]]) -> list[Row]:
+    """Rows of the page: those whose names begin as ``chosen`` has it, by the table's title."""
+    return [
+        row | {"name": f"{table.title}: {row['name']}"}
+        for table in tables
+        for row in table.rows
+        if str(row["name"]).startswith(chosen.get(table.title, ()))
+    ]
 
 
 def _count(text: str) -> int:
@@ -108,16 +162,3 @@ def _count(text: str) -> int:
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"expected a whole number above 0, found {text!r}")
     return int(text)
-
-
-def _no_plot(modules: dict[str, ModuleType]) -> str:
-    """Why ``--plot`` can't be served, known before anything is measured; empty when it can."""
-    from softfinger.tools.paper.style import NoMatplotlib, settings
-
-    if not any(hasattr(module, "plot") for module in modules.values()):
-        return "--plot: none of the named measurements has a picture"
-    try:
-        settings()
-    except NoMatplotlib as error:
-        return f"--plot: {error}"
-    return ""

@@ -1,7 +1,7 @@
 """A soak in real time, hardware in the loop: ``python -m tests.soak.hil``, ten minutes.
 
-The daemon's process on the stand-in hand's, without any fault: random grasps, turns, moves and
-releases. What was on the servos' wire is judged every few seconds by the stand-in hand's record,
+The daemon's process on the emulated hand's, without any fault: random grasps, turns, moves and
+releases. What was on the servos' wire is judged every few seconds by the emulated hand's record,
 and the daemon's memory must be flat. Faults that a busy machine brings about are counted, told and
 cleared.
 """
@@ -81,7 +81,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
             if status["fault"] and status["fault"] != last:
                 account.faults[status["fault_name"]] += 1
                 if status["fault_name"] in _ASKEW:
-                    rig.tell("place")
+                    rig.send("place")
                     account.placed += 1
             last = status["fault"]
             request = _next(chance, status["mode"])

@@ -1,7 +1,7 @@
-"""Trials of the estimator: many frames of one contact, and what the bound says of it.
+"""Trials of the estimator: many frames of one contact, and what the Cramér-Rao bound says of it.
 
-Holds the contacts of the envelope, the Cramér-Rao bound with cells left out, and the loop that
-adds noise, counts as a board would, and estimates by the calls that the daemon makes.
+Holds the contacts of the envelope, the bound with cells left out, and the loop that adds noise,
+counts as a board would, and estimates by the calls that the daemon makes.
 """
 
 from __future__ import annotations
@@ -15,30 +15,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks.estimator_bounds import (
-    LINEAR,
-    MARGIN,
-    MODULUS,
-    NOISES,
-    PITCH,
-    SIZE,
-    SMALL,
-    TIP,
-    tilts,
-)
 
 FloatArray = NDArray[np.float64]
+
+TIP = Fingertip(radius=0.020)
+MODULUS = 0.304e6  # Pa
+LINEAR = Material.constant(MODULUS)
+SIZE = 44
+PITCH = 0.058 / SIZE
+NOISES = tuple(share * MODULUS for share in (0.001, 0.002, 0.005, 0.01, 0.02))  # Pa, of a cell
 
 # Columns of a trial's frames.
 D, TILT_X, TILT_Y, GAIN, CONTACT, VALID, CHI2, CELLS = range(8)
 COVARIANCE = 8
 COLUMNS = COVARIANCE + 16
 
+_SMALL = 0.03  # σ_d over d: up to here the bound is small
+_MARGIN = math.radians(3.0)  # short of the rim
 _GOLDEN = 0.6180339887498949
 _SILVER = 0.7548776662466927  # with its square: points that fill a square evenly
 _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
+
+
+def tilts(theta: float, azimuth: float) -> tuple[float, float]:
+    """(tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
+    s = math.sin(theta)
+    return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,9 @@ class Board:
 
 
 FLOAT = Board()
+SIXTEEN_BITS = Board(pascal_per_count=4.0)
+# 8 bits up to 204 kPa; the envelope's largest pressure is 188 kPa, at 8 mm and 30°.
+EIGHT_BITS = Board(pascal_per_count=800.0, full_count=255, threshold=3)
 
 
 @dataclass(frozen=True)
@@ -59,8 +68,8 @@ class Place:
 
     d: float
     theta: float
-    azimuth: float
-    offset: tuple[float, float]
+    azimuth: float = 0.0
+    offset: tuple[float, float] = (0.0, 0.0)
 
     @property
     def truth(self) -> tuple[float, float, float, float]:
@@ -75,7 +84,7 @@ class Place:
     @property
     def inside(self) -> bool:
         """Three degrees or more short of the rim."""
-        return self.theta <= math.asin((TIP.radius - self.d) / TIP.radius) - MARGIN
+        return self.theta <= math.asin((TIP.radius - self.d) / TIP.radius) - _MARGIN
 
     def __str__(self) -> str:
         return (
@@ -128,7 +137,13 @@ def bound(
 
 def is_small(place: Place, covariance: FloatArray) -> bool:
     """Whether the bound is small there and the rim is not near."""
-    return bool(math.sqrt(covariance[0, 0]) <= SMALL * place.d and place.inside)
+    return bool(math.sqrt(covariance[0, 0]) <= _SMALL * place.d and place.inside)
+
+
+def is_misfit(chi2: FloatArray, cells: FloatArray) -> NDArray[np.bool_]:
+    """As :attr:`ContactEstimate.misfit`, of many."""
+    spread = 2.0 / (9.0 * np.maximum(cells - 4.0, 1.0))
+    return np.asarray(chi2 > (1.0 - spread + 5.0 * np.sqrt(spread)) ** 3)
 
 
 def estimator(
@@ -147,34 +162,28 @@ def estimator(
     )
 
 
+def keep(e: ContactEstimate, row: FloatArray) -> None:
+    """Write an estimate into a row of COLUMNS."""
+    valid = e.contact and e.valid
+    row[:COVARIANCE] = e.d, e.tilt_x, e.tilt_y, e.gain, e.contact, valid, e.chi2, e.cells
+    if valid:
+        row[COVARIANCE:] = e.covariance.ravel()
+
+
 def run(
     made: ContactEstimator, clean: FloatArray, noise: float, bank: FloatArray, board: Board = FLOAT
 ) -> FloatArray:
     """Estimate ``clean`` + ``noise`` · each of ``bank`` [n, rows, cols]; float64 [n, COLUMNS]."""
     out = np.zeros((len(bank), COLUMNS))
-    scale = board.pascal_per_count or 1.0
     counted = board.pascal_per_count > 0.0
-    ends = (board.threshold, board.full_count)
+    scale = board.pascal_per_count or 1.0
     frame = np.zeros(clean.shape, np.uint16 if counted else np.float64)
     for normals, row in zip(bank, out, strict=True):
         if counted:
-            _count(clean, noise, normals, scale, ends, frame)
+            _count(clean, noise, normals, scale, board.threshold, board.full_count, frame)
         else:
             _add(clean, noise, normals, frame)
-        e = made.update(frame, scale)
-        valid = e.contact and e.valid
-        row[:COVARIANCE] = (
-            e.d,
-            e.tilt_x,
-            e.tilt_y,
-            e.gain,
-            e.contact,
-            valid,
-            e.chi2,
-            e.cells,
-        )
-        if valid:
-            row[COVARIANCE:] = e.covariance.ravel()
+        keep(made.update(frame, scale), row)
     return out
 
 
@@ -192,17 +201,13 @@ def _count(
     noise: float,
     normals: FloatArray,
     scale: float,
-    ends: tuple[int, int],
+    threshold: int,
+    full: int,
     frame: NDArray[np.uint16],
 ) -> None:
     rows, cols = frame.shape
     for i in range(rows):
         for j in range(cols):
             value = (clean[i, j] + noise * normals[i, j]) / scale
-            value = min(max(value + 0.5, 0.0), ends[1] + 0.5)
-            frame[i, j] = np.uint16(value if value >= ends[0] else 0.0)
-
-
-def noises() -> tuple[float, ...]:
-    """Standard deviations of a cell [Pa]."""
-    return tuple(share * MODULUS for share in NOISES)
+            value = min(max(value + 0.5, 0.0), full + 0.5)
+            frame[i, j] = np.uint16(value if value >= threshold else 0.0)

@@ -2,8 +2,7 @@
 
 All times are of one run in turns, over the same points: d up to 8 mm, |θ| up to 30°, half of the d
 spread evenly and half by orders of magnitude down to 1 µm. Errors are the largest relative ones of
-the row's outputs over these points, against the integrals with many nodes; a table's certificate
-covers its whole domain.
+the row's outputs over these points, against the integrals with many nodes.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,94 +27,60 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks import contact_kernels, contact_scipy
-from softfinger.tools.benchmarks.contact_report import MODES, ContactRow, Timing, aligned_table
 from softfinger.tools.benchmarks.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.report import Row, row
+from softfinger.tools.benchmarks.report import Row, Table, figure
 
 FloatArray = NDArray[np.float64]
 
 TIP = Fingertip(radius=0.020)
 MODULUS = 0.304e6  # [Pa]
-TIGHT, TIGHTER = 1e-9, 1e-12  # the two tolerances that have aims
-_MEMORY = 256.0  # KiB
-_REFERENCE_NODES = 40
+CONSTANT, LAW = Material.constant(MODULUS), Material.table_i()
+ERROR = "largest relative error"
+# How a representation is called; times are ns a call or, in a batch, a point.
+MODES = {
+    "loop": "contact, calls in a compiled loop, which overlap",
+    "chain": "contact, calls in a compiled loop, each waits for the last",
+    "kernel": "contact, the kernel called from Python with floats",
+    "python": "contact, Python API with floats",
+    "batch": "contact, Python API with arrays, a point",
+}
+_CLOSED = "closed form, constant E, "
+PAGE = {
+    MODES["loop"]: (_CLOSED + "six", "table to"),
+    MODES["python"]: ("table to", "dblquad", "RectBivariateSpline.ev: ratio 64², degree 5"),
+}
+# Tolerances with the aims for six outputs over the closed form, and for the build [s].
+_TOLERANCES = {1e-9: (2.0, 0.3), 1e-12: (3.0, 2.0)}
 _SINGLE = 16  # points that single calls from Python go round
 _FEW = 8  # points where calls take milliseconds
 _TILES = 8  # a batch is this many times the points
-
-Reference = Callable[[FloatArray, FloatArray], FloatArray]
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much is measured; the default is the full bench."""
-
-    rounds: int = 25
-    points: int = 512  # a power of two
-    quick: bool = False  # one size of each of SciPy's methods, two of the tables
+_WORDS = {2: "F and U", 6: "six outputs"}
 
 
 @dataclass
 class _Case:
-    """One row to be: its subjects by mode, and what gives its outputs for the error."""
+    """A representation with one number of outputs: its subjects by mode, and its error."""
 
     name: str
-    material: str
     outputs: int
     error: float
     subjects: dict[str, Subject] = field(default_factory=dict)
-    nbytes: int | None = None
-    build_s: float | None = None
-    certificate: float | None = None
-
-    def key(self, mode: str) -> str:
-        """The subject's name in the run."""
-        return f"{self.material}/{self.name}/{self.outputs}/{mode}"
+    facts: Row = field(default_factory=dict)
 
 
-def measure(effort: Effort | None = None) -> list[ContactRow | Row]:
-    """Rows of every representation, then the ratios and times that have an aim."""
-    effort = effort or Effort()
-    d, theta = points(effort.points)
-    constant, law = Material.constant(MODULUS), Material.table_i()
-    tight = ContactTable.build(TIP, law, TIGHT)
-    tighter = ContactTable.build(TIP, law, TIGHTER)
-    cases = [
-        *_closed_cases(constant, d, theta),
-        *_table_cases(ContactTable.build(TIP, constant), constant, d, theta),
-        *_closed_cases(law, d, theta),
+def measure(brief: bool = False, rounds: int = 25, count: int = 512) -> list[Table]:
+    """One table a way of calling, then what has an aim. ``count`` of points: a power of two."""
+    d, theta = points(count)
+    cases = list(_cases(brief, d, theta))
+    subjects = {
+        f"{mode} {case.name}": subject for case in cases for mode, subject in case.subjects.items()
+    }
+    times = interleave(subjects, 10 if brief else rounds)
+    tables = [
+        Table(title, [_row(case, mode, times) for case in cases if mode in case.subjects], ERROR)
+        for mode, title in MODES.items()
     ]
-    for form in FORMS[CLOSED + 1 :]:
-        if effort.quick and form not in (tight.form, tighter.form):
-            continue
-        before = time.perf_counter()
-        try:
-            table = ContactTable.build(TIP, law, 0.5, form=form.name)
-        except TableError:
-            continue
-        cases += _table_cases(table, law, d, theta, time.perf_counter() - before)
-    for tolerance, table in ((TIGHT, tight), (TIGHTER, tighter)):
-        cases.append(_domain_case(table, tolerance, effort.points))
-    for nodes in (18,) if effort.quick else (6, 10, 14, 18):
-        cases.append(_quadrature_case(law, nodes, d, theta))
-    cases += _scipy_cases(law, d, theta, effort.quick)
-    times = interleave({c.key(m): s for c in cases for m, s in c.subjects.items()}, effort.rounds)
-    bases = {c.outputs: c for c in cases if c.name == "closed form" and c.material == "constant"}
-    rows: list[ContactRow | Row] = [_row(case, bases[case.outputs], times) for case in cases]
-    builds = _builds(law, 1 if effort.quick else 5)
-    return rows + _aims(cases, bases, times, tight, tighter) + builds
-
-
-def table(rows: list[ContactRow]) -> str:
-    """The representations as an aligned table."""
-    return aligned_table(rows)
-
-
-def plot(rows: list[ContactRow], path: Path) -> None:
-    """Run time against error, as a picture. Raises NoMatplotlib without the extra ``plot``."""
-    from softfinger.tools.benchmarks.contact_plot import draw
-
-    draw(rows, path)
+    return [*tables, Table("contact, what has an aim", list(_aims(brief, times)))]
 
 
 def points(count: int) -> tuple[FloatArray, FloatArray]:
@@ -130,24 +94,134 @@ def points(count: int) -> tuple[FloatArray, FloatArray]:
 
 def reference(material: Material, d: FloatArray, theta: FloatArray) -> FloatArray:
     """The six outputs [6, n]: for a constant modulus the formulas in long double."""
-    if material.is_linear:
-        depth, tilt = d.astype(np.longdouble), theta.astype(np.longdouble)
-        cosine, slope = np.cos(tilt), np.tan(tilt)
-        # π to 19 digits; NumPy has it in double precision only.
-        pi = np.longdouble(np.pi) + np.longdouble(1.2246467991473532e-16)
-        force = pi * np.longdouble(material.reference_modulus) * depth * depth / cosine
-        energy = force * depth / (3 * cosine)
-        six = (force, energy, 2 * force / depth, force * slope, force / cosine, 2 * energy * slope)
-        return np.stack(six)
-    return np.stack(integrate(TIP, material, d, theta, _REFERENCE_NODES))
+    if not material.is_linear:
+        return np.stack(integrate(TIP, material, d, theta, 40))
+    depth, tilt = d.astype(np.longdouble), theta.astype(np.longdouble)
+    cosine, slope = np.cos(tilt), np.tan(tilt)
+    # π to 19 digits; NumPy has it in double precision only.
+    pi = np.longdouble(np.pi) + np.longdouble(1.2246467991473532e-16)
+    force = pi * np.longdouble(material.reference_modulus) * depth * depth / cosine
+    energy = force * depth / (3 * cosine)
+    six = (force, energy, 2 * force / depth, force * slope, force / cosine, 2 * energy * slope)
+    return np.stack(six)
 
 
 def _error(got: Any, expected: FloatArray, outputs: int) -> float:
-    """The largest relative error of the first ``outputs`` rows."""
-    worst = 0.0
-    for value, true in zip(got[:outputs], expected[:outputs], strict=True):
-        worst = max(worst, float(np.max(np.abs((value - true) / true))))
-    return worst
+    pairs = zip(got[:outputs], expected[:outputs], strict=True)
+    return max(float(np.max(np.abs((value - true) / true))) for value, true in pairs)
+
+
+def _cases(brief: bool, d: FloatArray, theta: FloatArray) -> Iterator[_Case]:
+    six = closed_forms(MODULUS, d, theta)
+    expected = reference(CONSTANT, d, theta)
+    closed = partial(closed_form, MODULUS), partial(closed_forms, MODULUS)
+    yield from _compiled(_CLOSED, six, expected, "closed", MODULUS, closed, d, theta)
+    table = ContactTable.build(TIP, CONSTANT)
+    yield from _table("table, constant E, ", table, expected, d, theta)
+    expected = reference(LAW, d, theta)
+    for tolerance in _TOLERANCES:
+        table = ContactTable.build(TIP, LAW, tolerance)
+        yield from _table(f"table to {tolerance:g}: ", table, expected, d, theta)
+        yield _whole_domain(table, tolerance, d.size)
+    if not brief:
+        for form in FORMS[CLOSED + 1 :]:
+            before = time.perf_counter()
+            try:
+                table = ContactTable.build(TIP, LAW, 0.5, form=form.name)
+            except TableError:
+                continue
+            spent = 1e3 * (time.perf_counter() - before)
+            for case in _table(f"table {form.name}: ", table, expected, d, theta):
+                case.facts["build ms"] = spent
+                yield case
+    for nodes in (18,) if brief else (6, 10, 14, 18):
+        quadrature = partial(integrate, TIP, LAW, nodes=nodes)
+        case = _Case(
+            f"quadrature: {nodes} nodes a piece, six outputs",
+            6,
+            _error(quadrature(d, theta), expected, 6),
+        )
+        case.subjects["python"] = _single(quadrature, d, theta)
+        case.subjects["batch"] = _batch(quadrature, d, theta)
+        yield case
+    yield from _scipy(d, theta, expected)
+
+
+def _compiled(
+    name: str,
+    got: Any,
+    expected: FloatArray,
+    kernels: str,
+    argument: Any,
+    calls: tuple[Callable[..., object], Callable[..., object]],
+    d: FloatArray,
+    theta: FloatArray,
+) -> Iterator[_Case]:
+    """A compiled representation with two and six outputs: ``calls`` as kernel and as Python API."""
+    kernel, api = calls
+    out = np.empty((d.size, 6))
+    for outputs, modes in ((2, ("loop",)), (6, ("loop", "chain"))):
+        case = _Case(name + _WORDS[outputs], outputs, _error(got, expected, outputs))
+        for mode in modes:
+            run = getattr(contact_kernels, f"{kernels}_{mode}_{outputs}")
+            case.subjects[mode] = Subject(partial(_run, run, argument, d, theta, out), d.size)
+        if outputs == 6:
+            case.subjects["kernel"] = _single(kernel, d, theta)
+            case.subjects["python"] = _single(api, d, theta)
+            case.subjects["batch"] = _batch(api, d, theta)
+        yield case
+
+
+def _run(kernel: Callable[..., None], *arguments: Any) -> None:
+    """Call it with the last argument, the repeats, first."""
+    *others, repeat = arguments
+    kernel(repeat, *others)
+
+
+def _table(
+    name: str, table: ContactTable, expected: FloatArray, d: FloatArray, theta: FloatArray
+) -> Iterator[_Case]:
+    calls = partial(lookup, table.data), table
+    got = table(d, theta)
+    for case in _compiled(name, got, expected, "lookup", table.data, calls, d, theta):
+        case.facts = {"certified": table.max_error, "KiB": table.data.nbytes / 1024}
+        yield case
+
+
+def _whole_domain(table: ContactTable, tolerance: float, count: int) -> _Case:
+    """The same lookup with d up to a: more of the table, and its slow corner."""
+    rng = np.random.default_rng(4)
+    d = rng.uniform(0.0, TIP.radius, count)
+    theta = rng.uniform(-1.0, 1.0, count) * TIP.theta_limit(d)
+    name = f"table to {tolerance:g}: whole domain, "
+    cases = _table(name, table, reference(LAW, d, theta), d, theta)
+    case = next(case for case in cases if case.outputs == 6)
+    case.subjects = {"loop": case.subjects["loop"]}
+    return case
+
+
+def _scipy(d: FloatArray, theta: FloatArray, expected: FloatArray) -> Iterator[_Case]:
+    try:
+        import scipy  # noqa: F401
+    except ImportError:
+        print(
+            "bench contact: SciPy's rows are left out, since it is not installed; it is in the "
+            "extra 'dev': pip install '.[dev]'",
+            file=sys.stderr,
+        )
+        return
+    for method in contact_scipy.methods(TIP, LAW):
+        case = _Case(f"{method.name}, {_WORDS[method.outputs]}", method.outputs, 0.0)
+        case.facts = {"KiB": method.nbytes / 1024, "build ms": 1e3 * method.build_s}
+        if method.batch:
+            case.error = _error(method.call(d, theta), expected, method.outputs)
+            case.subjects["python"] = _single(method.call, d, theta)
+            case.subjects["batch"] = _batch(method.call, d, theta)
+        else:  # so slow that a few points have to do for the error, and one for the time
+            got = np.array([method.call(float(d[i]), float(theta[i])) for i in range(_FEW)]).T
+            case.error = _error(got, expected[:, :_FEW], method.outputs)
+            case.subjects["python"] = _single(method.call, d[:1], theta[:1])
+        yield case
 
 
 def _single(call: Callable[..., object], d: FloatArray, theta: FloatArray) -> Subject:
@@ -173,191 +247,31 @@ def _batch(call: Callable[..., object], d: FloatArray, theta: FloatArray) -> Sub
     return Subject(run, depth.size)
 
 
-def _compiled(kernel: Callable[..., object], *arguments: Any) -> Subject:
-    """A compiled loop; the last of its arguments is θ."""
-    count = arguments[-1].size
-    out = np.empty((count, 6))
-    return Subject(lambda repeat: kernel(repeat, *arguments, out), count)
+def _row(case: _Case, mode: str, times: dict[str, FloatArray]) -> Row:
+    taken = times[f"{mode} {case.name}"]
+    base = times.get(f"{mode} {_CLOSED}{_WORDS[case.outputs]}")
+    row = figure(case.name, "ns", taken)
+    del row["aim ≤"]
+    row["× closed form"] = None if base is None else float(np.median(taken / base))
+    return row | {ERROR: case.error} | case.facts
 
 
-def _closed_cases(material: Material, d: FloatArray, theta: FloatArray) -> Iterator[_Case]:
-    """The closed form; for a law that is not linear only its error is of interest."""
-    modulus = material.reference_modulus
-    got, expected = closed_forms(modulus, d, theta), reference(material, d, theta)
-    for outputs, word in ((2, "two"), (6, "six")):
-        name = "closed form" if material.is_linear else "closed form at its first modulus"
-        case = _Case(name, material.name, outputs, _error(got, expected, outputs))
-        loop = getattr(contact_kernels, f"closed_loop_{word}")
-        chain = getattr(contact_kernels, f"closed_chain_{word}")
-        case.subjects["loop"] = _compiled(loop, modulus, d, theta)
-        case.subjects["chain"] = _compiled(chain, modulus, d, theta)
-        if material.is_linear:
-            case.subjects["kernel"] = _single(partial(closed_form, modulus), d, theta)
-            case.subjects["python"] = _single(partial(closed_forms, modulus), d, theta)
-            case.subjects["batch"] = _batch(partial(closed_forms, modulus), d, theta)
-        yield case
-
-
-def _table_cases(
-    table: ContactTable,
-    material: Material,
-    d: FloatArray,
-    theta: FloatArray,
-    build_s: float | None = None,
-) -> Iterator[_Case]:
-    got, expected = table(d, theta), reference(material, d, theta)
-    for outputs, word in ((2, "two"), (6, "six")):
-        case = _Case(
-            f"table, {table.form.name}",
-            material.name,
-            outputs,
-            _error(got, expected, outputs),
-            nbytes=table.data.nbytes,
-            build_s=build_s,
-            certificate=table.max_error,
-        )
-        loop = getattr(contact_kernels, f"lookup_loop_{word}")
-        chain = getattr(contact_kernels, f"lookup_chain_{word}")
-        case.subjects["loop"] = _compiled(loop, table.data, d, theta)
-        case.subjects["chain"] = _compiled(chain, table.data, d, theta)
-        case.subjects["kernel"] = _single(partial(lookup, table.data), d, theta)
-        case.subjects["python"] = _single(table, d, theta)
-        case.subjects["batch"] = _batch(table, d, theta)
-        yield case
-
-
-def _domain_case(table: ContactTable, tolerance: float, count: int) -> _Case:
-    """The same lookup over the whole domain, d up to a: more of the table, and its slow corner."""
-    rng = np.random.default_rng(4)
-    d = rng.uniform(0.0, TIP.radius, count)
-    theta = rng.uniform(-1.0, 1.0, count) * TIP.theta_limit(d)
-    error = _error(table(d, theta), reference(Material.table_i(), d, theta), 6)
-    case = _Case(
-        f"table to {tolerance:g}, points over its whole domain",
-        "table_i",
-        6,
-        error,
-        nbytes=table.data.nbytes,
-        certificate=table.max_error,
-    )
-    case.subjects["loop"] = _compiled(contact_kernels.lookup_loop_six, table.data, d, theta)
-    case.subjects["chain"] = _compiled(contact_kernels.lookup_chain_six, table.data, d, theta)
-    return case
-
-
-def _quadrature_case(material: Material, nodes: int, d: FloatArray, theta: FloatArray) -> _Case:
-    quadrature = partial(integrate, TIP, material, nodes=nodes)
-    error = _error(quadrature(d, theta), reference(material, d, theta), 6)
-    case = _Case(f"direct quadrature, {nodes} nodes a piece", material.name, 6, error)
-    case.subjects["python"] = _single(quadrature, d, theta)
-    case.subjects["batch"] = _batch(quadrature, d, theta)
-    return case
-
-
-def _scipy_cases(
-    material: Material, d: FloatArray, theta: FloatArray, quick: bool
-) -> Iterator[_Case]:
-    try:
-        import scipy  # noqa: F401
-    except ImportError:
-        print(
-            "bench contact: SciPy's rows are left out, since it is not installed; it is in the "
-            "extra 'dev': pip install '.[dev]'",
-            file=sys.stderr,
-        )
-        return
-    expected = reference(material, d, theta)
-    for method in contact_scipy.methods(TIP, material, quick):
-        case = _Case(method.name, material.name, method.outputs, 0.0)
-        case.nbytes, case.build_s = method.nbytes, method.build_s
-        if method.batch:
-            case.error = _error(method.call(d, theta), expected, method.outputs)
-            case.subjects["python"] = _single(method.call, d, theta)
-            case.subjects["batch"] = _batch(method.call, d, theta)
-        else:  # so slow that a few points have to do for the error, and one for the time
-            got = np.array([method.call(float(d[i]), float(theta[i])) for i in range(_FEW)]).T
-            case.error = _error(got, expected[:, :_FEW], method.outputs)
-            case.subjects["python"] = _single(method.call, d[:1], theta[:1])
-        yield case
-
-
-def _row(case: _Case, base: _Case, times: dict[str, FloatArray]) -> ContactRow:
-    timings = {}
-    for mode in MODES:
-        if mode in case.subjects:
-            taken = times[case.key(mode)]
-            ratio = float(np.median(taken / times[base.key(mode)]))
-            timings[mode] = Timing(float(taken.min()), float(np.median(taken)), ratio)
-    return ContactRow(
-        case.name,
-        case.material,
-        case.outputs,
-        case.error,
-        case.certificate,
-        case.nbytes,
-        case.build_s,
-        timings,
-    )
-
-
-def _aims(
-    cases: list[_Case],
-    bases: dict[int, _Case],
-    times: dict[str, FloatArray],
-    tight: ContactTable,
-    tighter: ContactTable,
-) -> list[Row]:
-    """Ratios of the same rounds, and errors, beside what they are meant to be."""
-
-    def over(case: _Case, mode: str, base: _Case, base_mode: str) -> FloatArray:
-        return times[case.key(mode)] / times[base.key(base_mode)]
-
-    by_name = {(case.name, case.material, case.outputs): case for case in cases}
-    rows = []
-    compared = (
-        ("constant E: table", "constant", "closed", 1.2),
-        (f"Table I, {TIGHT:g}: table", "table_i", tight.form.name, 2.0),
-        (f"Table I, {TIGHTER:g}: table", "table_i", tighter.form.name, 3.0),
-    )
-    for name, material, form, aim in compared:
-        case = by_name[f"table, {form}", material, 6]
+def _aims(brief: bool, times: dict[str, FloatArray]) -> Iterator[Row]:
+    """Ratios of the same rounds, certified errors and builds, beside what they are meant to be."""
+    six = _WORDS[6]
+    names = {"table, constant E, ": 1.2}
+    names |= {f"table to {tolerance:g}: ": aims[0] for tolerance, aims in _TOLERANCES.items()}
+    for name, aim in names.items():
         for mode in ("loop", "chain"):
-            samples = over(case, mode, bases[6], mode)
-            rows.append(row(f"{name} / closed form, {MODES[mode]}", "×", samples, aim))
-    closed = by_name["table, closed", "constant", 6]
-    rows.append(row("constant E: largest error of the table", "1", [closed.error], 4e-15))
-    for tolerance, table in ((TIGHT, tight), (TIGHTER, tighter)):
-        name = f"Table I, {tolerance:g}"
-        rows.append(row(f"{name}: certified error", "1", [table.max_error], tolerance))
-        rows.append(row(f"{name}: memory", "KiB", [table.data.nbytes / 1024], _MEMORY))
-    tables = [c for c in cases if c.name.startswith("table, ") and c.outputs == 2]
-    tables = [c for c in tables if c.material == "table_i"]
-    splines = [c for c in cases if c.name.startswith("RectBivariateSpline") and c.outputs == 2]
-    rivals = [(min(splines, key=lambda case: case.error), 0.01)] if splines else []
-    rivals += [(case, 1e-5) for case in cases if case.name == "dblquad"]
-    for rival, aim in rivals:
-        # The fastest of ours that errs no more.
-        good = [c for c in tables if c.error <= rival.error] or tables
-        mine = min(good, key=lambda case: float(np.median(times[case.key("loop")])))
-        name = rival.name.partition(",")[0]
-        words = f"{mine.name} ({mine.error:.0e}) / {name} ({rival.error:.0e})"
-        rows.append(row(words, "×", over(mine, "loop", rival, "python"), aim))
-        rows.append(row("  the same, ours chained", "×", over(mine, "chain", rival, "python")))
-        from_python = over(mine, "kernel", rival, "python")
-        rows.append(row("  the same, both called from Python", "×", from_python))
-    return rows
-
-
-def _builds(material: Material, repeats: int) -> list[Row]:
-    """Seconds to build a table, its kernels compiled."""
-    taken: dict[float, list[float]] = {TIGHT: [], TIGHTER: []}
-    for _ in range(repeats):
-        for tolerance, samples in taken.items():
+            ratio = times[f"{mode} {name}{six}"] / times[f"{mode} {_CLOSED}{six}"]
+            yield figure(f"{name}{six}, over the closed form, {mode}", "×", ratio, aim)
+    for tolerance, (_, aim) in _TOLERANCES.items():
+        samples = []
+        for _ in range(1 if brief else 5):
             before = time.perf_counter()
-            ContactTable.build(TIP, material, tolerance)
+            table = ContactTable.build(TIP, LAW, tolerance)
             samples.append(time.perf_counter() - before)
-    aims = {TIGHT: 0.3, TIGHTER: 2.0}
-    return [
-        row(f"Table I, {tolerance:g}: build", "s", samples, aims[tolerance])
-        for tolerance, samples in taken.items()
-    ]
+        name = f"table to {tolerance:g}"
+        yield figure(f"{name}: build", "s", samples, aim)
+        yield figure(f"{name}: certified error", "1", [table.max_error], tolerance)
+        yield figure(f"{name}: memory", "KiB", [table.data.nbytes / 1024], 256.0)

@@ -3,9 +3,9 @@
 In a ``loop`` the calls are independent, so that the processor overlaps them; the order of the n
 points, n a power of two, jumps about so that the compiler can't merge calls into vector
 instructions, which a single call has none of. In a ``chain`` each call's arguments wait for the
-last call's result: what one call alone takes. The results go to the point's row of ``out`` [n, 6],
-which keeps the compiler from dropping a call's work or moving it out of the loop. ``two`` writes
-force and energy alone, so that the partials may be dropped.
+last call's result. The results go to the point's row of ``out`` [n, 6], which keeps the compiler
+from dropping a call's work; ``_2`` writes force and energy alone, so that the partials may be
+dropped.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _next(i: int, count: int) -> int:
 
 
 @kernel
-def closed_loop_two(
+def closed_loop_2(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     i = 0
@@ -38,7 +38,7 @@ def closed_loop_two(
 
 
 @kernel
-def closed_loop_six(
+def closed_loop_6(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     i = 0
@@ -50,19 +50,7 @@ def closed_loop_six(
 
 
 @kernel
-def closed_chain_two(
-    repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
-) -> None:
-    wait = 0.0
-    for _ in range(repeat):
-        for i in range(d.shape[0]):
-            out[i, 0], last, _, _, _, _ = closed_form(modulus, d[i] + wait, theta[i] + wait)
-            out[i, 1] = last
-            wait = 0.0 * last
-
-
-@kernel
-def closed_chain_six(
+def closed_chain_6(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     wait = 0.0
@@ -76,7 +64,7 @@ def closed_chain_six(
 
 
 @kernel
-def lookup_loop_two(
+def lookup_loop_2(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     p = address(data)
@@ -87,7 +75,7 @@ def lookup_loop_two(
 
 
 @kernel
-def lookup_loop_six(
+def lookup_loop_6(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     p = address(data)
@@ -100,20 +88,7 @@ def lookup_loop_six(
 
 
 @kernel
-def lookup_chain_two(
-    repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
-) -> None:
-    p = address(data)
-    wait = 0.0
-    for _ in range(repeat):
-        for i in range(d.shape[0]):
-            out[i, 0], last, _, _, _, _, _ = lookup_at(p, d[i] + wait, theta[i] + wait)
-            out[i, 1] = last
-            wait = 0.0 * last
-
-
-@kernel
-def lookup_chain_six(
+def lookup_chain_6(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     p = address(data)

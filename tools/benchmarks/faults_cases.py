@@ -18,7 +18,7 @@ from softfinger.tools.benchmarks.faults_rig import Rig
 Inject = Callable[[Rig, random.Random], AbstractContextManager[None]]
 # works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints
 # stay where they are, without a fault. dies: the daemon is gone, the servos stop by themselves.
-# stops: it is told to stop, and no motor is driven in time, with a fault or without.
+# stops: `stop` is sent, and no motor is driven in time, with a fault or without.
 Expect = Literal["works", "fault", "either", "lets go", "dies", "stops"]
 
 _SETTINGS = Settings()
@@ -47,28 +47,28 @@ class Case:
     held_only: bool = False  # the hand must hold; else it may be closing or turning, too
 
 
-def told(words: Callable[[random.Random], tuple[str, str]]) -> Inject:
-    """Said to the stand-in hand: what begins it, and what ends it."""
+def sent(words: Callable[[random.Random], tuple[str, str]]) -> Inject:
+    """Words sent to the emulated hand: those that begin the fault, and those that end it."""
 
     @contextlib.contextmanager
     def inject(rig: Rig, chance: random.Random) -> Iterator[None]:
         begin, end = words(chance)
-        rig.tell(begin)
+        rig.send(begin)
         try:
             yield
         finally:
             if end:
-                rig.tell(end)
+                rig.send(end)
 
     return inject
 
 
 def _reply(kind: str, share: float) -> Inject:
-    return told(lambda _: (f"{kind}={share}", "well"))
+    return sent(lambda _: (f"{kind}={share}", "well"))
 
 
 def _lost(share: float) -> Inject:
-    return told(lambda _: (f"lose={share} drop={share}", "well"))
+    return sent(lambda _: (f"lose={share} drop={share}", "well"))
 
 
 def _servo(begin: str, end: str) -> Inject:
@@ -76,7 +76,7 @@ def _servo(begin: str, end: str) -> Inject:
         servo = chance.choice(_SERVOS)
         return begin.format(servo), end.format(servo)
 
-    return told(words)
+    return sent(words)
 
 
 def _board(begin: str, end: str = "{}:well") -> Inject:
@@ -84,7 +84,7 @@ def _board(begin: str, end: str = "{}:well") -> Inject:
         side = chance.choice(_SIDES)
         return begin.format(side), end.format(side)
 
-    return told(words)
+    return sent(words)
 
 
 @contextlib.contextmanager
@@ -136,12 +136,12 @@ CASES: tuple[Case, ...] = (
     Case("one servo's readings frozen", "fault", _servo("frozen={0}", "recover={0}"),
          ("servos.frozen",), 0.12 + _AT_ONCE),
     _silent("one servo's readings refused", inject=_servo("refuse={0}", "recover={0}")),
-    Case("writes lost, 100%", "fault", told(lambda _: ("lose-writes=1", "well")),
+    Case("writes lost, 100%", "fault", sent(lambda _: ("lose-writes=1", "well")),
          ("goal.lost",), _SAME + 0.05 + _STOP),
     *(Case(f"stop, {share:.0%} lost each way", "stops", _lost(share), within=_STOP)
       for share in (0.0, 0.2, 0.5, 0.8, 0.9)),
-    Case("stop, writes lost", "stops", told(lambda _: ("lose-writes=1", "well")), within=_STOP),
-    Case("servos' port gone and back", "fault", told(lambda _: ("unplug", "plug")),
+    Case("stop, writes lost", "stops", sent(lambda _: ("lose-writes=1", "well")), within=_STOP),
+    Case("servos' port gone and back", "fault", sent(lambda _: ("unplug", "plug")),
          ("servos.bus",), _WATCHDOG),
     _blind("board silent", inject=_board("{}:silent")),
     Case("board frozen", "fault", _board("{}:frozen"), ("tactile.frozen",), _FROZEN,

@@ -1,6 +1,6 @@
-"""What presses on the daemon from outside its wires: clients, subscribers, a recorder, no memory.
+"""Pressures on the daemon from outside: clients, subscribers, a recorder, no memory.
 
-Each is a context: it presses from its beginning to its end, and cleans up after itself.
+Each is a context that presses from its beginning to its end.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import Any
 import msgpack
 import zmq
 
-from softfinger.tools.benchmarks.faults_rig import SOFTFINGER, Rig, RigError
+from softfinger.tools.benchmarks.campaign import RigError
+from softfinger.tools.benchmarks.faults_rig import SOFTFINGER, Rig
 
 _FLOODERS = 4
 _STUCK = 5
@@ -137,19 +138,19 @@ def full_disk(rig: Rig, chance: random.Random) -> Iterator[None]:
         preexec_fn=small,
     )
     try:
-        _, said = recorder.communicate(timeout=60.0)
+        _, errors = recorder.communicate(timeout=60.0)
         yield
     finally:
         if recorder.poll() is None:
             recorder.kill()
             recorder.communicate()
-    if recorder.returncode != 1 or "File too large" not in said:
-        raise RigError(f"the recorder ended with {recorder.returncode}: {said[-200:]}")
+    if recorder.returncode != 1 or "File too large" not in errors:
+        raise RigError(f"the recorder ended with {recorder.returncode}: {errors[-200:]}")
 
 
 @contextlib.contextmanager
 def no_memory(rig: Rig, chance: random.Random) -> Iterator[None]:
-    """The daemon may take next to no address space any more, and is spoken to all the while."""
+    """The daemon may take next to no address space any more, and is asked meanwhile."""
     assert rig.daemon is not None
     process = rig.daemon.pid
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)

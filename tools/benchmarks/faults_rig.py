@@ -1,7 +1,7 @@
 """The hardware-in-the-loop set-up that faults are injected into: two processes and their wires.
 
-The stand-in hand and the daemon run as users run them. What reached the servos is asked of the
-stand-in hand, never of the daemon.
+The emulated hand and the daemon run as users run them. What reached the servos is asked of the
+emulated hand, never of the daemon.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ import msgpack
 import zmq
 
 from softfinger.daemon.client.command_client import NoAnswer
-from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
 from softfinger.daemon.wire.schema import STATE
+from softfinger.tools.benchmarks.campaign import RigError
+from softfinger.tools.benchmarks.rigs import HIL
 
-PROFILE = Path(__file__).parents[2] / "config" / "hil.toml"
 SOFTFINGER = (sys.executable, "-m", "softfinger")
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new
 _STATE_RATE = 250.0  # Hz
@@ -33,12 +33,8 @@ _LOOK = 0.003  # s between two looks at the hand
 _SCHEDSTAT = 80  # bytes
 
 
-class RigError(SoftfingerError):
-    """The set-up itself does not work: nothing was measured."""
-
-
 class Rig:
-    """A stand-in hand and a daemon on it, each of which can be started again."""
+    """An emulated hand and a daemon on it, each of which can be started again."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="softfinger-faults-")
@@ -52,7 +48,7 @@ class Rig:
             f'stream.address = "{self.stream}"\ncommands.address = "{self.commands}"\n'
             f"stream.state_rate = {_STATE_RATE}\n"
         )
-        self.config.write_text(head + PROFILE.read_text(encoding="utf-8"), encoding="utf-8")
+        self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
         self.settings = load(self.config, self.ports)
         self.context: zmq.Context[Any] = zmq.Context()
         self.hand: subprocess.Popen[str] | None = None
@@ -61,17 +57,15 @@ class Rig:
         self.placed = 0  # times that the object was put back
         self.start_seconds = 0.0  # that the last one took
         self._states: zmq.Socket[bytes] | None = None
-        self._aside: dict[int, float] = {}
-
-    # --- processes ---------------------------------------------------------------------------
+        self._last_waited: dict[int, float] = {}
 
     def start_hand(self) -> None:
-        """Start the stand-in hand, and wait until it answers. Raises RigError."""
+        """Start the emulated hand, and wait until it answers. Raises RigError."""
         words = [*SOFTFINGER, "emulate", "--dir", str(self.ports), "--config", str(self.config)]
         self.hand = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         assert self.hand.stdout is not None
         if self.hand.stdout.readline().strip() != "ready":
-            raise RigError("the stand-in hand did not start")
+            raise RigError("the emulated hand did not start")
 
     def start_daemon(self) -> None:
         """Start the daemon, and wait for its first answer; once more where it ends. RigError."""
@@ -136,7 +130,7 @@ class Rig:
         self.close()
 
     def log(self) -> list[str]:
-        """What the daemon said."""
+        """The daemon's log."""
         try:
             return (self.folder / "daemon.log").read_text(encoding="utf-8").splitlines()
         except OSError:
@@ -147,10 +141,8 @@ class Rig:
         """Whether the daemon's process lives."""
         return self.daemon is not None and self.daemon.poll() is None
 
-    # --- the stand-in hand -------------------------------------------------------------------
-
-    def tell(self, words: str) -> str:
-        """Words for the stand-in hand's control socket; its reply. Raises RigError."""
+    def send(self, words: str) -> str:
+        """Words for the emulated hand's control socket; its reply. Raises RigError."""
         try:
             reply = send_words(self.ports, words)
         except NoEmulator as error:
@@ -161,10 +153,8 @@ class Rig:
 
     def report(self, forget: bool = False) -> dict[str, Any]:
         """What was on the servos' wire; ``forget`` begins the record anew."""
-        report: dict[str, Any] = json.loads(self.tell("report forget" if forget else "report"))
+        report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
         return report
-
-    # --- the daemon --------------------------------------------------------------------------
 
     def ask(self, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
         """One command and its reply. Raises NoAnswer."""
@@ -215,21 +205,19 @@ class Rig:
             found.append(msgpack.unpackb(socket.recv_multipart()[1]))
         return found
 
-    # --- the machine -------------------------------------------------------------------------
-
-    def put_aside(self) -> float:
+    def waited(self) -> float:
         """Seconds that others held the processor that either process wanted, since last asked."""
         most = 0.0
         for process in (self.daemon, self.hand):
             if process is None:
                 continue
-            seconds = _waited(process.pid)
-            most = max(most, seconds - self._aside.get(process.pid, seconds))
-            self._aside[process.pid] = seconds
+            seconds = _waiting(process.pid)
+            most = max(most, seconds - self._last_waited.get(process.pid, seconds))
+            self._last_waited[process.pid] = seconds
         return most
 
 
-def _waited(process: int) -> float:
+def _waiting(process: int) -> float:
     """How long a process's threads have been ready to run and did not, altogether [s].
 
     All of them: while one is put aside with the interpreter's lock, the others can't go on.

@@ -1,6 +1,6 @@
 """One trial of the fault campaign: grip, inject, look, end it, and make the hand grip again.
 
-What was on the servos' wire is judged from the stand-in hand's record with arithmetic of its own.
+What was on the servos' wire is judged from the emulated hand's record with arithmetic of its own.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.tools.benchmarks.campaign import RigError
 from softfinger.tools.benchmarks.faults_cases import Case
-from softfinger.tools.benchmarks.faults_rig import Rig, RigError, stopped
+from softfinger.tools.benchmarks.faults_rig import Rig, stopped
 
 _SLACK = 0.05  # s that a look may come after what it sees, and a process be late
-_ASIDE = 0.015  # s between two looks that others took: what is late then is theirs
+_WAITED = 0.015  # s between two looks that others took: what is late then is theirs
 _RESOLUTION = 0.0016  # rad, a count of the servo's
 _CURRENT_UNIT = 0.0027  # A
 _READY_WITHIN = 15.0  # s
@@ -36,21 +37,22 @@ class Trial:
     seed: int
     phase: str = ""
     fault: str = ""  # its name
-    fault_s: float = math.nan  # until the daemon said so
+    fault_s: float = math.nan  # until the daemon published it
     safe_s: float = math.nan  # until no motor was driven any more
-    aside_s: float = 0.0  # longest between two looks that others had the processor
+    waited_s: float = 0.0  # longest between two looks that others had the processor
     wrong: str = ""  # what must never be
     missed: str = ""  # what was not as expected, and may be the busy machine's doing
 
     @property
     def disturbed(self) -> bool:
         """Not as expected, while other processes held this one up: no measurement."""
-        return bool(self.missed) and not self.wrong and self.aside_s > _ASIDE
+        return bool(self.missed) and not self.wrong and self.waited_s > _WAITED
 
     @property
-    def ok(self) -> bool:
-        """All as it must be."""
-        return not self.wrong and not self.missed
+    def failure(self) -> str:
+        """What was not as it must be, with the phase."""
+        text = self.wrong or self.missed
+        return f"{self.phase}: {text}" if text else ""
 
 
 def trial(rig: Rig, case: Case, seed: int) -> Trial:
@@ -64,7 +66,7 @@ def trial(rig: Rig, case: Case, seed: int) -> Trial:
     judge_wire(rig, found)
     _judge_daemon(rig, case, found)
     _judge(case, found)
-    stays = case.expect == "works" and found.ok
+    stays = case.expect == "works" and not found.failure
     if not stays and not ready(rig, chance):
         found.wrong = found.wrong or f"no working hand afterwards: {rig.status()}"
         _start_anew(rig)
@@ -88,7 +90,7 @@ def _grip(rig: Rig, case: Case, chance: random.Random, found: Trial) -> None:
         found.phase = _phase(rig, case, chance)
         time.sleep(chance.uniform(0.0, 0.02))
         rig.states(0.0)
-        rig.put_aside()
+        rig.waited()
         # A busy machine may have let a servo's watchdog act already; then once more.
         if not any(servo["stopped_by_watchdog"] for servo in rig.report(forget=True)["servos"]):
             return
@@ -147,7 +149,7 @@ def _place(rig: Rig) -> None:
             if time.monotonic() > end:
                 break
             time.sleep(0.01)
-    rig.tell("place")
+    rig.send("place")
     rig.placed += 1
 
 
@@ -188,7 +190,7 @@ def _look(rig: Rig, case: Case, found: Trial) -> None:
         report = rig.report()
         if stopped(report) and math.isnan(found.safe_s):
             found.safe_s = report["monotonic"] - begin
-        found.aside_s = max(found.aside_s, rig.put_aside())
+        found.waited_s = max(found.waited_s, rig.waited())
         safe = not math.isnan(found.safe_s)
         if safe and (found.fault or case.expect in ("dies", "stops")):
             return

@@ -48,3 +48,13 @@ def interleave(subjects: dict[str, Subject], rounds: int) -> dict[str, NDArray[n
         if collecting:
             gc.enable()
     return times
+
+
+def timed(call: Callable[[], object], count: int) -> list[float]:
+    """Wall time of each of ``count`` calls [µs]."""
+    samples = []
+    for _ in range(count):
+        before = time.perf_counter_ns()
+        call()
+        samples.append((time.perf_counter_ns() - before) * 1e-3)
+    return samples

@@ -1,50 +1,110 @@
-"""What a measurement returns, and the statistics that all of them share."""
+"""What a measurement returns: tables of rows; their text, and what became slower."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import math
+import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+# One measured thing; each key is the heading of its column, "name" the first of them.
+Row = dict[str, Any]
+
+_IN_SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
+_SURE = 3.0  # interquartile ranges, by which a median has to rise to be called slower
+_LEAST = 0.05  # share below which no rise is of interest
+
 
 @dataclass(frozen=True)
-class Row:
-    """One measured quantity: its median and tail in ``unit``, from ``count`` samples."""
+class Table:
+    """Rows under a title; ``error`` names the column that run time is drawn against."""
 
-    name: str
-    unit: str
-    median: float
-    p99: float
-    count: int
-    aim: float | None = None  # for the median, where there is one
+    title: str
+    rows: list[Row]
+    error: str = ""
+    notes: tuple[str, ...] = ()
+    failed: bool = False
 
-    def as_dict(self) -> dict[str, Any]:
-        """For the JSON file."""
-        return asdict(self)
+    def __str__(self) -> str:
+        """Aligned text; numbers with four digits, nothing for None and NaN."""
+        keys = list(dict.fromkeys(key for row in self.rows for key in row)) or ["name"]
+        lines = [[self.title if key == "name" else key for key in keys]]
+        lines += [[_cell(row.get(key)) for key in keys] for row in self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        words = [any(isinstance(row.get(key), str) for row in self.rows) for key in keys]
+        aligned = [
+            "  ".join(
+                cell.ljust(width) if left else cell.rjust(width)
+                for cell, width, left in zip(line, widths, words, strict=True)
+            ).rstrip()
+            for line in lines
+        ]
+        return "\n".join([*aligned, *self.notes])
 
 
-def row(name: str, unit: str, samples: ArrayLike, aim: float | None = None) -> Row:
-    """Summarise samples that are already in ``unit``."""
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None) -> Row:
+    """Median, interquartile range and 99th percentile of samples that are already in ``unit``."""
     values = np.asarray(samples, dtype=np.float64)
-    median, p99 = np.percentile(values, [50.0, 99.0])
-    return Row(name, unit, float(median), float(p99), len(values), aim)
+    low, median, high, p99 = np.percentile(values, [25.0, 50.0, 75.0, 99.0]).tolist()
+    return {
+        "name": name,
+        "median": median,
+        "IQR": high - low,
+        "p99": p99,
+        "unit": unit,
+        "aim ≤": aim,
+        "n": int(values.size),
+    }
 
 
-def table(rows: list[Row]) -> str:
-    """The rows as an aligned table."""
-    width = max([58, *(len(each.name) for each in rows)])
-    lines = [f"{'':{width}} {'median':>9} {'p99':>9} {'unit':>4} {'aim':>7} {'n':>7}"]
-    for each in rows:
-        aim = "" if each.aim is None else f"≤ {each.aim:g}"
-        lines.append(
-            f"{each.name:{width}} {_number(each.median)} {_number(each.p99)} {each.unit:>4} "
-            f"{aim:>7} {each.count:7d}"
-        )
-    return "\n".join(lines)
+def yardstick() -> Row:
+    """A fixed piece of work: how fast this machine is just now, to compare runs by."""
+    samples = []
+    for _ in range(101):
+        before = time.perf_counter_ns()
+        sum(i * i for i in range(2000))
+        samples.append((time.perf_counter_ns() - before) * 1e-3)
+    return figure("yardstick", "µs", samples)
 
 
-def _number(value: float) -> str:
-    """Three decimals, or an exponent where these would hide it."""
-    return f"{value:9.3f}" if value == 0.0 or abs(value) >= 0.01 else f"{value:9.1e}"
+def slower(old: list[Row], new: list[Row]) -> Table:
+    """The times and ratios of ``new`` that rose beyond the noise of both runs.
+
+    Rows are told by measurement, table and name. Times are taken over their run's own yardstick, so
+    that a slower machine makes nothing slower.
+    """
+
+    def by_key(rows: list[Row]) -> dict[tuple[str, str, str], Row]:
+        chosen = [row for row in rows if row.get("unit") in {*_IN_SECONDS, "×"}]
+        return {(row["measurement"], row["table"], row["name"]): row for row in chosen}
+
+    before, after = by_key(old), by_key(new)
+    rows = []
+    common = [key for key in after if key[2] != "yardstick" and key in before]
+    for key in common:
+        row = after[key]
+        if before[key]["median"] <= 0.0:
+            continue
+        ends = [before[key], row]
+        if row["unit"] == "×":
+            values = [end["median"] for end in ends]
+        else:
+            sticks = [each[key[0], "", "yardstick"] for each in (before, after)]
+            pairs = zip(ends, sticks, strict=True)
+            values = [e["median"] * _IN_SECONDS[e["unit"]] / s["median"] for e, s in pairs]
+            ends += sticks
+        noise = math.hypot(*(end["IQR"] / end["median"] for end in ends if end["median"] > 0.0))
+        ratio = values[1] / values[0]
+        if ratio > 1.0 + max(_SURE * noise, _LEAST):
+            name = ": ".join(part for part in key if part)
+            rows.append({"name": name, "ratio": ratio, "noise": noise})
+    return Table(f"slower than before, over the yardstick: {len(rows)} of {len(common)}", rows)

@@ -5,118 +5,201 @@ Paced, the emulated servos take the wire's own time; what is above it is ours an
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import dynamixel_sdk as sdk
 import numpy as np
 
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.simulation.emulator.control_port import send_words
-from softfinger.tools.benchmarks.bare_pty import bare
-from softfinger.tools.benchmarks.report import Row, row
-from softfinger.tools.benchmarks.servo_rig import OurCycle, PlainCycle, emulated
+from softfinger.daemon.types import Goal, Reading
+from softfinger.tools.benchmarks.interleaved import timed
+from softfinger.tools.benchmarks.report import Row, Table, figure
+from softfinger.tools.benchmarks.rigs import emulator
 
-_ROUNDS = 100
-_CYCLES = 20  # of each in a round
-_PACED = 1500
-_RATES = (1_000_000, 2_000_000, 3_000_000, 4_000_000)
-_MISSES = 50
+TITLE = "read + write of two servos over a pty"
+PAGE = {TITLE: ("unpaced", "2 Mbaud: cycle")}
+PROFILE = """\
+tactile.backend = "none"
+[servos]
+backend = "dynamixel"
+port = "{dir}/servos"
+"""
+# Fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6.
+_BITS = 10 * (16 + 36 + 28)
+_IN_TURN = 20  # cycles
+_RATES = (1, 2, 3, 4)  # Mbaud
+_PATIENCE = 0.2  # s for a reply, where its deadline is not what is measured
 
 
-def measure() -> list[Row]:
-    """Wall and processor time a cycle in µs, and what a missing reply costs in ms.
+def measure(brief: bool = False) -> list[Table]:
+    """Wall and processor time a cycle, and what a missing reply costs.
 
     With the real-time measures that the daemon takes by default.
     """
+    turns, paced, misses = (10, 200, 10) if brief else (100, 1500, 50)
     with RealTime(Settings()):
-        rows = _unpaced()
-        for baud in _RATES:
-            rows += _paced(baud)
-        return rows + _missing()
+        rows = unpaced(turns)
+        for baud in _RATES[1:2] if brief else _RATES:
+            rows += at_rate(baud, paced)
+        rows.append(missing_reply(misses))
+    return [Table(TITLE, rows)]
 
 
-def _unpaced() -> list[Row]:
-    """Ours, a bare pseudo-terminal's and the plain SDK's in turns, each on a far end of its own."""
-    with ExitStack() as stack:
-        ours = OurCycle(stack.enter_context(emulated()).folder)
-        stack.callback(ours.close)
-        floor = stack.enter_context(bare(*ours.bytes().parts))
-        plain = PlainCycle(stack.enter_context(emulated()).folder)
-        stack.callback(plain.close)
-        turns: list[tuple[str, Callable[[], None]]] = [
-            ("ours", ours),
-            ("bare", floor),
-            ("plain", plain),
-        ]
-        wall: dict[str, list[float]] = {name: [] for name, _ in turns}
-        busy: dict[str, list[float]] = {name: [] for name, _ in turns}
-        for name, cycle in turns * _ROUNDS:
-            spent, cpu = timed(cycle, _CYCLES)
-            wall[name] += spent
-            busy[name].append(cpu)
-        _must_have_worked(ours.failed + plain.failed, 2 * _ROUNDS * _CYCLES)
+def unpaced(turns: int) -> list[Row]:
+    """Ours and the plain SDK's in turns, each on emulated servos of its own."""
+    with emulated() as near, OurCycle(near) as ours, emulated() as far, PlainCycle(far) as plain:
+        cycles: dict[str, OurCycle | PlainCycle] = {"unpaced": ours, "unpaced, plain SDK": plain}
+        wall: dict[str, list[float]] = {name: [] for name in cycles}
+        busy: dict[str, list[float]] = {name: [] for name in cycles}
+        for _ in range(turns):
+            for name, cycle in cycles.items():
+                samples, processor = _timed(cycle, _IN_TURN)
+                wall[name] += samples
+                busy[name].append(processor)
+        must_have_worked(ours.failed + plain.failed, 2 * turns * _IN_TURN)
+    rows = []
+    for name in cycles:
+        aims = (120.0, 100.0) if name == "unpaced" else (None, None)
+        rows.append(figure(f"{name}: cycle", "µs", wall[name], aims[0]))
+        rows.append(figure(f"{name}: processor time", "µs", busy[name], aims[1]))
+    return rows
+
+
+def at_rate(mbaud: int, cycles: int) -> list[Row]:
+    """A cycle against the time that its bytes take on a wire of this rate."""
+    wire = _BITS / mbaud  # µs; the servos' return delay is 0
+    with emulated(1_000_000 * mbaud) as folder, OurCycle(folder, 1_000_000 * mbaud) as cycle:
+        timed(cycle, 50)
+        # From start to start: the bytes of a write are still on the wire when it returns.
+        samples, processor = _timed(cycle, cycles)
+        must_have_worked(cycle.failed, cycles)
+    name = f"{mbaud} Mbaud"
     return [
-        row("read + write of two servos, unpaced pty", "µs", wall["ours"], aim=120.0),
-        row("  its processor time", "µs", busy["ours"], aim=100.0),
-        row("  the same bytes with no work at either end, in turns with it", "µs", wall["bare"]),
-        row("  and their processor time", "µs", busy["bare"]),
-        row("  the plain SDK's cycle, in turns with it", "µs", wall["plain"]),
-        row("  and its processor time", "µs", busy["plain"]),
+        figure(f"{name}: cycle, {wire:.0f} µs on the wire", "µs", samples),
+        figure(f"{name}: over the bytes' own time", "×", np.array(samples) / wire, 1.15),
+        figure(f"{name}: processor time", "µs", [processor], 200.0),
     ]
 
 
-def _must_have_worked(failed: int, count: int) -> None:
-    """A machine that is busy elsewhere may hold a reply up past its deadline, now and then."""
+def missing_reply(misses: int) -> Row:
+    """A cycle's time over the deadline of its reply [ms], where a servo is silent."""
+    with emulated() as folder, OurCycle(folder, strict=True) as cycle:
+        send_words(folder, "silent=2")
+        samples = timed(cycle, misses)
+        missed = cycle.failed
+        send_words(folder, "answer=2")
+    if missed < misses - 1:
+        raise RuntimeError(f"only {missed} of {misses} replies were missing")
+    extra = 1e-3 * np.array(samples[-missed:]) - 1e3 * cycle.deadline
+    return figure(f"missing reply, over its deadline of {1e3 * cycle.deadline:g} ms", "ms", extra)
+
+
+def must_have_worked(failed: int, count: int) -> None:
+    """RuntimeError for more failures than a machine that is busy elsewhere makes."""
     if failed > 0.02 * count:
         raise RuntimeError(f"{failed} of {count} cycles failed")
 
 
-def timed(cycle: Callable[[], None], count: int) -> tuple[list[float], float]:
-    """Wall time of each of ``count`` cycles and the mean processor time of one, in µs."""
-    wall = []
-    cpu = time.thread_time_ns()
-    for _ in range(count):
-        before = time.perf_counter_ns()
-        cycle()
-        wall.append((time.perf_counter_ns() - before) * 1e-3)
-    return wall, (time.thread_time_ns() - cpu) * 1e-3 / count
+def _timed(cycle: Callable[[], None], count: int) -> tuple[list[float], float]:
+    """Wall time of each cycle and the mean processor time of one [µs]."""
+    before = time.thread_time_ns()
+    samples = timed(cycle, count)
+    return samples, (time.thread_time_ns() - before) * 1e-3 / count
 
 
-def _paced(baud: int) -> list[Row]:
-    with emulated(baud) as stand:
-        cycle = OurCycle(stand.folder, baud)
-        try:
-            traffic = cycle.bytes()
-            timed(cycle, 50)
-            wire = traffic.seconds(baud) * 1e6  # the servos' return delay is 0
-            # From start to start: the bytes of a write are still on the wire when it returns.
-            spent, cpu = timed(cycle, _PACED)
-            _must_have_worked(cycle.failed, _PACED)
-        finally:
-            cycle.close()
-    share = np.array(spent) / wire
-    name = f"read + write of two servos at {baud // 1_000_000} Mbaud"
-    return [
-        row(f"{name}, {wire:.0f} µs on the wire", "µs", spent),
-        row("  over the bytes' own time", "", share, aim=1.15),
-        row("  its processor time", "µs", [cpu], aim=200.0),
-    ]
+@contextlib.contextmanager
+def emulated(baud: int = 0) -> Iterator[Path]:
+    """The folder of two emulated servos: ``baud`` 0 unpaced, else with the wire's time."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        config = folder / "servos.toml"
+        config.write_text(PROFILE)
+        with emulator(folder, config, "--baud", str(baud)):
+            yield folder
 
 
-def _missing() -> list[Row]:
-    with emulated() as stand:
-        cycle = OurCycle(stand.folder, strict=True)
-        try:
-            send_words(stand.folder, "silent=2")
-            spent, _ = timed(cycle, _MISSES)
-            deadline = cycle.deadline * 1e3
-            missed = cycle.failed
-            send_words(stand.folder, "answer=2")
-        finally:
-            cycle.close()
-    if missed < _MISSES - 1:
-        raise RuntimeError(f"only {missed} of {_MISSES} replies were missing")
-    extra = np.array(spent[-missed:]) * 1e-3 - deadline
-    return [row(f"a missing reply: cycle's time over its deadline of {deadline:g} ms", "ms", extra)]
+class OurCycle:
+    """The daemon's own: one read and one write of all servos, torque on.
+
+    A reply is waited for longer than the settings say, unless ``strict``.
+    """
+
+    def __init__(self, folder: Path, baud: int = 2_000_000, strict: bool = False) -> None:
+        settings = load(folder / "servos.toml", folder)
+        self.deadline = settings.servos.reply_timeout if strict else _PATIENCE  # s
+        # No bus watchdog: the line is quiet while the other way of driving it has its turn.
+        change = {"baud": baud, "watchdog": 0.0, "reply_timeout": self.deadline}
+        servos = settings.servos.model_copy(update=change)
+        settings = settings.model_copy(update={"servos": servos})
+        self._servos = DynamixelServos(settings, RealClock(settings.realtime.spin))
+        self._servos.connect()
+        self._servos.torque_on()
+        self._reading = Reading()
+        self._goal = Goal(q=[0.05, 0.05], current=[0.3, 0.3])
+        self.failed = 0
+
+    def __enter__(self) -> OurCycle:
+        return self
+
+    def __call__(self) -> None:
+        """One cycle."""
+        self._servos.read(self._reading)
+        self.failed += not self._reading.valid
+        self._servos.write(self._goal)
+
+    def __exit__(self, *_: object) -> None:
+        self._servos.close()
+
+
+class PlainCycle:
+    """The same with the SDK as it comes: fast sync read, two sync writes, its own port handler.
+
+    Two writes, since the indirect map that puts both goals in one is not the SDK's doing.
+    """
+
+    def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
+        self._port = sdk.PortHandler(str(folder / "servos"))
+        if not (self._port.openPort() and self._port.setBaudRate(baud)):
+            raise RuntimeError("the plain SDK did not open the port")
+        packets = sdk.PacketHandler(2.0)
+        span = reg.PRESENT_POSITION + 4 - reg.PRESENT_CURRENT
+        self._read = sdk.GroupSyncRead(self._port, packets, reg.PRESENT_CURRENT, span)
+        self._currents = sdk.GroupSyncWrite(self._port, packets, reg.GOAL_CURRENT, 2)
+        self._positions = sdk.GroupSyncWrite(self._port, packets, reg.GOAL_POSITION, 4)
+        for servo in (1, 2):
+            packets.write1ByteTxRx(self._port, servo, reg.TORQUE_ENABLE, 1)
+            self._read.addParam(servo)
+            self._currents.addParam(servo, [100, 0])
+            self._positions.addParam(servo, [0, 8, 0, 0])
+        self.failed = 0
+
+    def __enter__(self) -> PlainCycle:
+        return self
+
+    def __call__(self) -> None:
+        """One cycle."""
+        self.failed += self._read.fastSyncRead() != sdk.COMM_SUCCESS
+        for servo in (1, 2):
+            for address, size in (
+                (reg.PRESENT_CURRENT, 2),
+                (reg.PRESENT_VELOCITY, 4),
+                (reg.PRESENT_POSITION, 4),
+            ):
+                self._read.getData(servo, address, size)
+            self._currents.changeParam(servo, [100, 0])
+            self._positions.changeParam(servo, [0, 8, 0, 0])
+        self._currents.txPacket()
+        self._positions.txPacket()
+
+    def __exit__(self, *_: object) -> None:
+        self._port.closePort()

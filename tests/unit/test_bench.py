@@ -1,0 +1,215 @@
+"""``softfinger bench``: tables, turns, campaigns, comparison of runs, and the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from softfinger.tools import bench, cli
+from softfinger.tools.benchmarks import accuracy, interleaved, tick, wakeup
+from softfinger.tools.benchmarks.campaign import RigError, run_trials, upper_bound
+from softfinger.tools.benchmarks.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.report import Row, Table, figure, slower
+
+REPORT = """\
+# /dev/cpu_dma_latency set to 0us
+# Histogram
+000000 000000
+000014 000003
+000015 000001
+# Total: 000000004
+# Min Latencies: 00014
+# Avg Latencies: 00022
+# Max Latencies: 00250
+# Histogram Overflows: 00002
+"""
+
+
+def test_a_table_is_aligned_and_leaves_out_what_is_missing() -> None:
+    rows = [
+        {"name": "a", "x µs": 7.8e-6, "n": 3},
+        {"name": "longer", "x µs": math.nan, "what": "w"},
+    ]
+    assert str(Table("times", rows, notes=("a note",))).splitlines() == [
+        "times      x µs  n  what",
+        "a       7.8e-06  3",
+        "longer              w",
+        "a note",
+    ]
+
+
+def test_a_figure_has_median_and_tail() -> None:
+    row = figure("f", "s", range(101), 60.0)
+    assert (row["median"], row["IQR"], row["p99"], row["n"]) == (50.0, 50.0, 99.0, 101)
+
+
+def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0]
+    order: list[str] = []
+    monkeypatch.setattr(interleaved.time, "perf_counter_ns", lambda: clock[0])
+
+    def subject(name: str, cost: int, calls: int) -> Subject:
+        def run(repeat: int) -> None:
+            order.append(name)
+            clock[0] += cost * calls * repeat
+
+        return Subject(run, calls)
+
+    times = interleave({"a": subject("a", 100, 5), "b": subject("b", 7_000_000, 1)}, rounds=3)
+    assert order == ["a", "a", "b", "b"] + ["a", "b"] * 3
+    assert times["a"].tolist() == [100.0] * 3
+    assert times["b"].tolist() == [7e6] * 3
+
+
+def rows_of(stick: float, **medians: float) -> list[Row]:
+    """A run's rows: a yardstick, and others of 2 % noise."""
+    rows = [figure("yardstick", "µs", [stick]) | {"table": ""}]
+    for name, median in medians.items():
+        samples = [0.99 * median, median, 1.01 * median]
+        rows.append(figure(name, "µs", samples) | {"table": "t"})
+    return [{"measurement": "m", **row} for row in rows]
+
+
+def test_what_became_slower_is_told_from_noise_and_from_a_slower_machine() -> None:
+    old = rows_of(100.0, same=5.0, worse=5.0, gone=1.0)
+    twice = slower(old, rows_of(200.0, same=10.1, worse=13.0, new=1.0))
+    assert [row["name"] for row in twice.rows] == ["m: t: worse"]
+    assert twice.rows[0]["ratio"] == pytest.approx(1.3)
+    none = slower(old, rows_of(100.0, same=4.0, worse=5.1))
+    assert str(none) == "slower than before, over the yardstick: 0 of 2"
+
+
+@dataclass
+class Judged:
+    failure: str = ""
+    disturbed: bool = False
+
+
+def test_disturbed_trials_are_made_again_and_failures_counted() -> None:
+    found = {1: Judged("late", disturbed=True), 3: Judged("crash")}
+    seeds: list[int] = []
+
+    def one(seed: int) -> Judged:
+        seeds.append(seed)
+        return found.get(seed, Judged())
+
+    outcome = run_trials(3, one, lambda seed, reason: Judged(reason))
+    assert seeds == [1, 2, 3, 4]
+    assert (len(outcome.trials), outcome.passed, outcome.disturbed) == (3, 2, 1)
+    assert outcome.failed
+    assert outcome.failures == ["seed 3, crash"]
+
+
+def test_a_set_up_that_does_not_work_is_given_up() -> None:
+    def broken(seed: int) -> Judged:
+        raise RigError("no hand")
+
+    outcome = run_trials(100, broken, lambda seed, reason: Judged(reason))
+    assert (len(outcome.trials), outcome.passed) == (3, 0)
+    assert outcome.failure_bound == 1.0
+    assert "the set-up failed: no hand" in outcome.failures[0]
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 40])
+def test_the_upper_bound_is_the_poisson_one(count: int) -> None:
+    mean = upper_bound(count, 1000) * 1000
+    tail = sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(count + 1))
+    assert tail == pytest.approx(0.05, abs=0.004)
+
+
+def test_a_report_of_cyclictest_is_read_with_what_its_histogram_does_not_reach() -> None:
+    assert wakeup.histogram(REPORT).tolist() == pytest.approx(
+        [14.5e-6, 14.5e-6, 14.5e-6, 15.5e-6, 250e-6, 250e-6]
+    )
+    with pytest.raises(ValueError, match="nothing that can be read"):
+        wakeup.histogram("usage: cyclictest")
+
+
+# The command line
+
+
+@pytest.fixture
+def canned(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """A measurement of a tick that takes as long as is said."""
+
+    def set_time(micros: float) -> None:
+        rows = [figure("pipeline alone, nobody subscribed", "µs", [micros] * 5)]
+        monkeypatch.setattr(tick, "measure", lambda brief: [Table(tick.TITLE, rows, "error")])
+
+    monkeypatch.setattr(bench, "PAGE", ("tick",))
+    set_time(20.0)
+    return set_time
+
+
+def test_figures_are_kept_and_compared(
+    canned: Callable[[float], None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = tmp_path / "old.json"
+    assert cli.main(["bench", "tick", "--json", str(old)]) == 0
+    rows = json.loads(old.read_text(encoding="utf-8"))["rows"]
+    assert [(row["measurement"], row["name"]) for row in rows] == [
+        ("tick", "pipeline alone, nobody subscribed"),
+        ("tick", "yardstick"),
+    ]
+    canned(2000.0)
+    assert cli.main(["bench", "--against", str(old)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{tick.TITLE}: pipeline alone" in printed, "the page"
+    assert "slower than before" in printed
+
+
+def test_a_failed_campaign_is_no_success(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[tuple[int | None, str]] = []
+
+    def measure(trials: int | None, only: str) -> list[Table]:
+        asked.append((trials, only))
+        return [Table("part", [{"name": "x"}], failed=trials == 7)]
+
+    monkeypatch.setattr(accuracy, "measure", measure)
+    assert cli.main(["bench", "campaign", "accuracy"]) == 0
+    assert cli.main(["bench", "campaign", "accuracy", "--trials", "7", "--only", "bound"]) == 1
+    assert asked == [(None, ""), (7, "bound")]
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["contct"], "found 'contct', expected one of contact"),
+        (["faults"], "it is a campaign, `bench campaign faults`"),
+        (["campaign"], "'campaign' alone, expected one of accuracy, faults"),
+        (["campaign", "faults", "--only", "no such fault"], "found in no case of faults"),
+        (["campaign", "faults", "--only", "("], "found in no case of faults"),
+        (["tick", "--plot", "x.png"], "only contact and estimator have a picture"),
+        (["tick", "--against", "/nowhere.json"], "no figures of `bench --json`"),
+    ],
+)
+def test_refusals_come_before_the_measurements(
+    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["bench", *words]) == 2
+    error = capsys.readouterr().err
+    assert text in error
+    assert "measuring" not in error
+
+
+def test_a_picture_needs_matplotlib(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert cli.main(["bench", "contact", "--plot", "x.png"]) == 2
+    assert "pip install '.[plot]'" in capsys.readouterr().err
+
+
+def test_a_number_of_trials_is_a_whole_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["bench", "campaign", "faults", "--trials", "0"])
+    assert "expected a whole number above 0" in capsys.readouterr().err
