@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import (
     COUNTS_PER_TURN,
@@ -21,6 +22,7 @@ from softfinger.daemon.servos.control_table import (
     JointScale,
     by_name,
 )
+from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
@@ -69,6 +71,19 @@ def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: An
     """The servos of settings with these ``servos``, set up for the hand, on free joints."""
     settings = Settings.model_validate({"servos": servos or {}})
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
+
+
+def backend_settings(path: str, **servos: Any) -> Settings:
+    """The Dynamixel backend on this port; a bus in a thread shares the interpreter's lock."""
+    values = {"backend": "dynamixel", "port": path, "reply_timeout": 1.0} | servos
+    return Settings.model_validate({"servos": values})
+
+
+def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
+    """The Dynamixel backend, connected to a running bus."""
+    backend = DynamixelServos(backend_settings(bus.path, **servos), RealClock())
+    backend.connect()
+    return backend
 
 
 class DirectPort(SerialPort):

@@ -1,0 +1,225 @@
+"""What connecting finds: everything that is wrong at once, with its fix, and nothing changed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from softfinger.daemon.clock import RealClock
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos import dynamixel
+from softfinger.daemon.servos import port as port_module
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.types import Goal, Reading
+from tests.harness.servos import RunningBus, backend_settings, connected, hand_bus
+
+
+@pytest.fixture
+def running() -> Iterator[Callable[..., RunningBus]]:
+    """Starts buses that end with the test."""
+    buses: list[RunningBus] = []
+
+    def start(baud: int = 0, **options: Any) -> RunningBus:
+        buses.append(RunningBus(hand_bus(time.monotonic(), baud=baud, **options), baud))
+        return buses[-1]
+
+    yield start
+    for bus in buses:
+        bus.close()
+
+
+@pytest.fixture
+def bus(running: Callable[..., RunningBus]) -> RunningBus:
+    return running()
+
+
+def refusal(path: str, **servos: Any) -> list[str]:
+    """The lines of the error that connecting ends with."""
+    backend = DynamixelServos(backend_settings(path, **servos), RealClock())
+    with pytest.raises(ServoError) as caught:
+        backend.connect()
+    backend.close()
+    return str(caught.value).splitlines()
+
+
+def test_connect_changes_nothing_and_stiffens_nothing(bus: RunningBus) -> None:
+    live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
+
+    def settled() -> list[bytes]:
+        tables = [bus.memory(i) for i in (0, 1)]
+        return [table[: live.start] + table[live.stop :] for table in tables]
+
+    before = settled()
+    backend = connected(bus)
+    reading = Reading()
+    for _ in range(5):
+        backend.read(reading)
+        backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
+    backend.close()
+    assert settled() == before
+    assert not bus.servo(0).torque_on
+
+
+LEFT, RIGHT = "servo 1 (left): ", "servo 2 (right): "
+FIX = ": `softfinger doctor --fix`"
+REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
+
+
+@pytest.mark.parametrize(
+    ("options", "faults", "registers", "told"),
+    [
+        (
+            {"prepared": False},
+            ["overload=2"],
+            {},
+            [
+                f"{LEFT}operating mode is position (3), not current-based position (5){FIX}",
+                f"{LEFT}return delay is 500 µs, more than 50 µs{FIX}",
+                f"{RIGHT}operating mode is position (3), not current-based position (5){FIX}",
+                f"{RIGHT}return delay is 500 µs, more than 50 µs{FIX}",
+                f"{RIGHT}hardware error: overload{REBOOT}",
+            ],
+        ),
+        (
+            {},
+            ["undervoltage=1"],
+            {reg.CURRENT_LIMIT: 100},
+            [
+                f"{LEFT}supply is 8.5 V, not in 9.5 … 16.0 V: check the supply",
+                f"{RIGHT}current limit is 0.269 A, below safety.current_max 1.2 A: lower "
+                "safety.current_max or raise the limit",
+            ],
+        ),
+        (
+            {},
+            [],
+            {reg.DRIVE_MODE: 0b1000},
+            [
+                f"{RIGHT}drive mode 8 switches torque on with any goal, or has it follow another "
+                f"servo{FIX}"
+            ],
+        ),
+        (
+            {"servos": {"model": "XM430-W210"}},
+            [],
+            {},
+            [
+                f"{LEFT}is an XM430-W210, not an XM430-W350: set servos.model",
+                f"{RIGHT}is an XM430-W210, not an XM430-W350: set servos.model",
+            ],
+        ),
+    ],
+    ids=["factory-new and overloaded", "supply and limit", "drive mode", "model"],
+)
+def test_everything_wrong_is_listed_with_its_fix(
+    running: Callable[..., RunningBus],
+    options: dict[str, Any],
+    faults: list[str],
+    registers: dict[int, int],
+    told: list[str],
+) -> None:
+    bus = running(**options)
+    for fault in faults:
+        bus.fault(fault)
+    for address, value in registers.items():
+        bus.call(lambda at=address, value=value: bus.servo(1).table.set(at, value))
+    lines = refusal(bus.path)
+    # The servo itself may have noticed the supply by now.
+    assert [line for line in lines if "input voltage" not in line] == told
+
+
+def test_a_model_without_current_control(running: Callable[..., RunningBus]) -> None:
+    bus = running(servos={"model": "XL430-W250", "mode": "position"})
+    lines = refusal(bus.path, model="XL430-W250")
+    assert sum("no current-based position mode" in line for line in lines) == 2
+
+
+@pytest.mark.parametrize("silent", [(2,), (1, 2)])
+def test_servos_that_do_not_answer(bus: RunningBus, silent: tuple[int, ...]) -> None:
+    for servo in silent:
+        bus.fault(f"silent={servo}")
+    (line,) = refusal(bus.path, reply_timeout=0.5)
+    missing = "servo 2 (right): no answer at 2000000 baud: check its cable"
+    nothing = f"{bus.path}: no servo answers at 2000000 baud (IDs 1, 2): check power"
+    assert line.startswith(missing if silent == (2,) else nothing)
+
+
+def test_the_wrong_rate_is_met_with_silence(running: Callable[..., RunningBus]) -> None:
+    bus = running(baud=1_000_000)
+    (line,) = refusal(bus.path, baud=3_000_000, reply_timeout=0.05)
+    assert "no servo answers at 3000000 baud" in line
+    connected(bus, baud=1_000_000).close()
+
+
+def test_ports_that_can_not_be_used(bus: RunningBus) -> None:
+    assert "no such port" in refusal("/dev/does-not-exist")[0]
+    first = connected(bus)
+    assert "in use by another process" in refusal(bus.path)[0]
+    reading = Reading()
+    first.read(reading)
+    assert reading.valid
+    first.close()
+    connected(bus).close()  # free again
+
+
+def test_what_is_worth_knowing_is_a_notice(bus: RunningBus) -> None:
+    servo = bus.servo(0)
+    bus.call(lambda: servo.table.set(reg.DRIVE_MODE, 0b0001))
+    bus.call(lambda: servo.write(reg.TORQUE_ENABLE, b"\x01", time.monotonic()))
+    backend = connected(bus, watchdog=0.0, fault_after=60.0)
+    notices = [str(each) for each in backend.notices]
+    for finger in (LEFT, RIGHT):
+        assert f"{finger}servos.watchdog = 0: nothing stops it if daemon or line fail" in notices
+        assert [n for n in notices if n.startswith(f"{finger}servos.fault_after = 60 s: without")]
+    assert [n for n in notices if n.startswith(f"{LEFT}its drive mode is reversed")]
+    assert [n for n in notices if n.startswith(f"{LEFT}torque is on already")]
+    span = slice(reg.GOAL_CURRENT, reg.GOAL_POSITION + 4)
+    goal = bus.memory(0)[span]
+    backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
+    backend.close()
+    assert bus.memory(0)[span] == goal  # torque that was on stays as it was
+    assert servo.torque_on
+
+
+def test_an_adapters_latency_timer_is_asked_to_be_low(
+    bus: RunningBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = Path(os.path.realpath(bus.path)).name
+    (tmp_path / name / "device").mkdir(parents=True)
+    place = tmp_path / name / "device" / "latency_timer"
+    place.write_text("16\n")
+    monkeypatch.setattr(port_module, "_SYSFS", tmp_path)
+    monkeypatch.setattr(dynamixel, "_PATIENCE", 1.0)
+    # The mode is not there, as on this pseudo-terminal.
+    text = "the adapter's latency timer is 16 ms, so a read takes that long"
+    fix = "`softfinger doctor --fix` sets it to 1 ms"
+    assert refusal(bus.path, reply_timeout=0.004)[0] == f"{bus.path}: {text}: {fix}"
+    backend = connected(bus)  # a reply may take longer than the timer
+    assert (backend.notices[0].problem, backend.notices[0].fix) == (text, fix)
+    backend.close()
+    # The mode is there: a driver then sets the timer to 1 ms by itself.
+    asked = []
+
+    def low(_: serial.Serial, on: bool) -> None:
+        asked.append(on)
+        place.write_text("1\n")
+
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", low)
+    backend = connected(bus)
+    assert asked == [True]
+    assert backend.notices == ()
+    backend.close()
+    place.write_text("nonsense")
+    port = SerialPort(bus.path, 2_000_000, 1.0, low_latency=False)
+    port.openPort()
+    assert port.latency_timer() == 0.0
+    assert asked == [True]
+    port.closePort()

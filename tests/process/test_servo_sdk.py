@@ -1,0 +1,146 @@
+"""The maker's SDK, plain and through our packet handler, against emulated servos on a pty."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import dynamixel_sdk as sdk
+import pytest
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler
+from tests.harness.servos import RunningBus
+
+OK = sdk.COMM_SUCCESS
+Line = tuple[SerialPort, PacketHandler]
+
+
+@pytest.fixture
+def bus() -> Iterator[RunningBus]:
+    bus = RunningBus()
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def line(bus: RunningBus) -> Iterator[Line]:
+    port = SerialPort(bus.path, 2_000_000, 1.0)  # the bus shares this process's interpreter lock
+    port.openPort()
+    yield port, PacketHandler()
+    port.closePort()
+
+
+def test_goal_current_minus_one_and_goal_velocity_minus_three(bus: RunningBus, line: Line) -> None:
+    port, handler = line
+    goals = list(struct.pack("<hi", -1, -3))
+    span = slice(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 6)
+    before = bus.memory(0)[span]
+    sdk.PacketHandler(2.0).writeTxOnly(port, 1, reg.GOAL_CURRENT, 6, goals)
+    assert bus.memory(0)[span] == before  # the plain SDK's packet is not stuffed
+    assert handler.writeTxRx(port, 1, reg.GOAL_CURRENT, 6, goals) == (OK, 0)
+    assert bus.memory(0)[span] == bytes(goals)
+    assert handler.readTxRx(port, 1, reg.GOAL_CURRENT, 6) == (goals, OK, 0)
+
+
+@hypothesis_settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    data=st.lists(st.sampled_from([0xFF, 0xFD, 0x12, 0x00]), min_size=1, max_size=28).map(bytes),
+    kind=st.sampled_from([GroupRead, FastGroupRead]),
+)
+def test_any_bytes_come_and_go_unchanged(
+    bus: RunningBus, line: Line, data: bytes, kind: type[GroupRead]
+) -> None:
+    port, handler = line
+    start = 224  # indirect data pointing at itself: plain memory
+    assert handler.writeTxRx(port, 1, start, len(data), list(data)) == (OK, 0)
+    assert bus.memory(0)[start : start + len(data)] == data
+    assert handler.readTxRx(port, 1, start, len(data)) == (list(data), OK, 0)
+    group = kind(port, handler, start, len(data), [1])
+    assert group.exchange() == OK
+    assert group.data[1] == data
+
+
+def test_every_register_reads_as_the_table_has_it(bus: RunningBus, line: Line) -> None:
+    port, handler = line
+    size = bus.servo(1).table.size
+    read = b""
+    for address in range(0, size, 61):
+        data, result, _ = handler.readTxRx(port, 2, address, min(61, size - address))
+        assert result == OK
+        read += bytes(data)
+    memory, live = bus.memory(1), slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
+    assert read[: live.start] == memory[: live.start]
+    assert read[live.stop :] == memory[live.stop :]
+    assert handler.readTxRx(port, 2, size - 1, 2)[2] == 7
+
+
+def test_other_calls_of_the_sdk_work_through_our_handler(line: Line) -> None:
+    port, handler = line
+    assert handler.ping(port, 1) == (1020, OK, 0)
+    assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
+    assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
+    assert handler.regWriteTxRx(port, 2, reg.LED, 1, [1]) == (OK, 0)
+    assert handler.action(port, 2) == OK
+    # The SDK does not wait for that reply, which must not be taken for the next one's.
+    assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
+    bulk = sdk.GroupBulkRead(port, handler)
+    bulk.addParam(1, reg.PRESENT_POSITION, 4)
+    bulk.addParam(2, reg.PRESENT_TEMPERATURE, 1)
+    for exchange in (bulk.txRxPacket, bulk.fastBulkRead):
+        assert exchange() == OK
+        assert bulk.getData(1, reg.PRESENT_POSITION, 4) == 2048
+        assert bulk.getData(2, reg.PRESENT_TEMPERATURE, 1) == 25
+    assert handler.reboot(port, 1) == (OK, 0)
+
+
+def test_the_plain_sdk_is_served_too(bus: RunningBus) -> None:
+    port = sdk.PortHandler(bus.path)
+    handler = sdk.PacketHandler(2.0)
+    assert port.openPort()
+    assert port.setBaudRate(1_000_000)  # closes and opens the pty again
+    # Its 35 ms may pass on a busy machine.
+    port.setPacketTimeout = lambda _: port.setPacketTimeoutMillis(60_000)
+    assert handler.ping(port, 2) == (1020, OK, 0)
+    read = sdk.GroupSyncRead(port, handler, reg.PRESENT_POSITION, 4)
+    for servo in (1, 2):
+        assert read.addParam(servo)
+    for exchange in (read.txRxPacket, read.fastSyncRead):
+        assert exchange() == OK
+        assert [read.getData(servo, reg.PRESENT_POSITION, 4) for servo in (1, 2)] == [2048, 2048]
+    assert handler.broadcastPing(port) == ({1: [1020, 48], 2: [1020, 48]}, OK)
+    port.closePort()
+
+
+def test_error_bytes_of_a_group_read_are_kept(bus: RunningBus, line: Line) -> None:
+    bus.fault("overload=1")
+    for kind in (GroupRead, FastGroupRead):
+        group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
+        assert group.exchange() == OK
+        assert group.errors == {1: 0x80, 2: 0}
+        assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # beyond the table
+
+
+def test_noise_before_a_reply_is_skipped_and_counted() -> None:
+    class Script(SerialPort):
+        def __init__(self, data: bytes) -> None:
+            super().__init__("script", 2_000_000, 0.01)
+            self.received += data
+
+        def fill(self) -> bool:
+            return False
+
+    status = bytes.fromhex("FFFFFD00010800 55 00 A6000000 8CC0")
+    echo = bytes.fromhex("FFFFFD00010700 02 84000400 1D15")
+    for noise in (b"\x00\xff", b"\xff\xff\xfd", echo, b"\xff\xff\xfd\x00\x01\xff\xff\x55"):
+        handler = PacketHandler()
+        assert handler.rxPacket(Script(noise + status), False) == (status, OK)
+        assert handler.skipped_bytes == len(noise)
+    handler = PacketHandler()
+    assert handler.rxPacket(Script(status[:-3]), False)[1] == sdk.COMM_RX_CORRUPT
+    assert handler.rxPacket(Script(b""), False)[1] == sdk.COMM_RX_TIMEOUT
+    assert (handler.torn, handler.timeouts) == (1, 1)
