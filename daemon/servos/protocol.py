@@ -4,10 +4,10 @@ What the SDK (4.1.0) does otherwise than the daemon needs, with its consequence;
 here or in :mod:`servos.port`, and everything else of the SDK is used as it is:
 
 - ``txPacket`` drops the stuffed packet: FF FF FD within goals is sent unstuffed and misread.
-- ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD: up to 8 % of group reads fail.
+- ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD: 3-8 % of group reads were seen to fail.
 - ``rxPacket`` spins on non-blocking reads: a processor is busy for the whole wire's time.
-- ``txPacket`` leaves ``is_using`` set after a failure: every later call returns −1000.
-- ``updateCRC`` builds its table at each call: 50 µs a packet.
+- ``txPacket`` leaves ``is_using`` set when the port raises: every later call returns −1000.
+- ``updateCRC`` takes byte by byte: 8 µs for 40 bytes, against 1 µs of ours.
 - ``readTxRx`` takes a reply of another length: an old reply's CRC is returned as data.
 - ``GroupSyncRead`` drops the servos' error bytes and reads 0 after a failure: an alert is lost,
   and a joint seems to be at 0.

@@ -9,6 +9,7 @@ import math
 import os
 import queue
 import select
+import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -26,6 +27,8 @@ from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import Parser, frame
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
@@ -84,6 +87,40 @@ def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
     backend = DynamixelServos(backend_settings(bus.path, **servos), RealClock())
     backend.connect()
     return backend
+
+
+class BusClient:
+    """Talks to a bus at its own time; parses the replies with the independent parser."""
+
+    def __init__(self, bus: ServoBus) -> None:
+        self.bus = bus
+        self.t = 0.001
+
+    def send(self, packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+        return self.bus.feed(frame(packet_id, instruction, parameters), self.t)
+
+    def ask(
+        self, instruction: int, parameters: bytes = b"", packet_id: int = 1
+    ) -> tuple[int, bytes]:
+        """(error byte, data) of the one reply."""
+        (packet,) = Parser().feed(self.send(packet_id, instruction, parameters), 0.0)
+        assert packet.valid
+        assert packet.instruction == framing.STATUS
+        return packet.parameters[0], packet.parameters[1:]
+
+    def read(self, address: int, size: int, packet_id: int = 1) -> int:
+        error, data = self.ask(framing.READ, struct.pack("<HH", address, size), packet_id)
+        assert error & 0x7F == 0, f"error {error}"
+        return int.from_bytes(data, "little", signed=True)
+
+    def write(self, address: int, value: int, size: int, packet_id: int = 1) -> int:
+        """The error byte."""
+        data = address.to_bytes(2, "little") + value.to_bytes(size, "little", signed=value < 0)
+        return self.ask(framing.WRITE, data, packet_id)[0]
+
+    def later(self, seconds: float) -> None:
+        self.t += seconds
+        self.bus.advance(self.t)
 
 
 class DirectPort(SerialPort):

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import struct
-import threading
 
 import pytest
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from softfinger.tools.cli import main
+from tests.harness.emulated import emulated, send
 from tests.harness.servos import RADIAN
 
 UNIT = by_name("XM430-W350").current_unit
@@ -130,23 +128,14 @@ def test_silence_and_the_watchdog() -> None:
 
 
 def test_a_report_through_the_control_socket(tmp_path, capsys) -> None:
-    emulator = Emulator(Settings.model_validate({"tactile": {"backend": "none"}}), tmp_path)
-    ready = threading.Event()
-    runner = threading.Thread(target=emulator.run, args=(ready.set,), daemon=True)
-    runner.start()
-    try:
-        assert ready.wait(200)
-        send = ["emulate", "--dir", str(tmp_path), "--send"]
-        assert main([*send, "undervoltage=2 report forget"]) == 0
+    settings = Settings.model_validate({"tactile": {"backend": "none"}})
+    with emulated(tmp_path, settings=settings):
+        assert send(tmp_path, "undervoltage=2 report forget") == 0
         told = json.loads(capsys.readouterr().out)
         assert [each["id"] for each in told["servos"]] == [1, 2]
         assert told["servos"][0]["torque"] is False
         assert told["monotonic"] > told["t"] > 0.0
-        assert main([*send, "report wrong"]) == 1
+        assert send(tmp_path, "report wrong") == 1
         assert "'wrong'" in capsys.readouterr().err
-        assert main([*send, "forget"]) == 0
+        assert send(tmp_path, "forget") == 0
         assert capsys.readouterr().out == ""
-    finally:
-        emulator.stop()
-        runner.join()
-        emulator.close()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,11 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
-from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.tools import doctor
 from softfinger.tools.cli import main
 from tests.harness.descendants import ending
+from tests.harness.emulated import HIL, emulated
 from tests.harness.gateway import Served
-
-HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 
 
 class Hand:
@@ -37,11 +35,9 @@ class Hand:
     def __init__(self, folder: Path, **options: Any) -> None:
         self.folder = folder
         self.settings = load(HIL, folder)
-        self.emulator = Emulator(self.settings, folder, **options)
-        ready = threading.Event()
-        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,), daemon=True)
-        self._thread.start()
-        assert ready.wait(200)
+        self._stack = contextlib.ExitStack()
+        running = emulated(folder, settings=self.settings, **options)
+        self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:
         """What the servos hold, but for the registers that live."""
@@ -55,13 +51,11 @@ class Hand:
         return status, capsys.readouterr().out.splitlines()
 
     def close(self) -> None:
-        self.emulator.stop()
-        self._thread.join()
-        self.emulator.close()
+        self._stack.close()
 
 
 @pytest.fixture
-def emulated(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
+def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
     made: list[Hand] = []
 
     def start(**options: Any) -> Hand:
@@ -81,15 +75,15 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = hand.check_servos
     monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.5, 0.5))
     # The emulator shares this process's interpreter lock.
-    monkeypatch.setattr(provisioning, "PING_TIMEOUT", 0.5)
+    monkeypatch.setattr(provisioning, "PING_TIMEOUT", 0.2)
 
 
 def with_status(lines: list[str], status: str) -> list[str]:
     return [line[7:] for line in lines if line.startswith(status)]
 
 
-def test_factory_new_servos_fail_and_are_mended_only_when_asked(emulated, capsys):
-    hand = emulated(prepared=False)
+def test_factory_new_servos_fail_and_are_mended_only_when_asked(hands, capsys):
+    hand = hands(prepared=False)
     before = hand.registers()
     status, lines = hand.doctor(capsys)
     assert status == 1
@@ -110,8 +104,8 @@ def test_factory_new_servos_fail_and_are_mended_only_when_asked(emulated, capsys
     assert hand.registers() == before
 
 
-def test_boards_are_listened_to(emulated, capsys):
-    hand = emulated()
+def test_boards_are_listened_to(hands, capsys):
+    hand = hands()
     status, lines = hand.doctor(capsys)
     assert status == 0, lines
     for side in ("left", "right"):
@@ -124,8 +118,8 @@ def test_boards_are_listened_to(emulated, capsys):
     assert "       → set tactile.rows and tactile.cols" in lines
 
 
-def test_a_missing_port_and_a_missing_servo(emulated, capsys):
-    hand = emulated()
+def test_a_missing_port_and_a_missing_servo(hands, capsys):
+    hand = hands()
     hand.emulator.request("silent=2 right:unplug")
     status, lines = hand.doctor(capsys)
     assert status == 1
@@ -135,8 +129,8 @@ def test_a_missing_port_and_a_missing_servo(emulated, capsys):
     assert "note   found: no other servo answers at any rate" in lines
 
 
-def test_servos_at_another_rate_are_found(emulated, capsys):
-    hand = emulated(baud=1_000_000)
+def test_servos_at_another_rate_are_found(hands, capsys):
+    hand = hands(baud=1_000_000)
     status, lines = hand.doctor(capsys)
     assert status == 1
     assert "note   found: ID 1 at 1000000 baud: XM430-W350, firmware 48" in lines
@@ -157,8 +151,8 @@ def test_servos_at_another_rate_are_found(emulated, capsys):
     assert "no such port" in capsys.readouterr().err
 
 
-def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(emulated, capsys):
-    hand = emulated(ids=(1, 7))
+def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(hands, capsys):
+    hand = hands(ids=(1, 7), baud=2_000_000)
     servo = hand.emulator._servos.bus.servos[1]
     status, lines = hand.doctor(capsys)
     assert (status, servo.id) == (1, 7)

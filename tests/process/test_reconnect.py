@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.simulation.emulator.emulator import Emulator
 from tests.conftest import until
+from tests.harness.emulated import emulated
 
 
 class Rig:
@@ -30,11 +30,8 @@ class Rig:
         }
         own = {"servos": servos, "tactile": {"backend": "none"}, "loop": {"rate": 100.0}}
         self.settings = Settings.model_validate(own | sections)
-        self.emulator = Emulator(self.settings, folder)
-        ready = threading.Event()
-        self._thread = threading.Thread(target=self.emulator.run, args=(ready.set,), daemon=True)
-        self._thread.start()
-        assert ready.wait(200.0)
+        self._stack = contextlib.ExitStack()
+        self.emulator = self._stack.enter_context(emulated(folder, settings=self.settings))
         self.events: list[tuple[str, str, str]] = []
         self.daemon = Daemon(
             self.settings, wire=False, on_event=lambda *event: self.events.append(event)
@@ -75,7 +72,7 @@ class Rig:
 
     def unplug(self) -> None:
         assert self.emulator.request("unplug") == "ok"
-        until(lambda: self.emulator._servos.fileno() < 0)
+        until(lambda: not self.emulator._servos.plugged)
 
     def plug(self) -> None:
         assert self.emulator.request("plug") == "ok"
@@ -83,9 +80,7 @@ class Rig:
 
     def close(self) -> None:
         self.daemon.close()
-        self.emulator.stop()
-        self._thread.join()
-        self.emulator.close()
+        self._stack.close()
 
 
 @pytest.fixture

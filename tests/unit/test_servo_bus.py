@@ -1,8 +1,10 @@
-"""The emulated servo bus: published exchanges byte for byte, and a servo's rules."""
+"""The emulated servo bus: published exchanges byte for byte, who answers, faults on the line."""
 
 from __future__ import annotations
 
+import random
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,56 +13,18 @@ from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.control_table import MODELS, by_name
 from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
+from softfinger.daemon.simulation.servo_model.collision import collide, overlay
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Parser, frame
-from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from softfinger.daemon.simulation.servo_model.servo_health import OVERLOAD_TIME
 from tests.fuzz.servo_bus import fuzz
-from tests.harness.servos import RADIAN, hand_bus, make_bus
-
-FORMS = {1: "<B", 2: "<H", 4: "<I"}
+from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus
 
 
-class Client:
-    """Talks to a bus at its own time; parses the replies with the independent parser."""
-
-    def __init__(self, bus: ServoBus) -> None:
-        self.bus = bus
-        self.t = 0.001
-
-    def send(self, packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-        return self.bus.feed(frame(packet_id, instruction, parameters), self.t)
-
-    def ask(
-        self, instruction: int, parameters: bytes = b"", packet_id: int = 1
-    ) -> tuple[int, bytes]:
-        """(error byte, data) of the one reply."""
-        (packet,) = Parser().feed(self.send(packet_id, instruction, parameters), 0.0)
-        assert packet.valid
-        assert packet.instruction == framing.STATUS
-        return packet.parameters[0], packet.parameters[1:]
-
-    def read(self, address: int, size: int, packet_id: int = 1) -> int:
-        error, data = self.ask(framing.READ, struct.pack("<HH", address, size), packet_id)
-        assert error & 0x7F == 0, f"error {error}"
-        return int.from_bytes(data, "little", signed=True)
-
-    def write(self, address: int, value: int, size: int, packet_id: int = 1) -> int:
-        """The error byte."""
-        data = address.to_bytes(2, "little") + value.to_bytes(size, "little", signed=value < 0)
-        return self.ask(framing.WRITE, data, packet_id)[0]
-
-    def later(self, seconds: float) -> None:
-        self.t += seconds
-        self.bus.advance(self.t)
-
-
-def client(**options: object) -> Client:
-    return Client(make_bus(**options))  # type: ignore[arg-type]
+def client(**options: Any) -> BusClient:
+    return BusClient(make_bus(**options))
 
 
 def hexes(*texts: str) -> bytes:
@@ -69,58 +33,72 @@ def hexes(*texts: str) -> bytes:
 
 # --- published exchanges -----------------------------------------------------------------------
 
-
-def test_published_pings() -> None:
-    bus = make_bus(firmware=38)
-    assert bus.feed(hexes("FFFFFD00010300 01 194E"), 0.0) == hexes(
-        "FFFFFD00010700 55 00 060426 655D"
-    )
-    assert bus.feed(hexes("FFFFFD00FE0300 01 3142"), 0.0) == hexes(
-        "FFFFFD00010700 55 00 060426 655D", "FFFFFD00020700 55 00 060426 6F6D"
-    )
-
-
-def test_published_read_write_and_sync_read() -> None:
-    bus = make_bus(counts=(166, 2079))
-    assert bus.feed(hexes("FFFFFD00010700 02 84000400 1D15"), 0.0) == hexes(
-        "FFFFFD00010800 55 00 A6000000 8CC0"
-    )
-    assert bus.feed(hexes("FFFFFD00010900 03 740000020000 CA89"), 0.0) == hexes(
-        "FFFFFD00010400 55 00 A10C"
-    )
-    assert bus.servos[0].table.get(reg.GOAL_POSITION) == 512
-    assert bus.feed(hexes("FFFFFD00FE0900 82 840004000102 CEFA"), 0.0) == hexes(
-        "FFFFFD00010800 55 00 A6000000 8CC0", "FFFFFD00020800 55 00 1F080000 BABE"
-    )
-    assert bus.feed(hexes("FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287"), 0.0) == b""
-    assert [servo.table.get(reg.GOAL_POSITION) for servo in bus.servos] == [150, 170]
-
-
-def test_published_reg_write_and_action() -> None:
-    bus = make_bus()
-    done = hexes("FFFFFD00010400 55 00 A10C")
-    before = bus.servos[0].table.get(reg.GOAL_VELOCITY)
-    assert bus.feed(hexes("FFFFFD00010900 04 6800C8000000 AE8E"), 0.0) == done
-    assert bus.servos[0].table.get(reg.GOAL_VELOCITY) == before
-    assert bus.servos[0].table.get(reg.REGISTERED_INSTRUCTION) == 1
-    assert bus.feed(hexes("FFFFFD00010300 05 02CE"), 0.0) == done
-    assert bus.servos[0].table.get(reg.GOAL_VELOCITY) == 200
-    assert bus.servos[0].table.get(reg.REGISTERED_INSTRUCTION) == 0
+DONE = "FFFFFD00010400 55 00 A10C"
+XC330 = {"model": "XC330-T288"}
+THREE = {**XC330, "ids": (3, 7, 4), "counts": (166, 2079, 1023)}
 
 
 @pytest.mark.parametrize(
-    "request_packet",
+    ("options", "asked", "answers"),
     [
-        "FFFFFD00010400 06 01 A1E6",
-        "FFFFFD00010300 08 2F4E",
-        "FFFFFD00010800 10 0144584C22 B1DC",
-        "FFFFFD00010800 20 014354524C 16F5",
+        ({"firmware": 38}, "010300 01 194E", ["FFFFFD00010700 55 00 060426 655D"]),
+        (
+            {"firmware": 38},
+            "FE0300 01 3142",
+            ["FFFFFD00010700 55 00 060426 655D", "FFFFFD00020700 55 00 060426 6F6D"],
+        ),
+        (
+            {"counts": (166, 0)},
+            "010700 02 84000400 1D15",
+            ["FFFFFD00010800 55 00 A6000000 8CC0"],
+        ),
+        (
+            {"counts": (166, 2079)},
+            "FE0900 82 840004000102 CEFA",
+            ["FFFFFD00010800 55 00 A6000000 8CC0", "FFFFFD00020800 55 00 1F080000 BABE"],
+        ),
+        (
+            THREE,
+            "FE0A00 8A 84000400 030704 20F2",
+            [
+                "FFFFFD00FE1900 55 00 03 A6000000 8408",
+                "00 07 1F080000 16CA",
+                "00 04 FF030000 D19E",
+            ],
+        ),
+        (XC330, "010400 06 01 A1E6", [DONE]),
+        (XC330, "010300 08 2F4E", [DONE]),
+        (XC330, "010800 10 0144584C22 B1DC", [DONE]),
+        (XC330, "010800 20 014354524C 16F5", [DONE]),
     ],
-    ids=["factory reset", "reboot", "clear", "backup"],
+    ids=[
+        "ping",
+        "broadcast ping",
+        "read",
+        "sync read",
+        "fast sync read",
+        "factory reset",
+        "reboot",
+        "clear",
+        "backup",
+    ],
 )
-def test_published_exchanges_that_end_with_a_bare_status(request_packet: str) -> None:
-    bus = make_bus(model="XC330-T288")
-    assert bus.feed(hexes(request_packet), 0.0) == hexes("FFFFFD00010400 55 00 A10C")
+def test_published_exchanges(options: dict[str, Any], asked: str, answers: list[str]) -> None:
+    assert make_bus(**options).feed(hexes("FFFFFD00", asked), 0.0) == hexes(*answers)
+
+
+def test_published_writes() -> None:
+    bus = make_bus()
+    left = bus.servos[0].table
+    assert bus.feed(hexes("FFFFFD00010900 03 740000020000 CA89"), 0.0) == hexes(DONE)
+    assert left.get(reg.GOAL_POSITION) == 512
+    assert bus.feed(hexes("FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287"), 0.0) == b""
+    assert [servo.table.get(reg.GOAL_POSITION) for servo in bus.servos] == [150, 170]
+    before = left.get(reg.GOAL_VELOCITY)
+    assert bus.feed(hexes("FFFFFD00010900 04 6800C8000000 AE8E"), 0.0) == hexes(DONE)
+    assert (left.get(reg.GOAL_VELOCITY), left.get(reg.REGISTERED_INSTRUCTION)) == (before, 1)
+    assert bus.feed(hexes("FFFFFD00010300 05 02CE"), 0.0) == hexes(DONE)
+    assert (left.get(reg.GOAL_VELOCITY), left.get(reg.REGISTERED_INSTRUCTION)) == (200, 0)
 
 
 def test_published_bulk_read_and_bulk_write() -> None:
@@ -138,14 +116,6 @@ def test_published_bulk_read_and_bulk_write() -> None:
     assert bus.servos[1].table.get(reg.TEMPERATURE_LIMIT) == 80
 
 
-def test_published_fast_sync_read() -> None:
-    bus = make_bus("XC330-T288", (3, 7, 4), counts=(166, 2079, 1023))
-    request = hexes("FFFFFD00FE0A00 8A 84000400 030704 20F2")
-    assert bus.feed(request, 0.0) == hexes(
-        "FFFFFD00FE1900 55 00 03 A6000000 8408", "00 07 1F080000 16CA", "00 04 FF030000 D19E"
-    )
-
-
 def test_published_fast_bulk_read() -> None:
     bus = make_bus("XC330-T288", (3, 7, 4), counts=(166, 0, 0))
     bus.servos[2].health.temperature = 31.0
@@ -158,7 +128,7 @@ def test_published_fast_bulk_read() -> None:
     )
 
 
-# --- who answers, and when ---------------------------------------------------------------------
+# --- who answers, and when ---
 
 
 @pytest.mark.parametrize(
@@ -240,386 +210,40 @@ def test_servos_at_another_rate_hear_nothing() -> None:
     assert len(c.bus.feed(ping, c.t, baud=1_000_000)) == 14
 
 
-# --- access rights and limits ------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("address", "value", "size", "error"),
-    [
-        (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
-        (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
-        (14, 1, 1, framing.ACCESS),  # no such register
-        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # within a register
-        (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
-        (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
-        (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
-        (reg.OPERATING_MODE, 2, 1, framing.DATA_RANGE),
-        (reg.ID, 253, 1, framing.DATA_RANGE),
-        (reg.GOAL_POSITION, 4096, 4, framing.DATA_LIMIT),
-        (reg.GOAL_POSITION, -1, 4, framing.DATA_LIMIT),
-        (reg.GOAL_VELOCITY, 331, 4, framing.DATA_LIMIT),
-        (reg.GOAL_VELOCITY, -330, 4, framing.OK),
-        (reg.GOAL_CURRENT, -1193, 2, framing.OK),
-        (reg.GOAL_CURRENT, 1194, 2, framing.DATA_RANGE),
-        (reg.MIN_POSITION_LIMIT, 4095, 4, framing.OK),
-        (reg.LED, 1, 1, framing.OK),
-        (660, 7, 1, framing.OK),  # indirect data of the second block
-        (661, 0, 2, framing.ACCESS),  # past the end
-    ],
-)
-def test_what_a_write_is_answered(address: int, value: int, size: int, error: int) -> None:
-    c = client(model="XM430-W210")
-    before = bytes(c.bus.servos[0].table.memory)
-    assert c.write(address, value, size) == error
-    if error:
-        assert bytes(c.bus.servos[0].table.memory) == before
-
-
-def test_configured_limits_bind() -> None:
-    c = client()
-    assert c.write(reg.CURRENT_LIMIT, 500, 2) == 0
-    assert c.write(reg.GOAL_CURRENT, 501, 2) == framing.DATA_LIMIT
-    assert c.write(reg.MAX_POSITION_LIMIT, 3000, 4) == 0
-    assert c.write(reg.GOAL_POSITION, 3001, 4) == framing.DATA_LIMIT
-    assert c.write(reg.MIN_POSITION_LIMIT, 3001, 4) == framing.DATA_LIMIT
-
-
-def test_eeprom_is_locked_while_torque_is_on() -> None:
-    c = client()
-    assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
-    assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == framing.ACCESS
-    assert c.write(reg.TORQUE_ENABLE, 0, 1) == 0
-    assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == 0
-
-
-def test_reading_past_the_table_and_reading_gaps() -> None:
-    c = client()
-    assert c.ask(framing.READ, struct.pack("<HH", 660, 3))[0] == framing.ACCESS
-    assert c.ask(framing.READ, struct.pack("<HH", 14, 6)) == (0, bytes(6))
-
-
-def test_unknown_instruction_and_action_without_one() -> None:
-    c = client()
-    assert c.ask(0x77)[0] == framing.INSTRUCTION_ERROR
-    assert c.ask(framing.ACTION)[0] == framing.INSTRUCTION_ERROR
-
-
-def test_a_model_without_current_sensing_has_no_current_registers() -> None:
-    c = client(model="XL430-W250")
-    assert c.write(reg.GOAL_CURRENT, 1, 2) == framing.ACCESS
-    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == framing.DATA_RANGE
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_factory_values(name: str) -> None:
-    c = client(model=name)
-    model = by_name(name)
-    assert c.read(reg.MODEL_NUMBER, 2) == model.number
-    assert c.read(reg.RETURN_DELAY_TIME, 1) & 0xFF == 250
-    assert c.read(reg.OPERATING_MODE, 1) == reg.POSITION_MODE
-    assert c.read(reg.VELOCITY_LIMIT, 4) == model.velocity_limit
-    assert c.read(reg.POSITION_P_GAIN, 2) == model.position_gains[2]
-    assert c.read(reg.TORQUE_ENABLE, 1) == 0
-    first, data, _ = model.indirect_blocks(model.firmware)[0]
-    assert c.read(first, 2) == data
-
-
-# --- indirect addresses ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("model", "firmware"), [("XM430-W210", 48), ("XL330-M288", 52), ("XL330-M288", 53)]
-)
-def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -> None:
-    c = client(model=model, firmware=firmware, counts=(166, 0))
-    address, data, _ = by_name(model).indirect_blocks(firmware)[0]
-    for i, target in enumerate((reg.LED, *range(reg.PRESENT_POSITION, reg.PRESENT_POSITION + 4))):
-        assert c.write(address + 2 * i, target, 2) == 0
-    assert c.write(data, 1, 1) == 0
-    assert c.bus.servos[0].table.get(reg.LED) == 1
-    assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, hexes("01 A6000000"))
-    assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
-    assert c.write(address, 20, 2) == framing.DATA_RANGE  # EEPROM can't be pointed to
-
-
-# --- torque, modes, motion ---------------------------------------------------------------------
-
-
-def test_current_based_position_mode_moves_within_its_current() -> None:
-    c = client(prepared=True)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_CURRENT, 100, 2)
-    c.write(reg.GOAL_POSITION, 400, 4)
-    currents = []
-    for _ in range(200):
-        c.later(0.005)
-        currents.append(c.read(reg.PRESENT_CURRENT, 2))
-    assert max(currents) <= 100
-    assert abs(c.read(reg.PRESENT_POSITION, 4) - 400) <= 15
-    assert c.read(reg.MOVING, 1) == 0
-
-
-def test_torque_off_lets_go() -> None:
-    c = client(prepared=True)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_POSITION, 300, 4)
-    c.later(0.5)
-    c.write(reg.TORQUE_ENABLE, 0, 1)
-    before = c.read(reg.PRESENT_POSITION, 4)
-    c.write(reg.GOAL_POSITION, 0, 4)
-    c.later(0.5)
-    assert abs(c.read(reg.PRESENT_POSITION, 4) - before) <= 1
-    assert c.read(reg.PRESENT_CURRENT, 2) == 0
-
-
-def test_current_mode_pushes_the_way_of_its_sign() -> None:
-    c = client()
-    c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_CURRENT, -80, 2)
-    c.later(0.3)
-    assert c.read(reg.PRESENT_VELOCITY, 4) < 0
-    assert c.read(reg.PRESENT_CURRENT, 2) == -80
-
-
-def test_velocity_mode_keeps_its_speed() -> None:
-    c = client()
-    c.write(reg.OPERATING_MODE, reg.VELOCITY_MODE, 1)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_VELOCITY, 60, 4)
-    c.later(1.0)
-    assert abs(c.read(reg.PRESENT_VELOCITY, 4) - 60) <= 2
-
-
-def test_pwm_mode_runs_up_to_its_share_of_the_no_load_speed() -> None:
-    c = client()
-    c.write(reg.OPERATING_MODE, reg.PWM_MODE, 1)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_PWM, 443, 2)
-    c.later(2.0)
-    speed = c.read(reg.PRESENT_VELOCITY, 4)
-    assert 0.3 * 330 < speed < 0.5 * 330
-
-
-def test_a_profile_takes_the_time_it_should() -> None:
-    c = client()
-    c.write(reg.PROFILE_VELOCITY, 50, 4)  # 11.45 rpm: 1024 counts take 1.31 s
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_POSITION, 1024, 4)
-    c.later(0.65)
-    half = c.read(reg.PRESENT_POSITION, 4)
-    assert abs(half - 508) < 60
-    assert c.read(reg.MOVING, 1) == 1
-    c.later(0.9)
-    assert abs(c.read(reg.PRESENT_POSITION, 4) - 1024) <= 5
-
-
-def test_time_based_profile() -> None:
-    c = client()
-    c.write(reg.DRIVE_MODE, 4, 1)
-    c.write(reg.PROFILE_VELOCITY, 2000, 4)  # ms
-    c.write(reg.PROFILE_ACCELERATION, 500, 4)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_POSITION, 1000, 4)
-    c.later(1.0)
-    assert abs(c.read(reg.POSITION_TRAJECTORY, 4) - 500) < 10
-    c.later(0.95)
-    assert c.read(reg.MOVING_STATUS, 1) & 2
-    c.later(0.1)
-    assert c.read(reg.POSITION_TRAJECTORY, 4) == 1000
-
-
-def test_a_mode_change_resets_goals_gains_and_profiles() -> None:
-    c = client(counts=(700, 0))
-    for address, value, size in (
-        (reg.POSITION_P_GAIN, 5, 2),
-        (reg.PROFILE_VELOCITY, 30, 4),
-        (reg.GOAL_CURRENT, 3, 2),
-        (reg.GOAL_PWM, 4, 2),
-    ):
-        assert c.write(address, value, size) == 0
-    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == 0
-    assert c.read(reg.POSITION_P_GAIN, 2) == 800
-    assert c.read(reg.PROFILE_VELOCITY, 4) == 0
-    assert c.read(reg.GOAL_CURRENT, 2) == 1193
-    assert c.read(reg.GOAL_PWM, 2) == 885
-    assert c.read(reg.GOAL_POSITION, 4) == 700
-
-
-def test_turns_are_kept_until_position_mode_or_clear() -> None:
-    c = client(prepared=True)
-    c.bus.plant.q[0] = 5000 * RADIAN
-    assert c.read(reg.PRESENT_POSITION, 4) == 5000
-    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == 0
-    assert c.read(reg.PRESENT_POSITION, 4) == 904
-    c.bus.plant.q[0] = 9000 * RADIAN
-    assert c.read(reg.PRESENT_POSITION, 4) == 4904
-    assert c.write(reg.OPERATING_MODE, reg.POSITION_MODE, 1) == 0
-    assert c.read(reg.PRESENT_POSITION, 4) == 808
-
-
-def test_clear_fails_while_the_shaft_moves() -> None:
-    c = client()
-    c.bus.plant.dq[0] = 3.0
-    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == framing.RESULT_FAIL
-
-
-def test_homing_offset_and_reverse_mode() -> None:
-    c = client(counts=(100, 0))
-    assert c.write(reg.HOMING_OFFSET, -30, 4) == 0
-    assert c.read(reg.PRESENT_POSITION, 4) == 70
-    assert c.write(reg.DRIVE_MODE, 1, 1) == 0
-    assert c.read(reg.PRESENT_POSITION, 4) == -130
-
-
-def test_realtime_tick_wraps() -> None:
-    c = client()
-    c.later(32.766 - c.t)
-    assert c.read(reg.REALTIME_TICK, 2) == 32766
-    c.later(0.003)
-    assert c.read(reg.REALTIME_TICK, 2) == 1
-
-
-# --- bus watchdog ------------------------------------------------------------------------------
-
-
-def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
-    c = client(prepared=True)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.BUS_WATCHDOG, 5, 1)
-    c.write(reg.GOAL_CURRENT, 40, 2)
-    c.write(reg.GOAL_POSITION, 4000, 4)
-    for _ in range(20):  # packets keep it going
-        c.later(0.09)
-        assert c.read(reg.BUS_WATCHDOG, 1) == 5
-    assert c.bus.plant.dq[0] > 0.0
-    c.later(0.11)
-    assert c.bus.servos[0].table.memory[reg.BUS_WATCHDOG] == 0xFF
-    c.later(0.5)
-    stood = c.read(reg.PRESENT_POSITION, 4)
-    assert c.bus.plant.dq[0] == 0.0
-    assert c.read(reg.TORQUE_ENABLE, 1) == 1
-    assert c.write(reg.GOAL_POSITION, 10, 4) == framing.DATA_RANGE
-    assert c.write(reg.BUS_WATCHDOG, 5, 1) == framing.DATA_RANGE
-    assert c.write(reg.BUS_WATCHDOG, 0, 1) == 0
-    assert c.write(reg.GOAL_POSITION, stood + 10, 4) == 0
-
-
-def test_bus_watchdog_sleeps_while_torque_is_off() -> None:
-    c = client()
-    c.write(reg.BUS_WATCHDOG, 1, 1)
-    c.later(5.0)
-    assert c.read(reg.BUS_WATCHDOG, 1) == 1
-
-
-# --- hardware errors ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
-)
-def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
-    c = client(model="XL330-M288")  # its shutdown mask has all three
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.bus.fault(fault, c.t)
-    c.later(0.02)
-    error, data = c.ask(framing.READ, struct.pack("<HH", reg.HARDWARE_ERROR_STATUS, 1))
-    assert error == framing.ALERT
-    assert data[0] == 1 << bit
-    assert c.bus.servos[0].torque_on is False
-    assert c.write(reg.TORQUE_ENABLE, 1, 1) == framing.ALERT | framing.RESULT_FAIL
-    c.bus.fault("recover=1", c.t)
-    assert c.ask(framing.REBOOT)[0] == framing.ALERT
-    assert c.send(1, framing.PING) == b""
-    c.later(REBOOT_TIME)
-    assert c.read(reg.HARDWARE_ERROR_STATUS, 1) == 0
-    assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
-
-
-def test_an_error_outside_the_shutdown_mask_only_alerts() -> None:
-    c = client()  # XM430: mask 52 lacks the voltage bit
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.bus.fault("undervoltage=1", c.t)
-    c.later(0.02)
-    assert c.write(reg.LED, 1, 1) == framing.ALERT
-    assert c.bus.servos[0].torque_on is True
-
-
-def test_overload_after_its_time_at_the_current_limit() -> None:
-    c = client()
-    c.write(reg.CURRENT_LIMIT, 30, 2)
-    c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_CURRENT, 30, 2)
-    c.later(OVERLOAD_TIME - 0.1)
-    assert c.read(reg.HARDWARE_ERROR_STATUS, 1) == 0
-    c.later(0.3)
-    assert c.bus.servos[0].table.memory[reg.HARDWARE_ERROR_STATUS] == 1 << 5
-    assert c.bus.servos[0].torque_on is False
-
-
-# --- reboot, reset, backup ---------------------------------------------------------------------
-
-
-def test_reboot_resets_ram_and_keeps_eeprom() -> None:
-    c = client(counts=(1234, 0))
-    for address, value, size in (
-        (reg.RETURN_DELAY_TIME, 3, 1),
-        (reg.LED, 1, 1),
-        (reg.PROFILE_VELOCITY, 9, 4),
-        (reg.TORQUE_ENABLE, 1, 1),
-    ):
-        assert c.write(address, value, size) == 0
-    c.ask(framing.REBOOT)
-    c.later(REBOOT_TIME - 0.01)
-    assert c.send(1, framing.PING) == b""
-    c.later(0.01)
-    assert c.read(reg.RETURN_DELAY_TIME, 1) == 3
-    assert (
-        c.read(reg.LED, 1) == c.read(reg.PROFILE_VELOCITY, 4) == c.read(reg.TORQUE_ENABLE, 1) == 0
-    )
-    assert c.read(reg.GOAL_POSITION, 4) == 1234
-
-
-@pytest.mark.parametrize(
-    ("option", "new_id", "baud"), [(0xFF, 1, 1), (1, 5, 1), (2, 5, 3)], ids=["all", "id", "baud"]
-)
-def test_factory_reset(option: int, new_id: int, baud: int) -> None:
-    c = client(ids=(5, 6))
-    c.write(reg.BAUD_RATE, 3, 1, packet_id=5)
-    c.write(reg.RETURN_DELAY_TIME, 3, 1, packet_id=5)
-    assert c.ask(framing.FACTORY_RESET, bytes((option,)), packet_id=5)[0] == 0
-    c.later(REBOOT_TIME)
-    assert c.read(reg.BAUD_RATE, 1, packet_id=new_id) == baud
-    assert c.read(reg.RETURN_DELAY_TIME, 1, packet_id=new_id) & 0xFF == 250
-
-
-def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
-    c = client(ids=(5, 6))
-    assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
-    assert c.ask(framing.PING, packet_id=5)[0] == 0
-    assert c.ask(framing.FACTORY_RESET, b"\x07", packet_id=5)[0] == framing.DATA_RANGE
-
-
-def test_backup_and_restore() -> None:
-    c = client()
-    store, restore = b"\x01CTRL", b"\x02CTRL"
-    assert c.ask(framing.BACKUP, restore)[0] == framing.RESULT_FAIL  # nothing stored yet
-    c.write(reg.RETURN_DELAY_TIME, 11, 1)
-    c.write(reg.STARTUP_CONFIGURATION, 2, 1)
-    c.write(reg.POSITION_P_GAIN, 321, 2)
-    assert c.ask(framing.BACKUP, store)[0] == 0
-    assert c.read(reg.BACKUP_READY, 1) == 1
-    c.write(reg.RETURN_DELAY_TIME, 99, 1)
-    assert c.ask(framing.BACKUP, restore)[0] == 0
-    c.later(REBOOT_TIME)
-    assert c.read(reg.RETURN_DELAY_TIME, 1) == 11
-    assert c.read(reg.POSITION_P_GAIN, 2) == 321  # RAM too, as the startup configuration asks
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    assert c.ask(framing.BACKUP, store)[0] == framing.RESULT_FAIL
-
-
-# --- faults on demand --------------------------------------------------------------------------
+# --- servos that answer at once ------------------------------------------------------------------
+
+
+def test_a_low_bit_wins() -> None:
+    assert overlay([(0, b"\x0f\xff"), (0, b"\x3c\xf0")]) == b"\x0c\xf0"
+    assert overlay([(0, b"\x55")]) == b"\x55"
+    assert overlay([(3, b"abc"), (3, b"abc")]) == b"abc"
+    alone = bytes(range(256))
+    assert overlay([(0, alone)]) == alone
+
+
+def test_shifted_bits_are_garbled() -> None:
+    reply = framing.status(1, 0, b"\xfc\x03\x30")
+    whole = [overlay([(0, reply), (shift, reply)]) == reply for shift in range(10)]
+    assert whole == [True] + [False] * 9
+    # At a slow rate a bit is longer than the servos' jitter.
+    source = random.Random(3)
+    assert any(collide([reply, reply], 9600, source) == reply for _ in range(5))
+    assert not any(collide([reply, reply], 4_000_000, source) == reply for _ in range(5))
+
+
+def test_servos_that_share_an_id_answer_at_once() -> None:
+    bus = make_bus(ids=(1, 1, 2), counts=(100, 200, 300))
+    read = frame(1, framing.READ, b"\x84\x00\x04\x00")
+    replies = [bus.feed(read, 0.0) for _ in range(8)]
+    sound = [framing.status(1, 0, (100 * k).to_bytes(4, "little")) for k in (1, 2)]
+    assert not any(reply in sound for reply in replies)
+    assert len(bus.feed(frame(2, framing.PING), 0.0)) == 14
+    assert bus.feed(frame(BROADCAST, framing.PING), 0.0)[-14:-9] == b"\xff\xff\xfd\x00\x02"
+    group = frame(BROADCAST, framing.SYNC_READ, b"\x84\x00\x04\x00\x02\x01")
+    assert bus.feed(group, 0.0)[:5] == b"\xff\xff\xfd\x00\x02"
+
+
+# --- faults on demand ------------------------------------------------------------------------
 
 
 def test_reply_faults_do_what_they_say_and_are_seeded() -> None:
@@ -659,14 +283,14 @@ def test_faults_that_make_no_sense_are_refused(text: str) -> None:
         make_bus().fault(text, 0.0)
 
 
-# --- the hand's mapping ------------------------------------------------------------------------
+# --- the hand's mapping ----------------------------------------------------------------------
 
 
 def test_directions_and_zeros_of_the_settings() -> None:
     plant = FreeJoints(2)
     plant.q[:] = 0.3
     bus = ServoBus.from_settings(Settings(), plant)
-    c = Client(bus)
+    c = BusClient(bus)
     turn = round(0.3 / RADIAN)
     assert c.read(reg.PRESENT_POSITION, 4, 1) == 2048 + turn
     assert c.read(reg.PRESENT_POSITION, 4, 2) == 2048 - turn
@@ -689,7 +313,7 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
     assert run() == run()
 
 
-# --- anything at all ---------------------------------------------------------------------------
+# --- anything at all -------------------------------------------------------------------------
 
 
 @settings(max_examples=150)

@@ -1,0 +1,104 @@
+"""Emulated hands for the tests: one in a thread of this process, and the SDK on its servos."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
+
+from softfinger.daemon.clock import RealClock
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.emulator.emulator import Emulator
+from softfinger.daemon.tactile.flexitac import FlexiTac
+from softfinger.tools.cli import main
+
+HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+READY_WITHIN = 200.0  # s; kernels may have to be compiled
+
+
+@contextlib.contextmanager
+def emulated(
+    folder: Path, *faults: str, settings: Settings | None = None, **options: Any
+) -> Iterator[Emulator]:
+    """An emulator in a thread of this process, ready."""
+    made = Emulator(settings or Settings(), folder, faults=faults, **options)
+    ready = threading.Event()
+    runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
+    runner.start()
+    try:
+        assert ready.wait(READY_WITHIN)
+        yield made
+    finally:
+        made.stop()
+        runner.join()
+        made.close()
+
+
+class PatientPort(PortHandler):
+    """Waits for a reply longer than the SDK's 34 ms, which a busy machine may exceed."""
+
+    patience = 60_000.0  # ms
+
+    def setPacketTimeout(self, _: int) -> None:
+        self.setPacketTimeoutMillis(self.patience)
+
+
+class SdkServos:
+    """The maker's own SDK on the servos' port."""
+
+    def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
+        self.port = PatientPort(str(folder / "servos"))
+        assert self.port.openPort()
+        assert self.port.setBaudRate(baud)
+        self.packets = PacketHandler(2.0)
+
+    def ping(self, servo: int) -> int:
+        """The model."""
+        model, result, _ = self.packets.ping(self.port, servo)
+        assert result == COMM_SUCCESS
+        return int(model)
+
+    def silent(self, servo: int) -> bool:
+        """No reply comes soon."""
+        self.port.patience = 100.0
+        _, result, _ = self.packets.ping(self.port, servo)
+        self.port.patience = PatientPort.patience
+        return bool(result == COMM_RX_TIMEOUT)
+
+    def read(self, servo: int, address: int, size: int) -> int:
+        read = {
+            1: self.packets.read1ByteTxRx,
+            2: self.packets.read2ByteTxRx,
+            4: self.packets.read4ByteTxRx,
+        }[size]
+        value, result, error = read(self.port, servo, address)
+        assert (result, error) == (COMM_SUCCESS, 0)
+        return int(value)
+
+    def write(self, servo: int, address: int, size: int, value: int) -> None:
+        write = {
+            1: self.packets.write1ByteTxRx,
+            2: self.packets.write2ByteTxRx,
+            4: self.packets.write4ByteTxRx,
+        }[size]
+        assert write(self.port, servo, address, value) == (COMM_SUCCESS, 0)
+
+    def close(self) -> None:
+        self.port.closePort()
+
+
+def board(folder: Path, finger: int, timeout: float = 2.0, **changes: object) -> FlexiTac:
+    """The daemon's own backend on one of the stand-in hand's boards."""
+    tactile = load(HIL, folder).tactile
+    tactile = tactile.model_copy(update={"open_timeout": timeout, **changes})
+    return FlexiTac(tactile, RealClock(), finger)
+
+
+def send(folder: Path, words: str) -> int:
+    """The exit status of ``softfinger emulate --send``."""
+    return main(["emulate", "--dir", str(folder), "--send", words])

@@ -1,0 +1,218 @@
+"""An emulated hand's boards, scenes and faults, and the control socket that sets them."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.backends import make_sensor
+from softfinger.daemon.clock import RealClock
+from softfinger.daemon.errors import TactileError
+from softfinger.daemon.perception.finger_model import make_estimator
+from softfinger.daemon.profile.factory import make_material
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.simulation.emulator.link_folder import LINKS
+from softfinger.daemon.tactile.flexitac import FlexiTac
+from tests.conftest import until
+from tests.harness.emulated import SdkServos, board, emulated, send
+
+
+def test_a_scene_has_only_the_ports_it_needs(tmp_path):
+    (tmp_path / "one.toml").write_text(
+        'scene.fingers = ["right"]\nservos.backend = "none"\n[tactile]\nrows = 16\ncols = 8\n'
+        'backend = "flexitac"\n'
+    )
+    settings = load(tmp_path / "one.toml", tmp_path)
+    with emulated(tmp_path / "hand", settings=settings):
+        names = {path.name for path in (tmp_path / "hand").iterdir()}
+        assert names & set(LINKS) == {"tactile-right"}
+        sensor = board(tmp_path / "hand", 1, rows=16, cols=8)
+        sensor.open()
+        sensor.close()
+
+
+@pytest.mark.parametrize(("backend", "full"), [("glove", 1023), ("cobs", 65535)])
+def test_each_serial_framing_is_spoken(tmp_path, backend, full):
+    # Without servos the object is pressed on the tips to and fro.
+    (tmp_path / "one.toml").write_text(
+        f"""scene.fingers = ["left"]
+servos.backend = "none"
+[tactile]
+backend = "{backend}"
+port = ["{{dir}}/tactile-left", ""]
+rows = 32
+cols = 32
+pitch = 0.0018125
+pascal_per_count = 200.0
+full_count = {full}
+"""
+    )
+    settings = load(tmp_path / "one.toml", tmp_path / "hand")
+    with emulated(tmp_path / "hand", settings=settings):
+        sensor = make_sensor(settings, RealClock(), None, 0)
+        sensor.open()
+        frames = [sensor.latest().data]
+        until(lambda: (frames.append(sensor.latest().data), frames[-1].max() > 200)[1])
+        estimator = make_estimator(settings, make_material(settings.material))
+        estimate = estimator.update(frames[-1], 200.0)
+        assert estimate.valid
+        assert estimate.contact
+        assert 3e-4 < estimate.d < 8e-3
+        assert abs(estimate.tilt_x) < 0.05
+        assert sensor.counters()["resyncs"] <= 1  # the first packet may be half a one
+        sensor.close()
+
+
+def test_board_faults_reach_the_daemons_backend(tmp_path):
+    with emulated(tmp_path, "left:wrong-size", "right:torn=0.5"):
+        with pytest.raises(TactileError, match=r"256 cells.*1024"):
+            board(tmp_path, 0).open()
+        sensor = board(tmp_path, 1)
+        sensor.open()
+        until(lambda: sensor.counters()["resyncs"] >= 3)
+        assert sensor.latest().data.mean() < 10
+        sensor.close()
+
+
+def test_silent_frozen_and_noisy_boards(tmp_path):
+    with emulated(tmp_path, "left:frozen", "right:noisy=0.3"):
+        left, right = board(tmp_path, 0), board(tmp_path, 1)
+        right.open()
+        left.open()
+        kept = left.latest().data
+        seq = left.latest().seq
+        until(lambda: left.latest().seq > seq + 10)
+        assert np.array_equal(left.latest().data, kept)
+        until(lambda: right.counters()["resyncs"] > 0)
+        left.close()
+        right.close()
+        assert send(tmp_path, "right:silent") == 0
+        # What it had sent before may still be read.
+        until(lambda: "no byte came" in why_not_open(board(tmp_path, 1, timeout=0.1)))
+
+
+def why_not_open(sensor: FlexiTac) -> str:
+    try:
+        sensor.open()
+    except TactileError as error:
+        return str(error)
+    sensor.close()
+    return ""
+
+
+def test_servo_faults_reach_the_sdk(tmp_path):
+    with emulated(tmp_path, "silent=2"):
+        servos = SdkServos(tmp_path)
+        assert servos.ping(1) == 1020
+        assert servos.silent(2)
+        servos.close()
+    with emulated(tmp_path, "unplug"):
+        until(lambda: not (tmp_path / "servos").exists())
+        assert send(tmp_path, "plug") == 0
+        until((tmp_path / "servos").exists)
+        servos = SdkServos(tmp_path)
+        assert servos.ping(1) == 1020
+        servos.close()
+
+
+def test_a_board_that_nobody_reads_disturbs_nothing(tmp_path):
+    with emulated(tmp_path) as made:
+        boards = list(made._boards.values())
+        until(lambda: all(board.dropped > 20 for board in boards))
+        servos = SdkServos(tmp_path)
+        assert servos.ping(1) == 1020
+        servos.close()
+        sensor = board(tmp_path, 0)
+        sensor.open()
+        assert sensor.counters()["skipped_bytes"] < 2 * 1026
+        sensor.close()
+    assert not os.path.lexists(tmp_path / "servos")
+
+
+def test_faults_while_it_runs(tmp_path, capsys):
+    with emulated(tmp_path):
+        servos = SdkServos(tmp_path)
+        assert send(tmp_path, "silent=1 drop=1") == 0
+        assert servos.silent(1)
+        assert servos.silent(2)
+        assert send(tmp_path, "well") == 0
+        assert servos.silent(1)
+        assert servos.ping(2) == 1020
+        assert send(tmp_path, "answer=1") == 0
+        assert servos.ping(1) == 1020
+        assert send(tmp_path, "unplug plug@0.05") == 0
+        servos.close()
+        until((tmp_path / "servos").exists)
+        again = SdkServos(tmp_path)
+        assert again.ping(1) == 1020
+        again.close()
+        assert capsys.readouterr().err == ""
+        # One word that makes no sense, and none of them counts.
+        assert send(tmp_path, "silent=2 sillent=2") == 1
+        assert "'sillent=2'" in capsys.readouterr().err
+        assert SdkServos(tmp_path).ping(2) == 1020
+
+
+def test_boards_go_and_come_back(tmp_path):
+    with emulated(tmp_path):
+        left = board(tmp_path, 0)
+        left.open()
+        right = board(tmp_path, 1)
+        right.open()
+        assert send(tmp_path, "left:unplug right:frozen") == 0
+        until(lambda: not left.latest().valid)
+        assert "gone" in left.error
+        left.close()
+        assert not (tmp_path / "tactile-left").exists()
+        until(lambda: no_change(right))
+        assert send(tmp_path, "left:plug right:well") == 0
+        until((tmp_path / "tactile-left").exists)
+        left.open()
+        until(lambda: not no_change(right))
+        left.close()
+        right.close()
+
+
+def no_change(sensor: FlexiTac) -> bool:
+    """Whether three frames that follow each other are the same, which noise rules out."""
+    frames = [sensor.latest()]
+    while len(frames) < 3:
+        until(lambda: sensor.latest() is not frames[-1])
+        frames.append(sensor.latest())
+    return all(np.array_equal(frames[0].data, frame.data) for frame in frames)
+
+
+def test_nobody_to_tell(tmp_path, capsys):
+    assert send(tmp_path, "unplug") == 1
+    assert "no emulator answers here" in capsys.readouterr().err
+    assert send(tmp_path / "nowhere", "unplug") == 1
+
+
+def test_the_control_socket_survives_rude_clients_and_is_taken_away(tmp_path, monkeypatch):
+    folder = tmp_path / ("long" * 30)  # past what a socket's own path may have
+    folder.mkdir()
+    with emulated(folder):
+        place = folder / "control"
+        assert place.is_socket()
+        monkeypatch.chdir(folder)
+        rude = [socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(12)]
+        for each in rude:
+            each.connect("control")
+        rude[-1].send(b"\xff\xfe\x00")
+        assert rude[-1].recv(999).startswith(b"error: ")
+        assert send(folder, "drop=0") == 0
+        for each in rude:
+            each.close()
+        assert send(folder, "x" * 4000) == 1
+    assert not place.exists()
+
+
+def test_an_object_that_slipped_away_is_put_back(tmp_path: Path) -> None:
+    with emulated(tmp_path) as made:
+        made.hand.object_pose[:] = 0.07, 0.02, 1.2
+        assert made.request("place report").startswith("{")
+        until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))

@@ -1,0 +1,399 @@
+"""What an emulated servo's registers do: access and limits, motion, watchdog, errors, resets."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import MODELS, by_name
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST
+from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
+from softfinger.daemon.simulation.servo_model.servo_health import OVERLOAD_TIME
+from tests.harness.servos import RADIAN, BusClient, make_bus
+
+
+def client(**options: Any) -> BusClient:
+    return BusClient(make_bus(**options))
+
+
+# --- access rights and limits ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "size", "error"),
+    [
+        (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
+        (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
+        (14, 1, 1, framing.ACCESS),  # no such register
+        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # within a register
+        (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
+        (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
+        (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
+        (reg.OPERATING_MODE, 2, 1, framing.DATA_RANGE),
+        (reg.ID, 253, 1, framing.DATA_RANGE),
+        (reg.GOAL_POSITION, 4096, 4, framing.DATA_LIMIT),
+        (reg.GOAL_POSITION, -1, 4, framing.DATA_LIMIT),
+        (reg.GOAL_VELOCITY, 331, 4, framing.DATA_LIMIT),
+        (reg.GOAL_VELOCITY, -330, 4, framing.OK),
+        (reg.GOAL_CURRENT, -1193, 2, framing.OK),
+        (reg.GOAL_CURRENT, 1194, 2, framing.DATA_RANGE),
+        (reg.MIN_POSITION_LIMIT, 4095, 4, framing.OK),
+        (reg.LED, 1, 1, framing.OK),
+        (660, 7, 1, framing.OK),  # indirect data of the second block
+        (661, 0, 2, framing.ACCESS),  # past the end
+    ],
+)
+def test_what_a_write_is_answered(address: int, value: int, size: int, error: int) -> None:
+    c = client(model="XM430-W210")
+    before = bytes(c.bus.servos[0].table.memory)
+    assert c.write(address, value, size) == error
+    if error:
+        assert bytes(c.bus.servos[0].table.memory) == before
+
+
+def test_configured_limits_bind() -> None:
+    c = client()
+    assert c.write(reg.CURRENT_LIMIT, 500, 2) == 0
+    assert c.write(reg.GOAL_CURRENT, 501, 2) == framing.DATA_LIMIT
+    assert c.write(reg.MAX_POSITION_LIMIT, 3000, 4) == 0
+    assert c.write(reg.GOAL_POSITION, 3001, 4) == framing.DATA_LIMIT
+    assert c.write(reg.MIN_POSITION_LIMIT, 3001, 4) == framing.DATA_LIMIT
+
+
+def test_eeprom_is_locked_while_torque_is_on() -> None:
+    c = client()
+    assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
+    assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == framing.ACCESS
+    assert c.write(reg.TORQUE_ENABLE, 0, 1) == 0
+    assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == 0
+
+
+def test_reading_past_the_table_and_reading_gaps() -> None:
+    c = client()
+    assert c.ask(framing.READ, struct.pack("<HH", 660, 3))[0] == framing.ACCESS
+    assert c.ask(framing.READ, struct.pack("<HH", 14, 6)) == (0, bytes(6))
+
+
+def test_unknown_instruction_and_action_without_one() -> None:
+    c = client()
+    assert c.ask(0x77)[0] == framing.INSTRUCTION_ERROR
+    assert c.ask(framing.ACTION)[0] == framing.INSTRUCTION_ERROR
+
+
+def test_a_model_without_current_sensing_has_no_current_registers() -> None:
+    c = client(model="XL430-W250")
+    assert c.write(reg.GOAL_CURRENT, 1, 2) == framing.ACCESS
+    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == framing.DATA_RANGE
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_factory_values(name: str) -> None:
+    c = client(model=name)
+    model = by_name(name)
+    assert c.read(reg.MODEL_NUMBER, 2) == model.number
+    assert c.read(reg.RETURN_DELAY_TIME, 1) & 0xFF == 250
+    assert c.read(reg.OPERATING_MODE, 1) == reg.POSITION_MODE
+    assert c.read(reg.VELOCITY_LIMIT, 4) == model.velocity_limit
+    assert c.read(reg.POSITION_P_GAIN, 2) == model.position_gains[2]
+    assert c.read(reg.TORQUE_ENABLE, 1) == 0
+    first, data, _ = model.indirect_blocks(model.firmware)[0]
+    assert c.read(first, 2) == data
+
+
+# --- indirect addresses ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("model", "firmware"), [("XM430-W210", 48), ("XL330-M288", 52), ("XL330-M288", 53)]
+)
+def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -> None:
+    c = client(model=model, firmware=firmware, counts=(166, 0))
+    address, data, _ = by_name(model).indirect_blocks(firmware)[0]
+    for i, target in enumerate((reg.LED, *range(reg.PRESENT_POSITION, reg.PRESENT_POSITION + 4))):
+        assert c.write(address + 2 * i, target, 2) == 0
+    assert c.write(data, 1, 1) == 0
+    assert c.bus.servos[0].table.get(reg.LED) == 1
+    assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, bytes.fromhex("01 A6000000"))
+    assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
+    assert c.write(address, 20, 2) == framing.DATA_RANGE  # EEPROM can't be pointed to
+
+
+# --- torque, modes, motion -------------------------------------------------------------------
+
+
+def test_current_based_position_mode_moves_within_its_current() -> None:
+    c = client(prepared=True)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_CURRENT, 100, 2)
+    c.write(reg.GOAL_POSITION, 400, 4)
+    currents = []
+    for _ in range(200):
+        c.later(0.005)
+        currents.append(c.read(reg.PRESENT_CURRENT, 2))
+    assert max(currents) <= 100
+    assert abs(c.read(reg.PRESENT_POSITION, 4) - 400) <= 15
+    assert c.read(reg.MOVING, 1) == 0
+
+
+def test_torque_off_lets_go() -> None:
+    c = client(prepared=True)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_POSITION, 300, 4)
+    c.later(0.5)
+    c.write(reg.TORQUE_ENABLE, 0, 1)
+    before = c.read(reg.PRESENT_POSITION, 4)
+    c.write(reg.GOAL_POSITION, 0, 4)
+    c.later(0.5)
+    assert abs(c.read(reg.PRESENT_POSITION, 4) - before) <= 1
+    assert c.read(reg.PRESENT_CURRENT, 2) == 0
+
+
+def test_current_mode_pushes_the_way_of_its_sign() -> None:
+    c = client()
+    c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_CURRENT, -80, 2)
+    c.later(0.3)
+    assert c.read(reg.PRESENT_VELOCITY, 4) < 0
+    assert c.read(reg.PRESENT_CURRENT, 2) == -80
+
+
+def test_velocity_mode_keeps_its_speed() -> None:
+    c = client()
+    c.write(reg.OPERATING_MODE, reg.VELOCITY_MODE, 1)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_VELOCITY, 60, 4)
+    c.later(1.0)
+    assert abs(c.read(reg.PRESENT_VELOCITY, 4) - 60) <= 2
+
+
+def test_pwm_mode_runs_up_to_its_share_of_the_no_load_speed() -> None:
+    c = client()
+    c.write(reg.OPERATING_MODE, reg.PWM_MODE, 1)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_PWM, 443, 2)
+    c.later(2.0)
+    speed = c.read(reg.PRESENT_VELOCITY, 4)
+    assert 0.3 * 330 < speed < 0.5 * 330
+
+
+def test_a_profile_takes_the_time_it_should() -> None:
+    c = client()
+    c.write(reg.PROFILE_VELOCITY, 50, 4)  # 11.45 rpm: 1024 counts take 1.31 s
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_POSITION, 1024, 4)
+    c.later(0.65)
+    half = c.read(reg.PRESENT_POSITION, 4)
+    assert abs(half - 508) < 60
+    assert c.read(reg.MOVING, 1) == 1
+    c.later(0.9)
+    assert abs(c.read(reg.PRESENT_POSITION, 4) - 1024) <= 5
+
+
+def test_time_based_profile() -> None:
+    c = client()
+    c.write(reg.DRIVE_MODE, 4, 1)
+    c.write(reg.PROFILE_VELOCITY, 2000, 4)  # ms
+    c.write(reg.PROFILE_ACCELERATION, 500, 4)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_POSITION, 1000, 4)
+    c.later(1.0)
+    assert abs(c.read(reg.POSITION_TRAJECTORY, 4) - 500) < 10
+    c.later(0.95)
+    assert c.read(reg.MOVING_STATUS, 1) & 2
+    c.later(0.1)
+    assert c.read(reg.POSITION_TRAJECTORY, 4) == 1000
+
+
+def test_a_mode_change_resets_goals_gains_and_profiles() -> None:
+    c = client(counts=(700, 0))
+    for address, value, size in (
+        (reg.POSITION_P_GAIN, 5, 2),
+        (reg.PROFILE_VELOCITY, 30, 4),
+        (reg.GOAL_CURRENT, 3, 2),
+        (reg.GOAL_PWM, 4, 2),
+    ):
+        assert c.write(address, value, size) == 0
+    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == 0
+    assert c.read(reg.POSITION_P_GAIN, 2) == 800
+    assert c.read(reg.PROFILE_VELOCITY, 4) == 0
+    assert c.read(reg.GOAL_CURRENT, 2) == 1193
+    assert c.read(reg.GOAL_PWM, 2) == 885
+    assert c.read(reg.GOAL_POSITION, 4) == 700
+
+
+def test_turns_are_kept_until_position_mode_or_clear() -> None:
+    c = client(prepared=True)
+    c.bus.plant.q[0] = 5000 * RADIAN
+    assert c.read(reg.PRESENT_POSITION, 4) == 5000
+    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == 0
+    assert c.read(reg.PRESENT_POSITION, 4) == 904
+    c.bus.plant.q[0] = 9000 * RADIAN
+    assert c.read(reg.PRESENT_POSITION, 4) == 4904
+    assert c.write(reg.OPERATING_MODE, reg.POSITION_MODE, 1) == 0
+    assert c.read(reg.PRESENT_POSITION, 4) == 808
+
+
+def test_clear_fails_while_the_shaft_moves() -> None:
+    c = client()
+    c.bus.plant.dq[0] = 3.0
+    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == framing.RESULT_FAIL
+
+
+def test_homing_offset_and_reverse_mode() -> None:
+    c = client(counts=(100, 0))
+    assert c.write(reg.HOMING_OFFSET, -30, 4) == 0
+    assert c.read(reg.PRESENT_POSITION, 4) == 70
+    assert c.write(reg.DRIVE_MODE, 1, 1) == 0
+    assert c.read(reg.PRESENT_POSITION, 4) == -130
+
+
+def test_realtime_tick_wraps() -> None:
+    c = client()
+    c.later(32.766 - c.t)
+    assert c.read(reg.REALTIME_TICK, 2) == 32766
+    c.later(0.003)
+    assert c.read(reg.REALTIME_TICK, 2) == 1
+
+
+# --- bus watchdog ----------------------------------------------------------------------------
+
+
+def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
+    c = client(prepared=True)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.BUS_WATCHDOG, 5, 1)
+    c.write(reg.GOAL_CURRENT, 40, 2)
+    c.write(reg.GOAL_POSITION, 4000, 4)
+    for _ in range(20):  # packets keep it going
+        c.later(0.09)
+        assert c.read(reg.BUS_WATCHDOG, 1) == 5
+    assert c.bus.plant.dq[0] > 0.0
+    c.later(0.11)
+    assert c.bus.servos[0].table.memory[reg.BUS_WATCHDOG] == 0xFF
+    c.later(0.5)
+    stood = c.read(reg.PRESENT_POSITION, 4)
+    assert c.bus.plant.dq[0] == 0.0
+    assert c.read(reg.TORQUE_ENABLE, 1) == 1
+    assert c.write(reg.GOAL_POSITION, 10, 4) == framing.DATA_RANGE
+    assert c.write(reg.BUS_WATCHDOG, 5, 1) == framing.DATA_RANGE
+    assert c.write(reg.BUS_WATCHDOG, 0, 1) == 0
+    assert c.write(reg.GOAL_POSITION, stood + 10, 4) == 0
+
+
+def test_bus_watchdog_sleeps_while_torque_is_off() -> None:
+    c = client()
+    c.write(reg.BUS_WATCHDOG, 1, 1)
+    c.later(5.0)
+    assert c.read(reg.BUS_WATCHDOG, 1) == 1
+
+
+# --- hardware errors -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
+)
+def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
+    c = client(model="XL330-M288")  # its shutdown mask has all three
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.bus.fault(fault, c.t)
+    c.later(0.02)
+    error, data = c.ask(framing.READ, struct.pack("<HH", reg.HARDWARE_ERROR_STATUS, 1))
+    assert error == framing.ALERT
+    assert data[0] == 1 << bit
+    assert c.bus.servos[0].torque_on is False
+    assert c.write(reg.TORQUE_ENABLE, 1, 1) == framing.ALERT | framing.RESULT_FAIL
+    c.bus.fault("recover=1", c.t)
+    assert c.ask(framing.REBOOT)[0] == framing.ALERT
+    assert c.send(1, framing.PING) == b""
+    c.later(REBOOT_TIME)
+    assert c.read(reg.HARDWARE_ERROR_STATUS, 1) == 0
+    assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
+
+
+def test_an_error_outside_the_shutdown_mask_only_alerts() -> None:
+    c = client()  # XM430: mask 52 lacks the voltage bit
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.bus.fault("undervoltage=1", c.t)
+    c.later(0.02)
+    assert c.write(reg.LED, 1, 1) == framing.ALERT
+    assert c.bus.servos[0].torque_on is True
+
+
+def test_overload_after_its_time_at_the_current_limit() -> None:
+    c = client()
+    c.write(reg.CURRENT_LIMIT, 30, 2)
+    c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_CURRENT, 30, 2)
+    c.later(OVERLOAD_TIME - 0.1)
+    assert c.read(reg.HARDWARE_ERROR_STATUS, 1) == 0
+    c.later(0.3)
+    assert c.bus.servos[0].table.memory[reg.HARDWARE_ERROR_STATUS] == 1 << 5
+    assert c.bus.servos[0].torque_on is False
+
+
+# --- reboot, reset, backup -------------------------------------------------------------------
+
+
+def test_reboot_resets_ram_and_keeps_eeprom() -> None:
+    c = client(counts=(1234, 0))
+    for address, value, size in (
+        (reg.RETURN_DELAY_TIME, 3, 1),
+        (reg.LED, 1, 1),
+        (reg.PROFILE_VELOCITY, 9, 4),
+        (reg.TORQUE_ENABLE, 1, 1),
+    ):
+        assert c.write(address, value, size) == 0
+    c.ask(framing.REBOOT)
+    c.later(REBOOT_TIME - 0.01)
+    assert c.send(1, framing.PING) == b""
+    c.later(0.01)
+    assert c.read(reg.RETURN_DELAY_TIME, 1) == 3
+    assert (
+        c.read(reg.LED, 1) == c.read(reg.PROFILE_VELOCITY, 4) == c.read(reg.TORQUE_ENABLE, 1) == 0
+    )
+    assert c.read(reg.GOAL_POSITION, 4) == 1234
+
+
+@pytest.mark.parametrize(
+    ("option", "new_id", "baud"), [(0xFF, 1, 1), (1, 5, 1), (2, 5, 3)], ids=["all", "id", "baud"]
+)
+def test_factory_reset(option: int, new_id: int, baud: int) -> None:
+    c = client(ids=(5, 6))
+    c.write(reg.BAUD_RATE, 3, 1, packet_id=5)
+    c.write(reg.RETURN_DELAY_TIME, 3, 1, packet_id=5)
+    assert c.ask(framing.FACTORY_RESET, bytes((option,)), packet_id=5)[0] == 0
+    c.later(REBOOT_TIME)
+    assert c.read(reg.BAUD_RATE, 1, packet_id=new_id) == baud
+    assert c.read(reg.RETURN_DELAY_TIME, 1, packet_id=new_id) & 0xFF == 250
+
+
+def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
+    c = client(ids=(5, 6))
+    assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
+    assert c.ask(framing.PING, packet_id=5)[0] == 0
+    assert c.ask(framing.FACTORY_RESET, b"\x07", packet_id=5)[0] == framing.DATA_RANGE
+
+
+def test_backup_and_restore() -> None:
+    c = client()
+    store, restore = b"\x01CTRL", b"\x02CTRL"
+    assert c.ask(framing.BACKUP, restore)[0] == framing.RESULT_FAIL  # nothing stored yet
+    c.write(reg.RETURN_DELAY_TIME, 11, 1)
+    c.write(reg.STARTUP_CONFIGURATION, 2, 1)
+    c.write(reg.POSITION_P_GAIN, 321, 2)
+    assert c.ask(framing.BACKUP, store)[0] == 0
+    assert c.read(reg.BACKUP_READY, 1) == 1
+    c.write(reg.RETURN_DELAY_TIME, 99, 1)
+    assert c.ask(framing.BACKUP, restore)[0] == 0
+    c.later(REBOOT_TIME)
+    assert c.read(reg.RETURN_DELAY_TIME, 1) == 11
+    assert c.read(reg.POSITION_P_GAIN, 2) == 321  # RAM too, as the startup configuration asks
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    assert c.ask(framing.BACKUP, store)[0] == framing.RESULT_FAIL
