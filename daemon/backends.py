@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from softfinger.daemon.clock import Clock
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.servos.base import Servos
-    from softfinger.daemon.simulation.physics.hand import SimulatedHand
+    from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
     from softfinger.daemon.tactile.base import TactileSensor
 
 

@@ -33,7 +33,7 @@ from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
 if TYPE_CHECKING:
-    from softfinger.daemon.simulation.physics.hand import SimulatedHand
+    from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
 
 class Daemon:
@@ -119,7 +119,7 @@ class Daemon:
         settings = self.settings
         if not (SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand):
             return None
-        from softfinger.daemon.simulation.physics.hand import SimulatedHand
+        from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
         table = next((each.table for each in self.models if not each.own_material), None)
         if table is None:

@@ -134,7 +134,7 @@ def _estimator(scene: Scene) -> None:
 
 
 def _hand(scene: Scene) -> None:
-    from softfinger.daemon.simulation.physics.hand import SimulatedHand
+    from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
     SimulatedHand(scene.settings, 0.0, scene.models[0].table)
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.arrivals import Arrivals
 from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
 from softfinger.daemon.types import Frame
@@ -121,10 +120,9 @@ class SimulatedTactile:
         if number < self._hand.samples - self._hand.kept_samples:
             return False
         sample = self._hand.sample(number)
-        d = float(sample[layout.SAMPLE_D + self._finger])
-        theta = float(sample[layout.SAMPLE_THETA + self._finger])
-        share = float(sample[layout.SAMPLE_GAIN + self._finger])
-        bend = float(sample[layout.SAMPLE_BEND + self._finger])
+        finger = self._finger
+        d, theta = float(sample.d[finger]), float(sample.theta[finger])
+        share, bend = float(sample.gain[finger]), float(sample.bend[finger])
         # What is left without the curvature's own share, which the cells are to show themselves.
         share *= math.sqrt(1.0 + bend * self._radius)
         # Force goes with d²: half a tip on the face's edge presses with half the force.

@@ -13,7 +13,6 @@ import time
 
 import numpy as np
 
-from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.plant import step
 from softfinger.kinematics.compiled.kernel import kernel
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
@@ -35,12 +34,8 @@ WRONG = (
 
 
 @kernel
-def past_limit(memory, finger):
+def past_limit(radius, d, theta, bend):
     """How far the rim must be pressed in by the tip's d and θ alone [m]."""
-    radius = memory[layout.RADIUS]
-    d = memory[layout.CONTACT_D + finger]
-    theta = memory[layout.CONTACT_THETA + finger]
-    bend = memory[layout.CONTACT_BEND + finger]
     if bend == 0.0:
         return d - radius * (1.0 - abs(math.sin(theta)))
     away = radius - d + 1.0 / bend
@@ -49,45 +44,57 @@ def past_limit(memory, finger):
 
 
 @kernel
-def carry_out(memory, data, ring, commands):
+def is_sound(plant):
+    """Whether what a hand shows is finite."""
+    state, felt = plant.state, plant.felt
+    total = plant.energy
+    for j in range(5):
+        total += state.position[j] + state.velocity[j]
+    for j in range(6):
+        total += state.extra_shear[j]
+    for j in range(2):
+        total += state.shear[j] + state.current[j] + felt.d[j] + felt.theta[j] + felt.force[j]
+        total += felt.normal[j] + felt.tangential[j] + felt.rim[j]
+    return math.isfinite(total)
+
+
+@kernel
+def carry_out(plants, data, ring, commands):
     """Carry the commands out one by one; what went wrong, and at which."""
-    h = memory[layout.STEP]
+    plant = plants[0]
+    goals, state, felt = plant.goals, plant.state, plant.felt
     for k in range(commands.shape[0]):
         joint = int(commands[k, 0])
-        for place, value in (
-            (layout.MODE, commands[k, 1]),
-            (layout.TORQUE_ON, commands[k, 2]),
-            (layout.GOAL_Q, commands[k, 3]),
-            (layout.GOAL_CURRENT, commands[k, 4]),
-        ):
-            memory[place + joint] = value
+        goals.mode[joint] = int(commands[k, 1])
+        goals.torque_on[joint] = int(commands[k, 2])
+        goals.q[joint] = commands[k, 3]
+        goals.current[joint] = commands[k, 4]
         if commands[k, 8] > 0.0:
-            memory[layout.PUSH : layout.PUSH + 3] = commands[k, 5:8]
+            goals.push[:] = commands[k, 5:8]
         if commands[k, 9] > 0.0:  # open, the object back between the fingers
-            memory[layout.POSITION : layout.VELOCITY + 5] = 0.0
-            memory[layout.POSITION + 3] = 0.08
+            state.position[:] = 0.0
+            state.velocity[:] = 0.0
+            state.position[3] = 0.08
         if commands[k, 11] > 0.0:  # no input for a while: from then on the energy may only fall
-            for j in range(2):
-                memory[layout.TORQUE_ON + j] = 0.0
-                memory[layout.CURRENT + j] = 0.0
-            memory[layout.PUSH : layout.PUSH + 3] = 0.0
+            goals.torque_on[:] = 0
+            state.current[:] = 0.0
+            goals.push[:] = 0.0
         most = math.inf
-        for _ in range(int(commands[k, 10] / h) + 1):
-            step(memory, data, ring, 1)
+        for _ in range(int(commands[k, 10] / plant.parameters.step) + 1):
+            step(plants, data, ring, 1)
             if commands[k, 11] > 0.0:
-                total = memory[layout.TOTAL]
-                if total > most:
+                if plant.energy > most:
                     return CREATED, k
-                most = total + 1e-12 * (abs(total) + 1e-3)
-        for place in range(layout.TIP):
-            if not math.isfinite(memory[place]):
-                return NOT_FINITE, k
+                most = plant.energy + 1e-12 * (abs(plant.energy) + 1e-3)
+        if not is_sound(plant):
+            return NOT_FINITE, k
         for finger in range(2):
-            rim = memory[layout.CONTACT_RIM + finger]
-            pressed = memory[layout.CONTACT_FORCE + finger] > 0.0
-            if pressed and past_limit(memory, finger) > 1e-9 and not rim > 0.0:
+            least = past_limit(
+                plant.parameters.radius, felt.d[finger], felt.theta[finger], felt.bend[finger]
+            )
+            if felt.force[finger] > 0.0 and least > 1e-9 and not felt.rim[finger] > 0.0:
                 return UNTOLD, k
-            if abs(memory[layout.POSITION + finger]) > 1.6:
+            if abs(state.position[finger]) > 1.6:
                 return RUNAWAY, k
     return FINE, commands.shape[0]
 
@@ -140,7 +147,7 @@ def abuse(seed: int, count: int = EACH) -> str:
     generator = np.random.default_rng(seed)
     hand = random_hand(generator, seed % 3 == 0)
     commands = random_commands(generator, count)
-    code, at = carry_out(hand.memory, hand.table.data, hand._ring, commands)
+    code, at = carry_out(hand.plant.array, hand.table.data, hand._ring, commands)
     return f"seed {seed}, command {at}: {WRONG[code]}" if code != FINE else ""
 
 

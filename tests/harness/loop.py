@@ -9,7 +9,6 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.simulation.physics import layout
 
 Make = Callable[..., Daemon]
 
@@ -21,7 +20,7 @@ def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
 def torque_of(daemon: Daemon) -> Any:
     """Whether the plant's servos have torque, each."""
     assert daemon.hand is not None
-    return daemon.hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2]
+    return daemon.hand.torque_on
 
 
 def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:

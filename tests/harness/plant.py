@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -37,7 +36,7 @@ def place(hand: SimulatedHand, q, pose, dq=(0, 0), velocity=(0, 0, 0)) -> None:
 
 def hold_with(hand: SimulatedHand, currents) -> None:
     """Constant currents from the start on, whatever the joints' speed."""
-    hand.memory[layout.NO_LOAD_SPEED] = 1e9
+    hand.plant.parameters.no_load_speed = 1e9
     hand.current[:] = currents
     for joint in range(2):
         hand.drive(joint, CURRENT, True, 0.0, currents[joint])

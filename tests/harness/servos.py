@@ -26,11 +26,11 @@ from softfinger.daemon.servos.control_table import (
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
-from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import Parser, frame
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from tests.harness.free_joints import FreeJoints
 
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 

@@ -16,7 +16,7 @@ from softfinger.daemon.clock import Clock, RealClock, VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
 from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import Frame
 from tests.conftest import until

@@ -10,11 +10,11 @@ import pytest
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.simulation.physics.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.emulated import emulated, send
+from tests.harness.free_joints import FreeJoints
 from tests.harness.servos import RADIAN
 
 UNIT = by_name("XM430-W350").current_unit

@@ -19,13 +19,13 @@ from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.joint import current_toward
-from softfinger.daemon.simulation.physics.free_joints import FreeJoints
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from tests.harness.free_joints import FreeJoints
 from tests.harness.servos import RunningBus
 
 COUNT = 2 * math.pi / 4096
@@ -60,10 +60,8 @@ class SimulatedRig:
         self.servos = made
 
     def torque(self) -> list[bool]:
-        from softfinger.daemon.simulation.physics import layout
-
         self._hand.advance(self.clock.now())
-        return [bool(on) for on in self._hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2]]
+        return [bool(on) for on in self._hand.torque_on]
 
     def close(self) -> None:
         self.servos.close()

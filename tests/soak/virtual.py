@@ -26,7 +26,6 @@ from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.types import Frame, Goal, Reading
 
 TICKS = 10_000_000
@@ -377,7 +376,7 @@ class Soak:
         hand = self.daemon.hand
         assert hand is not None
         hand.advance(self.daemon.clock.now())
-        return bool(hand.memory[layout.TORQUE_ON : layout.TORQUE_ON + 2].any())
+        return bool(hand.torque_on.any())
 
     def _judge(self, count: int) -> None:
         state, servos, account = self.daemon.loop.state, self.servos, self.account

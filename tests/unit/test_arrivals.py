@@ -11,7 +11,7 @@ from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
 from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.arrivals import Arrivals
 from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.daemon.tactile.simulated import SimulatedTactile

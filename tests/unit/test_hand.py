@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from tests.harness.grasp import Grasp
 from tests.harness.plant import (
     BOUNDED,
@@ -54,10 +53,9 @@ def test_quasi_static_steering_gain(degrees, gain):
     place(hand, start.q, start.pose)
     hand.shear[:] = start.shear
     # The joints held stiffly and turned slowly, so that only they and the tips' energy decide.
-    hand.memory[layout.POSITION_GAIN] = 1e5
-    hand.memory[layout.RATE_GAIN] = 1e3
-    hand.memory[layout.CURRENT_LIMIT] = 1e3
-    hand.memory[layout.STALL_CURRENT] = 1e3
+    parameters = hand.plant.parameters
+    parameters.position_gain = 1e5
+    parameters.rate_gain = parameters.current_limit = parameters.stall_current = 1e3
     delta = math.radians(degrees)
     for share in np.linspace(0, 1, 400):
         for joint, sign in ((0, 1), (1, -1)):
@@ -152,7 +150,7 @@ def test_a_collision_keeps_momentum_and_energy():
     assert hand.object_velocity[0] > 0.3
     assert 0.05 * (hand.object_velocity[0] + 0.5) == pytest.approx(impulse, rel=1e-3)
     # The finger takes L N dt, with the object's face upright all the while.
-    assert hand.memory[layout.JOINT_INERTIA] * hand.dq[0] == pytest.approx(
+    assert hand.plant.parameters.joint_inertia * hand.dq[0] == pytest.approx(
         -0.080 * impulse, rel=3e-3
     )
     assert hand.energy() == pytest.approx(start, rel=1e-3)
@@ -179,7 +177,7 @@ def test_position_moves_are_well_damped_and_bounded_by_the_goal_current():
 
 def test_goal_current_is_reached_a_tenth_of_a_radian_away():
     hand = make()
-    hand.memory[layout.JOINTS_HELD] = 1.0
+    hand.plant.parameters.joints_held = True
     for joint, away in ((0, 0.1), (1, -0.1)):
         hand.drive(joint, BOUNDED, True, away, 1.0)
     run(hand, 0.02)
@@ -214,7 +212,7 @@ def test_end_stops_and_no_load_speed_bound_the_joints():
     while hand.t < 2.0:
         run(hand, 0.002)
         fastest = max(fastest, np.abs(hand.dq).max())
-    assert fastest < hand.memory[layout.NO_LOAD_SPEED]
+    assert fastest < hand.plant.parameters.no_load_speed
     # 5.4 N·m on 500 N·m/rad, behind the clearance of 0.05 rad.
     assert 1.05 < hand.q[0] < 1.07
     assert -0.57 < hand.q[1] < -0.55
@@ -319,12 +317,16 @@ def test_advance_is_idempotent_and_split_ways_are_bit_identical():
     for t in np.sort(generator.uniform(0, 1, 300)):
         hands[2].advance(float(t))
     hands[2].advance(1.0)
-    before = hands[0].memory.copy()
+
+    def state(hand):
+        return [hand.plant.array[part].tobytes() for part in ("state", "felt", "energy", "samples")]
+
+    before = state(hands[0])
     hands[0].advance(0.5)
-    np.testing.assert_array_equal(hands[0].memory[: layout.STATE], before[: layout.STATE])
+    assert state(hands[0]) == before
     for hand in hands:
         assert hand.t == pytest.approx(1.0)
-        np.testing.assert_array_equal(hand.memory[: layout.STATE], before[: layout.STATE])
+        assert state(hand) == before
 
 
 def test_samples_stand_at_the_frames_instants_between_sub_steps():
@@ -337,11 +339,11 @@ def test_samples_stand_at_the_frames_instants_between_sub_steps():
         h.advance(5.15)
     assert hand.samples == finer.samples == 20
     for number in range(hand.samples - 5, hand.samples):
-        row, exact = hand.sample(number), finer.sample(number)
-        assert row[layout.SAMPLE_T] == number / 130.0
+        sample, exact = hand.sample(number), finer.sample(number)
+        assert sample.t == number / 130.0
         # A tick's motion is 1e-4 rad and 4e-6 m: a sample that isn't interpolated is off by that.
-        np.testing.assert_allclose(row[2:4], exact[2:4], atol=8e-7)
-        np.testing.assert_allclose(row[4:6], exact[4:6], atol=1e-5)
+        np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
+        np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):
         hand.sample(hand.samples)
     with pytest.raises(LookupError):

@@ -10,7 +10,6 @@ import pytest
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
 from tests.harness.reference_hand import ReferenceHand
 
 HAND = ReferenceHand()
@@ -52,10 +51,10 @@ class Rig:
 
 def width_at_the_contacts(plant: Any) -> float:
     """Distance of both contacts along the object's n, by the plant's outline."""
-    memory, found = plant.memory, []
+    found = []
     n = np.array([math.cos(plant.object_pose[2]), math.sin(plant.object_pose[2])])
     for finger, side in ((0, 1.0), (1, -1.0)):
-        q = memory[layout.POSITION + finger]
+        q = plant.q[finger]
         along = np.array([side * math.cos(q), -math.sin(q)])
         turned = plant.theta[finger]
         c, s = math.cos(turned), math.sin(turned)

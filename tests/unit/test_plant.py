@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
-from softfinger.daemon.simulation.physics.tip import evaluate_tip
+from softfinger.daemon.simulation.physics.forces import place_finger
+from softfinger.daemon.simulation.physics.plant_state import TipContact
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.simulation.physics.tip import touch_object
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.simd import address
-from softfinger.kinematics.hand.geometry import HandGeometry
 from tests.fuzz.plant import abuse, random_hand
 from tests.harness.plant import (
     CONSTANT,
@@ -29,33 +29,21 @@ from tests.harness.plant import (
 
 
 @kernel
-def evaluate_one(memory, data, finger, q, way, slope, turn, shear):
-    evaluate_tip(
-        address(memory),
-        address(data),
-        layout.TIP,
-        finger,
-        layout.VELOCITY,
-        math.cos(q),
-        math.sin(q),
-        slope[0],
-        slope[1],
-        way[0],
-        way[1],
-        math.cos(turn),
-        math.sin(turn),
-        shear,
-    )
+def evaluate_one(plants, table, finger, turn):
+    plant = plants[0]
+    place_finger(plant, finger, plant.state.position[finger])
+    tip = plant.stages[0].on_object[finger]
+    touch_object(plant, address(table), tip, finger, plant.state, math.cos(turn), math.sin(turn))
 
 
-def tip_row(hand: SimulatedHand, finger: int, q, pose, shear: float) -> np.ndarray:
-    """Evaluate one tip at rest; a copy of its row."""
-    geometry = HandGeometry()
-    tip = geometry.tips([q, q])[finger]
-    slope = geometry.tip_jacobian([q, q])[finger]
-    hand.memory[layout.VELOCITY : layout.VELOCITY + 5] = 0.0
-    evaluate_one(hand.memory, hand.table.data, finger, q, tip - pose[:2], slope, pose[2], shear)
-    return hand.memory[layout.TIP : layout.TIP + layout.TIP_ROW].copy()
+def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContact:
+    """Evaluate one tip at rest; a copy of its contact."""
+    state = hand.plant.state
+    state.velocity[:] = 0.0
+    state.position[:] = q, q, *pose
+    state.shear[:] = shear
+    evaluate_one(hand.plant.array, hand.table.data, finger, pose[2])
+    return TipContact(hand.plant.stages[0].on_object[finger].array.copy())
 
 
 @pytest.mark.parametrize("table", [PAPER, TABLE_I], ids=["constant", "table_i"])
@@ -81,28 +69,28 @@ def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
         finger = int(generator.integers(2))
         q = generator.uniform(0, 0.9)
         pose = generator.uniform([0, 0.05, -0.9], [0, 0.10, 0.9])
-        open_row = tip_row(hand, finger, q, pose, 0.0)
+        gap = tip_at(hand, finger, q, pose, 0.0).d
         side = 1 - 2 * finger
         want = generator.uniform(*depth)
-        pose[0] += side * (want - open_row[layout.D]) / math.cos(pose[2])
+        pose[0] += side * (want - gap) / math.cos(pose[2])
         shear = generator.uniform(-0.3, 0.3) * want
-        row = tip_row(hand, finger, q, pose, shear)
-        if row[layout.GAIN] == 0.0 or row[layout.TIP_SHEAR] != shear:
+        tip = tip_at(hand, finger, q, pose, shear)
+        if tip.gain == 0.0 or tip.shear != shear:
             continue
         move = generator.normal(size=4) * [1, 0.05, 0.05, 1]
-        rolled = row[layout.JT : layout.JT + 4] @ move
+        rolled = tip.rows[2] @ move
         energies = [
-            tip_row(
+            tip_at(
                 hand,
                 finger,
                 q + s * move[0],
                 pose + s * move[1:],
                 shear + s * rolled,
-            )[layout.ENERGY]
+            ).energy
             for s in (step, -step)
         ]
         slope = (energies[0] - energies[1]) / (2 * step)
-        forces = row[layout.Q : layout.Q + 4]
+        forces = tip.forces
         assert -forces @ move == pytest.approx(
             slope, rel=1e-5, abs=1e-5 * np.abs(forces * move).sum()
         )
@@ -116,9 +104,9 @@ def test_friction_bounds_the_shear():
         friction = generator.uniform(0, 2)
         hand = make(tip_friction=friction)
         q, angle = generator.uniform(0.1, 0.2), generator.uniform(-0.3, 0.3)
-        row = tip_row(hand, 0, q, np.array([-0.002, 0.08, angle]), generator.normal() * 5e-3)
-        assert row[layout.NORMAL] > 0
-        assert abs(row[layout.TANGENTIAL]) <= friction * row[layout.NORMAL] * (1 + 1e-12)
+        tip = tip_at(hand, 0, q, np.array([-0.002, 0.08, angle]), generator.normal() * 5e-3)
+        assert tip.normal > 0
+        assert abs(tip.tangential) <= friction * tip.normal * (1 + 1e-12)
 
 
 # Energy.
@@ -135,7 +123,7 @@ def test_energy_never_rises_without_input(trial):
         generator.uniform(0.10, 0.45 if trial % 2 else 0.25, 2),
         generator.uniform([-0.003, 0.07, -0.2], [0.003, 0.09, 0.2]),
         generator.normal(size=2) * 2,
-        generator.normal(size=3) * [0.3, 0.3, 3] * (hand.memory[layout.OBJECT_HELD] == 0.0),
+        generator.normal(size=3) * [0.3, 0.3, 3] * (not hand.plant.parameters.object_held),
     )
     start = energy = hand.energy()
     scale = abs(start) + 1e-3
@@ -187,7 +175,7 @@ def drift(step: float, name: str) -> tuple[float, float]:
         hand.advance(hand.t + 1.5 * step)
         worst = max(worst, abs(total() - start))
         assert hand.d.min() > 0.001
-    assert hand.memory[layout.GUARDED] == 0.0
+    assert hand.plant.guarded == 0
     return worst, hand.energy()
 
 

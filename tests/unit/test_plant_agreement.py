@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from softfinger.daemon.simulation.physics import layout
 from tests.harness import plant_reference as reference
 from tests.harness.plant import LOSSLESS, hold_with, make, place
 
@@ -63,12 +62,10 @@ def start(scene: Scene, loss: float, count: int):
 
 def compared(hand, scene: Scene) -> np.ndarray:
     """The state in the reference's order."""
-    m = hand.memory
-    shears = m[layout.SHEAR : layout.SHEAR + 2]
-    if scene.contacts[0].mutual:
-        shears = m[layout.MUTUAL_SHEAR : layout.MUTUAL_SHEAR + 2]
-    palm = m[layout.PALM_SHEAR : layout.PALM_SHEAR + (0 if scene.corners is None else 2)]
-    return np.concatenate((m[:10], shears, palm))
+    state = hand.plant.state
+    shears = state.extra_shear[4:] if scene.contacts[0].mutual else state.shear
+    palm = state.extra_shear[: 0 if scene.corners is None else 2]
+    return np.concatenate((state.position, state.velocity, shears, palm))
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -76,15 +73,14 @@ def compared(hand, scene: Scene) -> np.ndarray:
 def test_agreement_with_an_adaptive_solver_and_order_two(name, loss, method):
     scene = SCENES[name]
     hand = start(scene, loss, 10)
-    m = hand.memory
-    mass, held = m[layout.MASS], m[layout.OBJECT_HELD] != 0.0
-    bodies = np.full(3, np.inf) if held else np.array([mass, mass, m[layout.INERTIA]])
+    p = hand.plant.parameters
+    bodies = np.full(3, np.inf) if p.object_held else np.array([p.mass, p.mass, p.inertia])
     equations = reference.Equations(
         scene.contacts,
-        np.array([m[layout.JOINT_INERTIA], m[layout.JOINT_INERTIA], *bodies]),
+        np.array([p.joint_inertia, p.joint_inertia, *bodies]),
         np.array(scene.currents),
         loss,
-        mass * m[layout.GRAVITY : layout.GRAVITY + 2],
+        p.mass * p.gravity,
         scene.corners,
         0.05,
     )
@@ -103,7 +99,7 @@ def test_agreement_with_an_adaptive_solver_and_order_two(name, loss, method):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        assert hand.memory[layout.GUARDED] == 0.0  # smooth, so that the method alone is seen
+        assert hand.plant.guarded == 0  # smooth, so that the method alone is seen
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[2] < 1e-6

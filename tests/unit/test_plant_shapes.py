@@ -9,9 +9,8 @@ import pytest
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings, Simulation
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
 from softfinger.daemon.simulation.physics.shapes import shape_of
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.tactile.simulated import SimulatedTactile
 from tests.harness.plant import (
     BOUNDED,
@@ -54,7 +53,7 @@ def test_gyration_and_lever_of_the_shapes():
 def test_a_wedge_stands_about_its_centre_of_mass():
     wedge = shape(object_shape="wedge", object_taper=0.6)
     # Faces narrow away from the palm, 0.6 rad apart, and are 40 mm apart at half the height.
-    normals = wedge.edges()[:, layout.EDGE_NORMAL_X : layout.EDGE_NORMAL_Y + 1]
+    normals = wedge.edges()[:, 2:4]
     assert math.acos(-normals[1] @ normals[3]) == pytest.approx(0.6)
     np.testing.assert_allclose(normals[1], [math.cos(0.3), math.sin(0.3)])
     sides = wedge.corners[[0, 3]].mean(axis=0), wedge.corners[[1, 2]].mean(axis=0)
@@ -136,7 +135,7 @@ def springs_on_a_cylinder(d, theta, curved):
     ("curved", "upright", "tilted"), [(10.0, 1e-3, 1e-3), (0.04, 0.02, 0.023), (0.02, 0.01, 0.045)]
 )
 def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upright, tilted):
-    share = make(object_shape="disc", object_radius=curved).memory[layout.SHARE]
+    share = make(object_shape="disc", object_radius=curved).plant.parameters.share
     for d in (0.001, 0.004, 0.008):
         assert springs_on_a_cylinder(d, 0.0, curved) == pytest.approx((share,) * 2, rel=upright)
         assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
@@ -214,10 +213,10 @@ def test_tips_press_each_other_as_each_a_plane_midway():
     np.testing.assert_allclose(hand.theta, [q, -q], atol=1e-12)
     np.testing.assert_allclose(hand.force, math.pi * MODULUS * d * d / math.cos(q), rtol=1e-9)
     # At rest each joint bears L cos q of ∂U/∂d, its tip's ∂U/∂θ, and what the stuck shears hold.
-    m, row, other = hand.memory, layout.MUTUAL, layout.MUTUAL + layout.TIP_ROW
+    left, right = hand.plant.stages[0].on_tip
     by_d = float(hand.normal[0] + hand.tangential[0] * math.tan(q))
-    by_shear = sum(m[r + layout.ALONG_T] * m[r + layout.JT] for r in (row, other))
-    torque = by_d * HAND.finger_length * math.cos(q) + m[row + layout.ALONG_THETA] + by_shear
+    by_shear = sum(tip.along[2] * tip.rows[2, 0] for tip in (left, right))
+    torque = by_d * HAND.finger_length * math.cos(q) + left.along[1] + by_shear
     assert torque == pytest.approx(CONSTANT * 0.5, rel=1e-6)
 
 
@@ -227,18 +226,18 @@ def test_mutual_forces_are_the_gradient_of_both_tips_energy():
     step = 1e-7
 
     def at(q, shears):
-        hand.memory[layout.MUTUAL_SHEAR : layout.MUTUAL_SHEAR + 2] = shears
+        hand.plant.state.extra_shear[4:] = shears
         place(hand, q, (0.0, 0.08, 0.0))
-        rows = hand.memory[layout.MUTUAL : layout.MUTUAL + 2 * layout.TIP_ROW]
-        return hand.energy(), hand.memory[layout.FORCES : layout.FORCES + 2].copy(), rows.copy()
+        by_shear = [tip.rows[2, :2].copy() for tip in hand.plant.stages[0].on_tip]
+        return hand.energy(), hand.plant.forces[:2].copy(), by_shear
 
     for _ in range(100):
         q = generator.uniform(0.42, 0.5, 2)
         shears = generator.uniform(-1e-3, 1e-3, 2)
-        _, forces, rows = at(q, shears)
+        _, forces, by_shear = at(q, shears)
         assert hand.d[0] > 0.001
         move = generator.normal(size=2)
-        rolled = np.array([rows[i * layout.TIP_ROW + layout.JT :][:2] @ move for i in range(2)])
+        rolled = np.array([row @ move for row in by_shear])
         high = at(q + step * move, shears + step * rolled)[0]
         low = at(q - step * move, shears - step * rolled)[0]
         assert -forces @ move == pytest.approx((high - low) / (2 * step), rel=1e-5, abs=1e-6)
@@ -379,7 +378,7 @@ def test_scenes_pay_only_for_what_they_have():
     # Neither rows of the palm nor of tips on each other enter the matrix of a grasp.
     hand = make()
     settled(hand, (0.9, 0.9), 0.4, 1.0)
-    assert hand.memory[layout.COUPLED] == 0.0
-    assert hand.memory[layout.MUTUAL_NEAR] == 0.0
+    assert not hand.plant.coupled
+    assert not hand.plant.tips_near
     # Where the joints' friction turns over, a step may be cut by some 1e-8 J.
-    assert hand.memory[layout.GUARDED] < 5
+    assert hand.plant.guarded < 5

@@ -11,7 +11,6 @@ import pytest
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.types import Frame
 
 Make = Callable[..., "Hand"]
@@ -47,8 +46,7 @@ class Hand:
 
     def torque(self) -> bool:
         assert self.daemon.hand is not None
-        memory = self.daemon.hand.memory
-        return bool(memory[layout.TORQUE_ON : layout.TORQUE_ON + 2].any())
+        return bool(self.daemon.hand.torque_on.any())
 
     def change_frames(self, finger: int, change: Callable[[Frame], Frame | None]) -> None:
         """From now on each new frame of one sensor goes through ``change``."""

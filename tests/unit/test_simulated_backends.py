@@ -14,7 +14,7 @@ from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.tactile.simulated import SimulatedTactile
 from softfinger.daemon.types import Goal, Reading
 from softfinger.kinematics.contact.closed_form import Fingertip
@@ -86,10 +86,8 @@ def test_goals_are_whole_counts_too():
     bench.goal.q = [0.1003] * 2
     bench.goal.current = [0.3] * 2
     bench.run(1.0)
-    from softfinger.daemon.simulation.physics import layout
 
-    goal_q = bench.hand.memory[layout.GOAL_Q : layout.GOAL_Q + 2]
-    bound = bench.hand.memory[layout.GOAL_CURRENT : layout.GOAL_CURRENT + 2]
+    goal_q, bound = bench.hand.plant.goals.q, bench.hand.plant.goals.current
     np.testing.assert_allclose(goal_q / COUNT, np.round(0.1003 / COUNT), rtol=1e-12)
     # A bound is rounded down, so that it stays one.
     np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
@@ -318,6 +316,6 @@ def test_registries_make_them_and_two_runs_are_bit_identical():
             servos.read(reading)
             data += repr((reading.q, reading.current)).encode() + sensor.latest().data.tobytes()
             servos.write(goal)
-        return data, hand.memory.tobytes()
+        return data, hand.plant.array.tobytes()
 
     assert run() == run()

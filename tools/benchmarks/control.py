@@ -15,7 +15,7 @@ import numpy as np
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.tools.benchmarks.control_rig import Watched, push_along
 from softfinger.tools.benchmarks.report import Row, Table, figure
 

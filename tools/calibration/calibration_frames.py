@@ -160,7 +160,7 @@ def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[Tacti
     """The finger's sensor, open. Raises TactileError."""
     hand = None
     if settings.tactile.backend == "simulated":
-        from softfinger.daemon.simulation.physics.hand import SimulatedHand
+        from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
         hand = SimulatedHand(settings, clock.now())
     backend = make_sensor(settings, clock, hand, FINGERS.index(finger))

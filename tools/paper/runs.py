@@ -17,8 +17,7 @@ import numpy as np
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.types import Contact
 from softfinger.tools.paper.sheets import FloatArray
 
@@ -153,7 +152,7 @@ def _frames(
             continue
         last = contact.seq
         sample = hand.sample(contact.seq - 1)
-        truth = float(sample[layout.SAMPLE_D]), float(sample[layout.SAMPLE_THETA])
+        truth = float(sample.d[0]), float(sample.theta[0])
         yield truth, _told(contact)
 
 
@@ -175,13 +174,14 @@ def _collect(rows: Iterator[Row], daemon: Daemon) -> Run:
 def _roll(hand: SimulatedHand, d: float, angle: float) -> None:
     """Put the held object where it has rolled to ``angle`` [rad] with ``d`` [m] held."""
     q = float(hand.q[0])
-    length = hand.memory[layout.LENGTH]
+    parameters = hand.plant.parameters
+    length = parameters.length
     tip = -_HALF_SEPARATION + length * math.sin(q), length * math.cos(q)
     out = RADIUS + 0.5 * _WIDTH - d
     along = (RADIUS - d) * angle  # the tip's place on the face, by rolling
-    hand.memory[layout.SCRIPT_X] = tip[0] + out * math.cos(angle) + along * math.sin(angle)
+    parameters.script_x = tip[0] + out * math.cos(angle) + along * math.sin(angle)
     hand.object_pose[:] = (
-        hand.memory[layout.SCRIPT_X],
+        parameters.script_x,
         tip[1] + out * math.sin(angle) - along * math.cos(angle),
         angle,
     )

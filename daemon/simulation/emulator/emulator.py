@@ -27,7 +27,7 @@ from softfinger.daemon.simulation.emulator.fault_spec import SERVOS, Event, Faul
 from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
-from softfinger.daemon.simulation.physics.hand import SimulatedHand
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.servo_model.bus_faults import FaultError, LineFaults
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.tactile.simulated import SimulatedTactile

@@ -8,86 +8,102 @@ live here.
 
 from __future__ import annotations
 
-import numpy as np
-
-from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.plant_state import (
+    CORNERS,
+    DISC,
+    Motion,
+    Plant,
+    Stage,
+)
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
 
 STIFFNESS = 1e5  # N/m, of each corner up and along
 LOSS = 1e-3  # s, damping over stiffness
 
 
 @inner_kernel
-def palm_is_far(memory: Pointer, position: int, velocity: int) -> bool:
+def palm_is_far(plant: Plant, now: Motion) -> bool:
     """Whether no point of the object can meet the palm within a step."""
-    height = memory[position + 3] - memory[layout.PALM] - memory[layout.EXTENT]
-    rate = memory[velocity + 3]
-    turning = memory[velocity + 4] * memory[layout.EXTENT]
-    return bool(height > memory[layout.STEP] * (abs(rate) + abs(turning)))
+    p = plant.parameters
+    height = now.position[3] - p.palm - p.extent
+    rate = now.velocity[3]
+    turning = now.velocity[4] * p.extent
+    return bool(height > p.step * (abs(rate) + abs(turning)))
 
 
 @inner_kernel
-def evaluate_palm(
-    memory: Pointer, position: int, velocity: int, shear: int, nx: float, ny: float, stage: np.int64
+def touch_palm(
+    plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
 ) -> None:
-    """Add the palm's forces on the object to FORCES; write its energy and its shears' rates.
+    """Add the palm's forces on the object, where it may meet it; (nx, ny) is the object's n.
 
-    ``position``, ``velocity`` and ``shear`` are where the coordinates, their rates and the shears
-    stand; (nx, ny) is the object's n. The first ``stage`` also brings the shears within friction
-    and hands the rows to the coupled matrix.
+    The first stage also brings the shears within friction and hands the rows to the full matrix.
     """
-    h = memory[layout.STEP]
-    height = memory[position + 3] - memory[layout.PALM]
-    x_rate = memory[velocity + 2]
-    y_rate = memory[velocity + 3]
-    turn_rate = memory[velocity + 4]
-    round_ = memory[layout.SHAPE] == layout.DISC
+    if not palm_is_far(plant, now):
+        press_on_palm(plant, now, stage, nx, ny, is_first)
+        return
+    for corner in range(CORNERS):
+        stage.extra_rate[corner] = 0.0
+    if is_first and plant.palm_energy != 0.0:
+        plant.palm_energy = 0.0
+        for corner in range(CORNERS):
+            now.extra_shear[corner] = 0.0
+
+
+@inner_kernel
+def press_on_palm(
+    plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
+) -> None:
+    """As :func:`touch_palm`, where the palm is near; writes its energy and its shears' rates."""
+    p = plant.parameters
+    height = now.position[3] - p.palm
+    x_rate = now.velocity[2]
+    y_rate = now.velocity[3]
+    turn_rate = now.velocity[4]
+    round_ = p.shape == DISC
     energy = 0.0
-    for corner in range(1 if round_ else 4):
+    for corner in range(1 if round_ else CORNERS):
         lever_x = 0.0
-        lever_y = -memory[layout.ROUNDNESS]
+        lever_y = -p.roundness
         if not round_:
-            edge = layout.OUTLINE + corner * layout.EDGE
-            u = memory[edge + layout.EDGE_X]
-            v = memory[edge + layout.EDGE_Y]
+            u = p.outline[corner].x
+            v = p.outline[corner].y
             lever_x = u * nx - v * ny
             lever_y = u * ny + v * nx
         depth = -(height + lever_y)
         rate = -(y_rate + lever_x * turn_rate)
         slide = x_rate - lever_y * turn_rate
-        coming = max(depth, depth + h * rate) > 0.0
+        coming = max(depth, depth + p.step * rate) > 0.0
         push = 0.0
         drag = 0.0
         loss = LOSS * STIFFNESS
         along = 0.0
         if depth > 0.0:
             push = max(STIFFNESS * (depth + LOSS * rate), 0.0)
-            most = memory[layout.PALM_FRICTION] * push
-            along = min(max(STIFFNESS * memory[shear + corner], -most), most)
+            most = p.palm_friction * push
+            along = min(max(STIFFNESS * now.extra_shear[corner], -most), most)
             energy += 0.5 * (STIFFNESS * depth * depth + along * along / STIFFNESS)
             if slide != 0.0:
                 opposed = along if slide > 0.0 else -along
                 loss = min(loss, (most - opposed) / abs(slide))
             drag = along + loss * slide
-            memory[layout.FORCES + 2] -= drag
-            memory[layout.FORCES + 3] += push
-            memory[layout.FORCES + 4] += push * lever_x + drag * lever_y
-        memory[layout.EXTRA_RATE + 6 * int(stage) + corner] = slide if depth > 0.0 else 0.0
-        if stage == layout.FIRST_STAGE:
-            memory[shear + corner] = along / STIFFNESS
-            up = layout.EXTRA + 2 * corner * layout.EXTRA_ROW
-            side = up + layout.EXTRA_ROW
-            memory[up + 3] = -1.0
-            memory[up + 4] = -lever_x
-            memory[up + 5] = STIFFNESS if coming else 0.0
-            memory[up + 6] = LOSS * STIFFNESS if coming else 0.0
-            memory[up + 7] = 0.0
-            memory[side + 2] = 1.0
-            memory[side + 4] = -lever_y
-            memory[side + 5] = STIFFNESS if coming else 0.0
-            memory[side + 6] = loss if coming else 0.0
-            memory[side + 7] = 1.0 + corner
-            if coming:
-                memory[layout.COUPLED] = 1.0
-    memory[layout.PALM_ENERGY] = energy
+            plant.forces[2] -= drag
+            plant.forces[3] += push
+            plant.forces[4] += push * lever_x + drag * lever_y
+        stage.extra_rate[corner] = slide if depth > 0.0 else 0.0
+        if is_first:
+            now.extra_shear[corner] = along / STIFFNESS
+            up = plant.extra[2 * corner]
+            up.row[3] = -1.0
+            up.row[4] = -lever_x
+            up.stiffness = STIFFNESS if coming else 0.0
+            up.damping = LOSS * STIFFNESS if coming else 0.0
+            up.shear = 0
+            side = plant.extra[2 * corner + 1]
+            side.row[2] = 1.0
+            side.row[4] = -lever_y
+            side.stiffness = up.stiffness
+            side.damping = loss if coming else 0.0
+            side.shear = 1 + corner
+            plant.coupled = plant.coupled or coming
+    plant.palm_energy = energy

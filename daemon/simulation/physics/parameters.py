@@ -1,4 +1,4 @@
-"""From settings to the plant's parameters, and the physical constants that no setting names.
+"""The plant's parameters from the settings, and the physical constants that no setting names.
 
 The defaults are this project's own choice of a plausible hand; they come from no publication.
 """
@@ -8,18 +8,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
+from softfinger.daemon.simulation.physics.plant_state import NO_OBJECT, Parameters
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
-
-FloatArray = NDArray[np.float64]
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 LONGEST_STEP = 0.25e-3  # s
@@ -51,7 +48,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     shape = shape_of(simulation)
-    if shape.kind == layout.NO_OBJECT:
+    if shape.kind == NO_OBJECT:
         fastest = geometry_of(settings).reach * math.sqrt(stiffness / simulation.joint_inertia)
     else:
         turning = (shape.half_width / shape.gyration) ** 2
@@ -61,97 +58,91 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
-def set_parameters(p: FloatArray, settings: Settings, table: ContactTable, step: float) -> None:
-    """Set the parameters in the plant's memory. Raises SettingsError for an unknown servo."""
+def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step: float) -> None:
+    """Set the plant's parameters. Raises SettingsError for an unknown servo."""
     simulation = settings.simulation
-    radius = settings.tip.radius
-    modulus = float(table.data[3])
-    p[layout.RADIUS] = radius
-    p[layout.SCALE] = simulation.modulus_scale
-    p[layout.FRICTION] = simulation.tip_friction
-    p[layout.LOSS] = simulation.tip_loss
-    p[layout.MODULUS] = modulus * simulation.modulus_scale
-    p[layout.TOLERANCE] = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
-    p[layout.RIM_STIFFNESS] = RIM_STIFFNESS
-
-    p[layout.STEP] = step
-    p[layout.HALF_SEPARATION] = 0.5 * settings.hand.pivot_separation
-    p[layout.LENGTH] = settings.hand.finger_length
-    p[layout.OFFSET] = settings.hand.finger_offset
+    p.step = step
+    p.sample_period = 1.0 / settings.tactile.rate
+    p.modulus = float(table.data[3]) * simulation.modulus_scale
+    p.radius = settings.tip.radius
+    p.scale = simulation.modulus_scale
+    p.friction = simulation.tip_friction
+    p.loss = simulation.tip_loss
+    p.rim_stiffness = RIM_STIFFNESS
+    p.tolerance = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
+    p.half_separation = 0.5 * settings.hand.pivot_separation
+    p.length = settings.hand.finger_length
+    p.offset = settings.hand.finger_offset
+    p.present[:] = [name in settings.scene.fingers for name in FINGERS]
     _object(p, settings)
     _joints(p, settings)
-    for name in settings.scene.fingers:
-        p[layout.PRESENT + FINGERS.index(name)] = 1.0
     _script(p, settings)
-    p[layout.SAMPLE_PERIOD] = 1.0 / settings.tactile.rate
 
 
-def _object(p: FloatArray, settings: Settings) -> None:
+def _object(p: Parameters, settings: Settings) -> None:
     simulation = settings.simulation
     shape, mass = shape_of(simulation), simulation.object_mass
-    p[layout.PALM] = simulation.palm
-    p[layout.PALM_FRICTION] = simulation.palm_friction
-    p[layout.SHAPE] = shape.kind
-    p[layout.HALF_WIDTH] = 0.5 * simulation.object_width
-    p[layout.HALF_HEIGHT] = 0.5 * simulation.object_height
-    p[layout.ROUNDNESS] = shape.roundness
-    p[layout.EXTENT] = shape.extent
-    p[layout.OUTLINE : layout.OUTLINE + 4 * layout.EDGE] = shape.edges().ravel()
+    p.palm = simulation.palm
+    p.palm_friction = simulation.palm_friction
+    p.shape = shape.kind
+    p.half_width = 0.5 * simulation.object_width
+    p.half_height = 0.5 * simulation.object_height
+    p.roundness = shape.roundness
+    p.extent = shape.extent
+    for k, values in enumerate(shape.edges().tolist()):
+        edge = p.outline[k]
+        edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
     # κ of a face with that radius, see tip.py.
     curved = shape.roundness
-    p[layout.SHARE] = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
-    p[layout.MASS] = mass
-    p[layout.INERTIA] = mass * shape.gyration**2
-    p[layout.GRAVITY : layout.GRAVITY + 2] = simulation.gravity
+    p.share = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
+    p.mass = mass
+    p.inertia = mass * shape.gyration**2
+    p.gravity[:] = simulation.gravity
     # What gravity doesn't pull along the plane presses the object on the table.
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
-    p[layout.TABLE_FORCE] = simulation.table_friction * mass * pressing
-    p[layout.TABLE_TORQUE] = p[layout.TABLE_FORCE] * shape.lever
-    p[layout.TABLE_SPEED] = TABLE_SPEED
-    p[layout.TABLE_SPIN] = TABLE_SPEED / shape.lever
+    p.table_force = simulation.table_friction * mass * pressing
+    p.table_torque = p.table_force * shape.lever
+    p.table_speed = TABLE_SPEED
+    p.table_spin = TABLE_SPEED / shape.lever
     # One finger alone can't hold anything: the object is then fixed to the bench.
-    p[layout.OBJECT_HELD] = float(
-        shape.kind == layout.NO_OBJECT
+    p.object_held = (
+        shape.kind == NO_OBJECT
         or len(settings.scene.fingers) == 1
         or (settings.servos.backend == "none" and simulation.compression_speed > 0.0)
     )
 
 
-def _joints(p: FloatArray, settings: Settings) -> None:
+def _joints(p: Parameters, settings: Settings) -> None:
     simulation, servos = settings.simulation, settings.servos
     model = by_name(servos.model)
     inertia, constant = simulation.joint_inertia, settings.control.torque_constant
-    p[layout.JOINT_INERTIA] = inertia
-    p[layout.JOINT_DAMPING] = simulation.joint_damping
-    p[layout.JOINT_FRICTION] = simulation.joint_friction
-    p[layout.JOINT_SPEED] = JOINT_SPEED
-    p[layout.TORQUE_CONSTANT] = constant
-    p[layout.ELECTRIC_TIME] = ELECTRIC_TIME
-    p[layout.CURRENT_LIMIT] = model.stall_current
-    p[layout.STALL_CURRENT] = model.stall_current
-    p[layout.NO_LOAD_SPEED] = model.no_load_speed / servos.gear_ratio
-    gain = model.stall_current / FULL_EFFORT_ERROR
-    p[layout.POSITION_GAIN] = gain
+    p.joint_inertia = inertia
+    p.joint_damping = simulation.joint_damping
+    p.joint_friction = simulation.joint_friction
+    p.joint_speed = JOINT_SPEED
+    p.torque_constant = constant
+    p.electric_time = ELECTRIC_TIME
+    p.current_limit = model.stall_current
+    p.stall_current = model.stall_current
+    p.no_load_speed = model.no_load_speed / servos.gear_ratio
+    p.position_gain = model.stall_current / FULL_EFFORT_ERROR
     # Critical damping of the joint on its position loop.
-    p[layout.RATE_GAIN] = 2.0 * math.sqrt(gain * constant * inertia) / constant
-    for joint in range(2):
-        p[layout.STOP_LOW + joint] = settings.hand.q_min[joint] - STOP_CLEARANCE
-        p[layout.STOP_HIGH + joint] = settings.hand.q_max[joint] + STOP_CLEARANCE
-    p[layout.STOP_STIFFNESS] = STOP_STIFFNESS
-    p[layout.JOINTS_HELD] = float(servos.backend == "none")
+    p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
+    p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
+    p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
+    p.stop_stiffness = STOP_STIFFNESS
+    p.joints_held = servos.backend == "none"
 
 
-def _script(p: FloatArray, settings: Settings) -> None:
+def _script(p: Parameters, settings: Settings) -> None:
     simulation = settings.simulation
-    p[layout.SCRIPT_X] = simulation.object_position[0]
+    p.script_x = simulation.object_position[0]
     if settings.servos.backend != "none":
         return
-    p[layout.SCRIPT_SPEED] = simulation.compression_speed
+    p.script_speed = simulation.compression_speed
     pose = (*simulation.object_position, simulation.object_angle)
     width = 2.0 * shape_of(simulation).half_width
     contacts = geometry_of(settings).contacts(settings.hand.open_angle, pose, width)
     ways = COMPRESSION_DEPTH * settings.tip.radius - contacts.d
     ways = np.maximum(ways / max(math.cos(simulation.object_angle), 0.1), 0.0)
-    for finger, place in enumerate((layout.SCRIPT_LEFT, layout.SCRIPT_RIGHT)):
-        if FINGERS[finger] in settings.scene.fingers:
-            p[place] = ways[finger]
+    p.script_reach[:] = ways * p.present

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import Simulation
-from softfinger.daemon.simulation.physics import layout
+from softfinger.daemon.simulation.physics.plant_state import (
+    DISC,
+    NO_OBJECT,
+    POLYGON,
+    RECTANGLE,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -18,7 +23,7 @@ FloatArray = NDArray[np.float64]
 class Shape:
     """One object's outline, round its centre of mass. Lengths are m."""
 
-    kind: int  # by layout's numbers
+    kind: int  # by plant_state's numbers
     corners: FloatArray  # (4, 2), counter-clockwise; of a disc: those of the square round it
     roundness: float  # radius of a disc, else 0
     gyration: float  # radius of gyration
@@ -33,13 +38,13 @@ class Shape:
     def half_width(self) -> float:
         """Half the width at the height of the centre."""
         (left, bottom), (right, top) = self.corners.min(axis=0), self.corners.max(axis=0)
-        if self.kind != layout.POLYGON:
+        if self.kind != POLYGON:
             return float(0.5 * (right - left))
         low, high = self.corners[1, 0], self.corners[2, 0]
         return float(low + (high - low) * -bottom / (top - bottom))
 
     def edges(self) -> FloatArray:
-        """Start, outward normal and length of the four edges, (4, layout.EDGE)."""
+        """The four edges, float64 [4, 5]: start x, y, outward normal x, y, length."""
         way = np.roll(self.corners, -1, axis=0) - self.corners
         length = np.hypot(*way.T)
         normal = np.stack((way[:, 1], -way[:, 0]), axis=1) / length[:, None]
@@ -51,14 +56,14 @@ def shape_of(simulation: Simulation) -> Shape:
     if simulation.object_shape == "disc":
         radius = simulation.object_radius
         square = _trapezoid(radius, radius, radius)
-        return Shape(layout.DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
+        return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
     half, height = 0.5 * simulation.object_width, simulation.object_height
-    kind, leaning = layout.RECTANGLE, 0.0
+    kind, leaning = RECTANGLE, 0.0
     if simulation.object_shape == "wedge":
-        kind = layout.POLYGON
+        kind = POLYGON
         leaning = 0.5 * height * math.tan(0.5 * simulation.object_taper)
     elif simulation.object_shape == "none":
-        kind = layout.NO_OBJECT
+        kind = NO_OBJECT
     corners = _trapezoid(half + leaning, half - leaning, 0.5 * height)
     lever, squared = _mean_distances(corners)
     return Shape(kind, corners, 0.0, math.sqrt(squared), lever)

@@ -1,145 +1,127 @@
 """The linear equations of a step in the usual scene, where only the tips touch the object.
 
 The joints are coupled only through the object, so that one 3 × 3 Schur complement is factorised;
-`coupled` has the full matrix. Only kernels live here.
+`full_solver` has the matrix of all other scenes. ``g`` is γh of `plant`.
 """
 
 from __future__ import annotations
 
-from softfinger.daemon.simulation.physics import layout
-from softfinger.daemon.simulation.physics.forces import stop_stiffness
+from softfinger.daemon.simulation.physics.plant_state import (
+    ALONG_D,
+    ALONG_SHEAR,
+    ALONG_THETA,
+    FloatArray,
+    Motion,
+    Plant,
+    TipContact,
+)
+from softfinger.daemon.simulation.physics.servo_loop import stop_stiffness
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
 
 
 @inner_kernel
-def joint_pivot(memory: Pointer, joint: int, g: float) -> float:
+def joint_pivot(plant: Plant, joint: int, g: float) -> float:
     """The matrix's entry of a joint by itself: inertia, friction, stop and motor."""
-    motor = memory[layout.MOTOR + 2 + joint] + g * memory[layout.MOTOR + joint]
-    pivot: float = memory[layout.JOINT_INERTIA] + g * (
-        memory[layout.DRAG + joint] + g * (stop_stiffness(memory, joint) + motor)
+    motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
+    pivot: float = plant.parameters.joint_inertia + g * (
+        plant.drag[joint] + g * (stop_stiffness(plant, joint) + motor)
     )
     return pivot
 
 
 @inner_kernel
-def factorise(memory: Pointer, g: float) -> None:
-    """Factorise M + gD + g²K of stage 1 into the matrix; ``g`` = γh.
+def entry(tip: TipContact, i: int, j: int, g: float) -> float:
+    """What a tip adds to the matrix at its coordinates ``i`` and ``j``."""
+    total = 0.0
+    for r in range(3):
+        weight = g * (tip.damping[r] + g * tip.stiffness[r])
+        total += weight * tip.rows[r, i] * tip.rows[r, j]
+    return total
 
-    Places 0, 1: inverse joint pivots; 2-4 and 5-7: the joints' couplings to (x, y, φ); 8-13: the
-    object's 3 × 3 Schur complement as L D Lᵀ (inverse d0, l10, l20, inverse d1, l21, inverse d2).
-    """
-    a = memory[layout.MASS] + g * memory[layout.DRAG + 2]
+
+@inner_kernel
+def factorise(plant: Plant, g: float) -> None:
+    """Factorise M + gD + g²K of the first stage."""
+    p, factors = plant.parameters, plant.factors
+    a = p.mass + g * plant.drag[2]
     b = 0.0
-    c = memory[layout.MASS] + g * memory[layout.DRAG + 3]
+    c = p.mass + g * plant.drag[3]
     d = 0.0
     e = 0.0
-    f = memory[layout.INERTIA] + g * memory[layout.DRAG + 4]
+    f = p.inertia + g * plant.drag[4]
     for finger in range(2):
-        row = layout.TIP + finger * layout.TIP_ROW
-        w_d = g * (memory[row + layout.C_D] + g * memory[row + layout.K_D])
-        w_r = g * (memory[row + layout.C_THETA] + g * memory[row + layout.K_THETA])
-        w_t = g * (memory[row + layout.C_T] + g * memory[row + layout.K_T])
-        d0 = memory[row + layout.JD]
-        d1 = memory[row + layout.JD + 1]
-        d2 = memory[row + layout.JD + 2]
-        d3 = memory[row + layout.JD + 3]
-        r0 = memory[row + layout.JTHETA]
-        r1 = memory[row + layout.JTHETA + 1]
-        r2 = memory[row + layout.JTHETA + 2]
-        r3 = memory[row + layout.JTHETA + 3]
-        t0 = memory[row + layout.JT]
-        t1 = memory[row + layout.JT + 1]
-        t2 = memory[row + layout.JT + 2]
-        t3 = memory[row + layout.JT + 3]
-        pivot = joint_pivot(memory, finger, g)
-        pivot += w_d * d0 * d0 + w_r * r0 * r0 + w_t * t0 * t0
-        inverse = 0.0 if memory[layout.JOINTS_HELD] != 0.0 else 1.0 / pivot
-        u0 = w_d * d0 * d1 + w_r * r0 * r1 + w_t * t0 * t1
-        u1 = w_d * d0 * d2 + w_r * r0 * r2 + w_t * t0 * t2
-        u2 = w_d * d0 * d3 + w_r * r0 * r3 + w_t * t0 * t3
-        memory[layout.MATRIX + finger] = inverse
-        memory[layout.MATRIX + 2 + 3 * finger] = u0
-        memory[layout.MATRIX + 3 + 3 * finger] = u1
-        memory[layout.MATRIX + 4 + 3 * finger] = u2
-        a += w_d * d1 * d1 + w_r * r1 * r1 + w_t * t1 * t1 - u0 * u0 * inverse
-        b += w_d * d1 * d2 + w_r * r1 * r2 + w_t * t1 * t2 - u0 * u1 * inverse
-        c += w_d * d2 * d2 + w_r * r2 * r2 + w_t * t2 * t2 - u1 * u1 * inverse
-        d += w_d * d1 * d3 + w_r * r1 * r3 + w_t * t1 * t3 - u0 * u2 * inverse
-        e += w_d * d2 * d3 + w_r * r2 * r3 + w_t * t2 * t3 - u1 * u2 * inverse
-        f += w_d * d3 * d3 + w_r * r3 * r3 + w_t * t3 * t3 - u2 * u2 * inverse
-    free = 0.0 if memory[layout.OBJECT_HELD] != 0.0 else 1.0
+        tip = plant.stages[0].on_object[finger]
+        pivot = joint_pivot(plant, finger, g) + entry(tip, 0, 0, g)
+        inverse = 0.0 if p.joints_held else 1.0 / pivot
+        u0 = entry(tip, 0, 1, g)
+        u1 = entry(tip, 0, 2, g)
+        u2 = entry(tip, 0, 3, g)
+        factors.joint[finger] = inverse
+        factors.coupling[finger, 0] = u0
+        factors.coupling[finger, 1] = u1
+        factors.coupling[finger, 2] = u2
+        a += entry(tip, 1, 1, g) - u0 * u0 * inverse
+        b += entry(tip, 1, 2, g) - u0 * u1 * inverse
+        c += entry(tip, 2, 2, g) - u1 * u1 * inverse
+        d += entry(tip, 1, 3, g) - u0 * u2 * inverse
+        e += entry(tip, 2, 3, g) - u1 * u2 * inverse
+        f += entry(tip, 3, 3, g) - u2 * u2 * inverse
+    free = 0.0 if p.object_held else 1.0
     first = 1.0 / a
-    l10 = b * first
-    l20 = d * first
-    second = 1.0 / (c - l10 * b)
-    rest = e - l10 * d
-    l21 = rest * second
-    memory[layout.MATRIX + 8] = free * first
-    memory[layout.MATRIX + 9] = l10
-    memory[layout.MATRIX + 10] = l20
-    memory[layout.MATRIX + 11] = free * second
-    memory[layout.MATRIX + 12] = l21
-    memory[layout.MATRIX + 13] = free / (f - l20 * d - l21 * rest)
+    factors.l10 = b * first
+    factors.l20 = d * first
+    second = 1.0 / (c - factors.l10 * b)
+    rest = e - factors.l10 * d
+    factors.l21 = rest * second
+    factors.pivot[0] = free * first
+    factors.pivot[1] = free * second
+    factors.pivot[2] = free / (f - factors.l20 * d - factors.l21 * rest)
 
 
 @inner_kernel
-def solve(memory: Pointer, out: int) -> None:
-    """Solve the factorised matrix for the load; five results from ``out`` on, held parts 0."""
-    m = layout.MATRIX
-    r0 = memory[layout.LOAD] * memory[m]
-    r1 = memory[layout.LOAD + 1] * memory[m + 1]
-    b0 = memory[layout.LOAD + 2] - memory[m + 2] * r0 - memory[m + 5] * r1
-    b1 = memory[layout.LOAD + 3] - memory[m + 3] * r0 - memory[m + 6] * r1
-    b2 = memory[layout.LOAD + 4] - memory[m + 4] * r0 - memory[m + 7] * r1
-    b1 -= memory[m + 9] * b0
-    b2 -= memory[m + 10] * b0 + memory[m + 12] * b1
-    z2 = b2 * memory[m + 13]
-    z1 = b1 * memory[m + 11] - memory[m + 12] * z2
-    z0 = b0 * memory[m + 8] - memory[m + 9] * z1 - memory[m + 10] * z2
-    memory[out] = r0 - memory[m] * (memory[m + 2] * z0 + memory[m + 3] * z1 + memory[m + 4] * z2)
-    memory[out + 1] = r1 - memory[m + 1] * (
-        memory[m + 5] * z0 + memory[m + 6] * z1 + memory[m + 7] * z2
-    )
-    memory[out + 2] = z0
-    memory[out + 3] = z1
-    memory[out + 4] = z2
+def solve(plant: Plant, k: Motion) -> None:
+    """Solve for the load: the velocities of ``k``, those of held parts 0."""
+    load, factors, out = plant.load, plant.factors, k.velocity
+    joint, coupling, pivot = factors.joint, factors.coupling, factors.pivot
+    r0 = load[0] * joint[0]
+    r1 = load[1] * joint[1]
+    b0 = load[2] - coupling[0, 0] * r0 - coupling[1, 0] * r1
+    b1 = load[3] - coupling[0, 1] * r0 - coupling[1, 1] * r1
+    b2 = load[4] - coupling[0, 2] * r0 - coupling[1, 2] * r1
+    b1 -= factors.l10 * b0
+    b2 -= factors.l20 * b0 + factors.l21 * b1
+    z2 = b2 * pivot[2]
+    z1 = b1 * pivot[1] - factors.l21 * z2
+    z0 = b0 * pivot[0] - factors.l10 * z1 - factors.l20 * z2
+    out[0] = r0 - joint[0] * (coupling[0, 0] * z0 + coupling[0, 1] * z1 + coupling[0, 2] * z2)
+    out[1] = r1 - joint[1] * (coupling[1, 0] * z0 + coupling[1, 1] * z1 + coupling[1, 2] * z2)
+    out[2] = z0
+    out[3] = z1
+    out[4] = z2
 
 
 @inner_kernel
-def row_along(memory: Pointer, row: int, finger: int, along: int) -> float:
-    """A tip's row over (q, x, y, φ) times the coordinates' rates from ``along`` on."""
+def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
+    """A tip's row ``r`` times the coordinates' ``rates``."""
     rate: float = (
-        memory[row] * memory[along + finger]
-        + memory[row + 1] * memory[along + 2]
-        + memory[row + 2] * memory[along + 3]
-        + memory[row + 3] * memory[along + 4]
+        tip.rows[r, 0] * rates[finger]
+        + tip.rows[r, 1] * rates[2]
+        + tip.rows[r, 2] * rates[3]
+        + tip.rows[r, 3] * rates[4]
     )
     return rate
 
 
 @inner_kernel
-def take_stiffness(memory: Pointer, along: int, shear1: float, shear2: float, g: float) -> None:
-    """Take g K r from the load, K of stage 1; r stands from ``along`` on, then both shears."""
+def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
+    """Take g K r from the load, with K of the first stage; r are positions and shears of ``k``."""
     for finger in range(2):
-        row = layout.TIP + finger * layout.TIP_ROW
-        at_d = row + layout.JD
-        at_r = row + layout.JTHETA
-        at_t = row + layout.JT
-        by_d = g * memory[row + layout.K_D] * row_along(memory, at_d, finger, along)
-        by_r = g * memory[row + layout.K_THETA] * row_along(memory, at_r, finger, along)
-        by_t = g * memory[row + layout.K_T] * (shear1 if finger == 0 else shear2)
-        memory[layout.LOAD + finger] -= (
-            memory[at_d] * by_d + memory[at_r] * by_r + memory[at_t] * by_t
-        )
-        for j in range(1, 4):
-            memory[layout.LOAD + 1 + j] -= (
-                memory[at_d + j] * by_d + memory[at_r + j] * by_r + memory[at_t + j] * by_t
+        tip = plant.stages[0].on_object[finger]
+        rows, stiffness = tip.rows, tip.stiffness
+        by_d = g * stiffness[ALONG_D] * along_row(tip, ALONG_D, finger, k.position)
+        by_r = g * stiffness[ALONG_THETA] * along_row(tip, ALONG_THETA, finger, k.position)
+        by_t = g * stiffness[ALONG_SHEAR] * k.shear[finger]
+        for j in range(4):
+            plant.load[finger if j == 0 else 1 + j] -= (
+                rows[ALONG_D, j] * by_d + rows[ALONG_THETA, j] * by_r + rows[ALONG_SHEAR, j] * by_t
             )
-
-
-@inner_kernel
-def shear_along(memory: Pointer, finger: int, along: int) -> float:
-    """Rate of a tip's d_t by stage 1's row for the coordinates' rates from ``along`` on."""
-    row = layout.TIP + finger * layout.TIP_ROW + layout.JT
-    return row_along(memory, row, finger, along)

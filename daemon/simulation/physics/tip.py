@@ -19,7 +19,7 @@ order in d: the footprint is narrower along the tilt by κ² = R/(R + a), the cu
 1/a + 1/R, and force and energy are κ times those of the plane, whatever θ. Integrals over the very
 springs, for a constant modulus, a = 20 mm and d up to 8 mm, are within 1.6 % of that upright and
 within 4.5 % at 30° for R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm. The sensor's frame is
-rendered from those springs (`simulation.sensor.curved_face`), so its sum differs by as much.
+rendered from those springs (`sensor.curved_face`), so its sum differs by as much.
 
 Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
 ratio |T|/N can't reach μ (with a constant E it can't exceed 1 at θ = 0), the tip slips at its
@@ -31,8 +31,16 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.outline import nearest, rim_on_disc, rim_on_plane
+from softfinger.daemon.simulation.physics.plant_state import (
+    ALONG_D,
+    ALONG_SHEAR,
+    ALONG_THETA,
+    Motion,
+    Parameters,
+    Plant,
+    TipContact,
+)
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.contact.lookup import lookup_at
@@ -73,45 +81,46 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 
 @inner_kernel
-def clear_row(memory: Pointer, row: int) -> None:
+def clear_contact(tip: TipContact) -> None:
     """A tip without contact; d, θ and the gain stay."""
-    for place in range(layout.FORCE, layout.TIP_ROW):
-        memory[row + place] = 0.0
+    tip.force = 0.0
+    tip.energy = 0.0
+    tip.rim = 0.0
+    tip.normal = 0.0
+    tip.tangential = 0.0
+    tip.shear = 0.0
+    tip.shear_rate = 0.0
+    tip.bend = 0.0
+    for r in range(3):
+        tip.stiffness[r] = 0.0
+        tip.damping[r] = 0.0
+        for j in range(4):
+            tip.rows[r, j] = 0.0
+    for j in range(4):
+        tip.forces[j] = 0.0
 
 
 @inner_kernel
-def press(
-    memory: Pointer,
-    data: Pointer,
-    row: int,
-    share: float,
-    sine: float,
-    cosine: float,
-    reach: float,
-    rate_d: float,
-    rate_theta: float,
-    slide: float,
-    shear: float,
-) -> None:
-    """The law of the contact: what d, θ and shear of the ``row`` do along d, θ and d_t.
+def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
+    """The law of the contact: forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
-    ``share`` is κ, ``reach`` how much deeper the step may lead; ``slide`` [m/s] is the velocity of
-    what is touched less the tip's, along t. Takes D, THETA, RIM and what belongs to the rim from
-    the row, and writes the rest but the rows over the coordinates and Q.
+    ``share`` is κ. Takes from the tip d, θ, reach, rates, slide, shear and the rim; writes the rest
+    but what is over the coordinates.
     """
-    d = memory[row + layout.D]
-    theta = memory[row + layout.THETA]
-    gain, gain_theta = fade(theta)
+    d = tip.d
+    sine = tip.sine
+    cosine = tip.cosine
+    shear = tip.shear
+    gain, gain_theta = fade(tip.theta)
     gain *= share
     gain_theta *= share
-    memory[row + layout.GAIN] = gain
     along_d = 0.0
     along_theta = 0.0
     energy = 0.0
-    if memory[row + layout.RIM] > 0.0:
-        along_d = memory[row + layout.RIM_D]
-        along_theta = memory[row + layout.RIM_THETA]
-        energy = memory[row + layout.RIM_ENERGY]
+    if tip.rim > 0.0:
+        along_d = tip.rim_d
+        along_theta = tip.rim_theta
+        energy = tip.rim_energy
     force = 0.0
     normal = along_d
     tangential = 0.0
@@ -123,10 +132,10 @@ def press(
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
         tangent = sine * inverse_cosine
-        coming = 2.0 * math.pi * memory[layout.MODULUS] * gain * reach * inverse_cosine
+        coming = 2.0 * math.pi * p.modulus * gain * tip.reach * inverse_cosine
     if gain > 0.0 and d > D_MIN:
         # The soft part within its range; d_soft_d, d_soft_theta are d_soft's derivatives.
-        radius = memory[layout.RADIUS]
+        radius = p.radius
         d_soft = d
         d_soft_d = 1.0
         d_soft_theta = 0.0
@@ -137,8 +146,8 @@ def press(
                 d_soft = limit
                 d_soft_d = 0.0
                 d_soft_theta = -radius * sine * cosine / bent
-        force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(data, d_soft, theta)
-        scale = memory[layout.SCALE]
+        force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(table, d_soft, tip.theta)
+        scale = p.scale
         force *= scale
         force_d *= scale
         force_theta *= scale
@@ -165,7 +174,7 @@ def press(
         # Most steps are far from slip, which two comparisons tell.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
-        friction = memory[layout.FRICTION]
+        friction = p.friction
         # What was brought within the limits just now is within them.
         most = friction * normal * (1.0 + _WITHIN)
         if abs(tangential) > most or bend * (shear - neutral) ** 2 > at_neutral:
@@ -192,8 +201,9 @@ def press(
 
     # Losses: a tip that leaves doesn't pull, and shear's loss stays within friction. Stick is
     # without slide, but for the tan θ ḋ that keeps the virtual work consistent.
-    rate_t = slide - tangent * rate_d
-    loss = memory[layout.LOSS]
+    rate_d = tip.rate_d
+    rate_t = tip.slide - tangent * rate_d
+    loss = p.loss
     loss_d = loss * stiffness_d
     if rate_d < 0.0:
         loss_d = min(loss_d, max(normal, 0.0) / -rate_d)
@@ -201,93 +211,92 @@ def press(
     loss_t = loss * stiffness_t
     if rate_t != 0.0:
         opposed = tangential if rate_t > 0.0 else -tangential
-        least = max(memory[layout.FRICTION] * normal - opposed, 0.0)
+        least = max(p.friction * normal - opposed, 0.0)
         loss_t = min(loss_t, least / abs(rate_t))
-    memory[row + layout.FORCE] = gain * force
-    memory[row + layout.ENERGY] = energy
-    memory[row + layout.NORMAL] = normal
-    memory[row + layout.TANGENTIAL] = tangential
-    memory[row + layout.TIP_SHEAR] = shear
-    memory[row + layout.SHEAR_RATE] = rate_t if d > D_MIN else 0.0
-    memory[row + layout.K_D] = stiffness_d + coming
-    memory[row + layout.K_THETA] = stiffness_theta
-    memory[row + layout.K_T] = stiffness_t
-    memory[row + layout.C_D] = loss_d + loss * coming
-    memory[row + layout.C_THETA] = loss_theta
-    memory[row + layout.C_T] = loss_t
-    memory[row + layout.ALONG_D] = along_d + loss_d * rate_d
-    memory[row + layout.ALONG_THETA] = along_theta + loss_theta * rate_theta
-    memory[row + layout.ALONG_T] = tangential + loss_t * rate_t
-    memory[row + layout.TANGENT] = tangent
+    tip.gain = gain
+    tip.tangent = tangent
+    tip.force = gain * force
+    tip.energy = energy
+    tip.normal = normal
+    tip.tangential = tangential
+    tip.shear = shear
+    tip.shear_rate = rate_t if d > D_MIN else 0.0
+    tip.stiffness[ALONG_D] = stiffness_d + coming
+    tip.stiffness[ALONG_THETA] = stiffness_theta
+    tip.stiffness[ALONG_SHEAR] = stiffness_t
+    tip.damping[ALONG_D] = loss_d + loss * coming
+    tip.damping[ALONG_THETA] = loss_theta
+    tip.damping[ALONG_SHEAR] = loss_t
+    tip.along[ALONG_D] = along_d + loss_d * rate_d
+    tip.along[ALONG_THETA] = along_theta + loss_theta * tip.rate_theta
+    tip.along[ALONG_SHEAR] = tangential + loss_t * rate_t
 
 
 @inner_kernel
-def stiffen_by_rim(memory: Pointer, row: int) -> None:
-    """Add the rim's stiffness to a row whose step may meet it.
+def set_row(tip: TipContact, r: int, q: float, x: float, y: float, turn: float) -> None:
+    """Set a row over (q, x, y, φ)."""
+    tip.rows[r, 0] = q
+    tip.rows[r, 1] = x
+    tip.rows[r, 2] = y
+    tip.rows[r, 3] = turn
+
+
+@inner_kernel
+def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
+    """Add the rim's stiffness to a tip whose step may meet it.
 
     Its own row is at most that of d and a times that of θ; twice each bounds it.
     """
-    hard = 2.0 * memory[layout.RIM_STIFFNESS]
-    memory[row + layout.K_D] += hard
-    memory[row + layout.K_THETA] += hard * memory[layout.RADIUS] ** 2
+    hard = 2.0 * p.rim_stiffness
+    tip.stiffness[ALONG_D] += hard
+    tip.stiffness[ALONG_THETA] += hard * p.radius**2
 
 
 @inner_kernel
-def evaluate_tip(
-    memory: Pointer,
-    data: Pointer,
-    row: int,
-    finger: int,
-    velocity: int,
-    cq: float,
-    sq: float,
-    vx: float,
-    vy: float,
-    rx: float,
-    ry: float,
-    nx: float,
-    ny: float,
-    shear: float,
+def touch_object(
+    plant: Plant, table: Pointer, tip: TipContact, finger: int, now: Motion, nx: float, ny: float
 ) -> None:
-    """Fill the tip's ``row`` of the plant's ``memory``; ``velocity`` is where the velocities are.
-
-    ``cq``, ``sq`` are cosine and sine of the joint angle, (vx, vy) the tip centre's derivative by
-    it, (rx, ry) the tip's centre from the object's, (nx, ny) the object's n; ``shear`` is d_t.
-    """
+    """Evaluate a finger's ``tip`` on the object where ``now`` is; (nx, ny) is the object's n."""
+    p = plant.parameters
+    its = plant.fingers[finger]
+    rx = its.x - now.position[2]
+    ry = its.y - now.position[3]
     side = 1.0 - 2.0 * finger
-    radius = memory[layout.RADIUS]
-    mu, mv, distance, curved = nearest(memory, rx * nx + ry * ny, ry * nx - rx * ny)
+    radius = p.radius
+    mu, mv, distance, curved = nearest(p, rx * nx + ry * ny, ry * nx - rx * ny)
     # m leads from the tip's centre into the object, t is m turned by a right angle.
     mx = mu * nx - mv * ny
     my = mu * ny + mv * nx
     d = radius - distance
     # Tip axis (±cos q, −sin q); θ is the angle from it to m.
-    ux = side * cq
-    uy = -sq
+    ux = side * its.cosine
+    uy = -its.sine
     cosine = ux * mx + uy * my
     sine = ux * my - uy * mx
     theta = math.atan2(sine, cosine)
-    memory[row + layout.D] = d
-    memory[row + layout.THETA] = theta
+    tip.d = d
+    tip.theta = theta
+    tip.sine = sine
+    tip.cosine = cosine
 
     # Rows over (q, x, y, φ); the contact point is at ``distance`` m from the tip's centre.
     px = rx + distance * mx
     py = ry + distance * my
     turn_m = my * px - mx * py
     turn_t = mx * px + my * py
-    v_m = vx * mx + vy * my
-    v_t = vy * mx - vx * my
-    q_rate = memory[velocity + finger]
-    x_rate = memory[velocity + 2]
-    y_rate = memory[velocity + 3]
-    turn_rate = memory[velocity + 4]
+    v_m = its.x_q * mx + its.y_q * my
+    v_t = its.y_q * mx - its.x_q * my
+    q_rate = now.velocity[finger]
+    x_rate = now.velocity[2]
+    y_rate = now.velocity[3]
+    turn_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - turn_m * turn_rate
     # The integrator's matrix takes the stiffness of where the step leads, so that an impact meets
     # it at once; losses take that of here.
-    reach = max(memory[layout.STEP] * rate_d, 0.0)
+    reach = max(p.step * rate_d, 0.0)
     if d + reach <= D_MIN:
-        memory[row + layout.GAIN] = fade(theta)[0] * memory[layout.SHARE]
-        clear_row(memory, row)
+        tip.gain = fade(theta)[0] * p.share
+        clear_contact(tip)
         return
     theta_q = side
     theta_x = 0.0
@@ -301,54 +310,35 @@ def evaluate_tip(
         theta_x = -my * inverse
         theta_y = mx * inverse
         theta_turn = (turn_t + curved) * inverse
-        memory[row + layout.BEND] = 1.0 / curved if curved > 0.0 else 0.0
-    else:
-        memory[row + layout.BEND] = 0.0
     if curved > 0.0:
-        rim = rim_on_disc(memory, row, distance + curved, curved, sine, cosine)
+        tip.bend = 1.0 / curved
+        rim = rim_on_disc(p, tip, distance + curved)
     else:
-        rim = rim_on_plane(memory, row, d, sine, cosine)
-    memory[row + layout.RIM] = max(rim, 0.0)
-    rate_theta = theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_turn * turn_rate
+        tip.bend = 0.0
+        rim = rim_on_plane(p, tip)
+    tip.rim = max(rim, 0.0)
+    tip.reach = reach
+    tip.rate_d = rate_d
+    tip.rate_theta = theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_turn * turn_rate
     # The object's velocity at the contact less the tip's, along t.
     t_q = side * distance - v_t
-    slide = t_q * q_rate - my * x_rate + mx * y_rate + turn_t * turn_rate
-    press(
-        memory,
-        data,
-        row,
-        memory[layout.SHARE],
-        sine,
-        cosine,
-        reach,
-        rate_d,
-        rate_theta,
-        slide,
-        shear,
-    )
+    tip.slide = t_q * q_rate - my * x_rate + mx * y_rate + turn_t * turn_rate
+    tip.shear = now.shear[finger]
+    press(p, table, tip, p.share)
     if rim + reach > 0.0:
-        stiffen_by_rim(memory, row)
-    tangent = memory[row + layout.TANGENT]
+        stiffen_by_rim(p, tip)
+    tangent = tip.tangent
     t_q -= tangent * v_m
     t_x = -my + tangent * mx
     t_y = mx + tangent * my
     t_turn = turn_t + tangent * turn_m
-    memory[row + layout.JD] = v_m
-    memory[row + layout.JD + 1] = -mx
-    memory[row + layout.JD + 2] = -my
-    memory[row + layout.JD + 3] = -turn_m
-    memory[row + layout.JTHETA] = theta_q
-    memory[row + layout.JTHETA + 1] = theta_x
-    memory[row + layout.JTHETA + 2] = theta_y
-    memory[row + layout.JTHETA + 3] = theta_turn
-    memory[row + layout.JT] = t_q
-    memory[row + layout.JT + 1] = t_x
-    memory[row + layout.JT + 2] = t_y
-    memory[row + layout.JT + 3] = t_turn
-    along_d = memory[row + layout.ALONG_D]
-    along_theta = memory[row + layout.ALONG_THETA]
-    along_t = memory[row + layout.ALONG_T]
-    memory[row + layout.Q] = -(along_d * v_m + along_theta * theta_q + along_t * t_q)
-    memory[row + layout.Q + 1] = along_d * mx - along_theta * theta_x - along_t * t_x
-    memory[row + layout.Q + 2] = along_d * my - along_theta * theta_y - along_t * t_y
-    memory[row + layout.Q + 3] = along_d * turn_m - along_theta * theta_turn - along_t * t_turn
+    set_row(tip, ALONG_D, v_m, -mx, -my, -turn_m)
+    set_row(tip, ALONG_THETA, theta_q, theta_x, theta_y, theta_turn)
+    set_row(tip, ALONG_SHEAR, t_q, t_x, t_y, t_turn)
+    along_d = tip.along[ALONG_D]
+    along_theta = tip.along[ALONG_THETA]
+    along_t = tip.along[ALONG_SHEAR]
+    tip.forces[0] = -(along_d * v_m + along_theta * theta_q + along_t * t_q)
+    tip.forces[1] = along_d * mx - along_theta * theta_x - along_t * t_x
+    tip.forces[2] = along_d * my - along_theta * theta_y - along_t * t_y
+    tip.forces[3] = along_d * turn_m - along_theta * theta_turn - along_t * t_turn

@@ -5,16 +5,33 @@ rigid plane: d = a − D/2 with the centres' distance D. The energy is that of b
 U(d, θ2, d_t2), which is 2 U(d, θ) for fingers that mirror each other. With unlike tilts the plane
 would bulge towards the softer tip, and this energy is a little too high (of second order in the
 difference of cos² θ). The plane sticks to both tips alike: each shears by half of what their
-surfaces slide along each other, less its tan θ ḋ. Only kernels live here.
+surfaces slide along each other, less its tan θ ḋ.
 """
 
 from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics import layout
 from softfinger.daemon.simulation.physics.outline import rim_on_plane
-from softfinger.daemon.simulation.physics.tip import D_MIN, clear_row, fade, press, stiffen_by_rim
+from softfinger.daemon.simulation.physics.plant_state import (
+    ALONG_D,
+    ALONG_SHEAR,
+    ALONG_THETA,
+    CORNERS,
+    EXTRA_ROWS,
+    NO_OBJECT,
+    PALM_ROWS,
+    Motion,
+    Plant,
+    Stage,
+)
+from softfinger.daemon.simulation.physics.tip import (
+    D_MIN,
+    clear_contact,
+    fade,
+    press,
+    stiffen_by_rim,
+)
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
 
@@ -22,55 +39,51 @@ _FAR = 1.5  # radii: half the centres' distance from which on nothing is evaluat
 
 
 @inner_kernel
-def evaluate_mutual(
-    memory: Pointer,
-    data: Pointer,
-    row: int,
-    position: int,
-    velocity: int,
-    shear: int,
-) -> bool:
-    """Fill both tips' rows from ``row`` on and add their torques to FORCES; may they touch?
+def tips_are_far(plant: Plant) -> bool:
+    """Whether both tips are too far from each other to be evaluated."""
+    left, right = plant.fingers[0], plant.fingers[1]
+    way_x = right.x - left.x
+    way_y = right.y - left.y
+    far = 2.0 * _FAR * plant.parameters.radius
+    return bool(way_x * way_x + way_y * way_y > far * far)
 
-    Both tips' centres stand in TIP_PLACE; ``position``, ``velocity`` and ``shear`` are where the
-    coordinates, their rates and both shears are.
-    """
-    radius = memory[layout.RADIUS]
-    place = layout.TIP_PLACE
-    way_x = memory[place + 4] - memory[place]
-    way_y = memory[place + 5] - memory[place + 1]
+
+@inner_kernel
+def press_on_each_other(plant: Plant, table: Pointer, now: Motion, stage: Stage) -> bool:
+    """Evaluate both tips on each other and add their torques to the forces; may they touch?"""
+    p = plant.parameters
+    left, right = plant.fingers[0], plant.fingers[1]
+    way_x = right.x - left.x
+    way_y = right.y - left.y
     apart = math.sqrt(way_x * way_x + way_y * way_y)
     half = 0.5 * apart
-    d = radius - half
+    d = p.radius - half
     ex = way_x / apart
     ey = way_y / apart
     # v·e and v along e turned by a right angle.
-    m1 = memory[place + 2] * ex + memory[place + 3] * ey
-    m2 = memory[place + 6] * ex + memory[place + 7] * ey
-    t1 = memory[place + 3] * ex - memory[place + 2] * ey
-    t2 = memory[place + 7] * ex - memory[place + 6] * ey
-    q1_rate = memory[velocity]
-    q2_rate = memory[velocity + 1]
+    m1 = left.x_q * ex + left.y_q * ey
+    m2 = right.x_q * ex + right.y_q * ey
+    t1 = left.y_q * ex - left.x_q * ey
+    t2 = right.y_q * ex - right.x_q * ey
+    q1_rate = now.velocity[0]
+    q2_rate = now.velocity[1]
     rate_d = 0.5 * (m1 * q1_rate - m2 * q2_rate)
-    reach = max(memory[layout.STEP] * rate_d, 0.0)
+    reach = max(p.step * rate_d, 0.0)
     touching = bool(d + reach > D_MIN)
     slide1 = 0.5 * (half - t1)
     slide2 = 0.5 * (t2 - half)
-    slide = slide1 * q1_rate + slide2 * q2_rate
     for finger in range(2):
-        out = row + finger * layout.TIP_ROW
+        tip = stage.on_tip[finger]
         side = 1.0 - 2.0 * finger
-        q = memory[position + finger]
-        ux = math.cos(q)  # the axis and e turned over for the right tip
-        uy = -side * math.sin(q)
-        cosine = ux * ex + uy * ey
-        sine = ux * ey - uy * ex
-        theta = math.atan2(sine, cosine)
-        memory[out + layout.D] = d
-        memory[out + layout.THETA] = theta
+        ux = plant.fingers[finger].cosine  # the axis and e turned over for the right tip
+        uy = -side * plant.fingers[finger].sine
+        tip.sine = ux * ey - uy * ex
+        tip.cosine = ux * ex + uy * ey
+        tip.theta = math.atan2(tip.sine, tip.cosine)
+        tip.d = d
         if not touching:
-            memory[out + layout.GAIN] = fade(theta)[0]
-            clear_row(memory, out)
+            tip.gain = fade(tip.theta)[0]
+            clear_contact(tip)
             continue
         by_q1 = -t1 / apart
         by_q2 = t2 / apart
@@ -78,63 +91,72 @@ def evaluate_mutual(
             by_q1 += 1.0
         else:
             by_q2 -= 1.0
-        rim = rim_on_plane(memory, out, d, sine, cosine)
-        memory[out + layout.RIM] = max(rim, 0.0)
-        memory[out + layout.BEND] = 0.0
-        press(
-            memory,
-            data,
-            out,
-            1.0,
-            sine,
-            cosine,
-            reach,
-            rate_d,
-            by_q1 * q1_rate + by_q2 * q2_rate,
-            slide,
-            memory[shear + finger],
-        )
+        rim = rim_on_plane(p, tip)
+        tip.rim = max(rim, 0.0)
+        tip.bend = 0.0
+        tip.reach = reach
+        tip.rate_d = rate_d
+        tip.rate_theta = by_q1 * q1_rate + by_q2 * q2_rate
+        tip.slide = slide1 * q1_rate + slide2 * q2_rate
+        tip.shear = now.extra_shear[CORNERS + finger]
+        press(p, table, tip, 1.0)
         if rim + reach > 0.0:
-            stiffen_by_rim(memory, out)
-        tangent = memory[out + layout.TANGENT]
-        memory[out + layout.JD] = 0.5 * m1
-        memory[out + layout.JD + 1] = -0.5 * m2
-        memory[out + layout.JTHETA] = by_q1
-        memory[out + layout.JTHETA + 1] = by_q2
-        memory[out + layout.JT] = slide1 - tangent * 0.5 * m1
-        memory[out + layout.JT + 1] = slide2 + tangent * 0.5 * m2
+            stiffen_by_rim(p, tip)
+        tangent = tip.tangent
+        tip.rows[ALONG_D, 0] = 0.5 * m1
+        tip.rows[ALONG_D, 1] = -0.5 * m2
+        tip.rows[ALONG_THETA, 0] = by_q1
+        tip.rows[ALONG_THETA, 1] = by_q2
+        tip.rows[ALONG_SHEAR, 0] = slide1 - tangent * 0.5 * m1
+        tip.rows[ALONG_SHEAR, 1] = slide2 + tangent * 0.5 * m2
         for j in range(2):
-            memory[layout.FORCES + j] -= (
-                memory[out + layout.ALONG_D] * memory[out + layout.JD + j]
-                + memory[out + layout.ALONG_THETA] * memory[out + layout.JTHETA + j]
-                + memory[out + layout.ALONG_T] * memory[out + layout.JT + j]
+            plant.forces[j] -= (
+                tip.along[ALONG_D] * tip.rows[ALONG_D, j]
+                + tip.along[ALONG_THETA] * tip.rows[ALONG_THETA, j]
+                + tip.along[ALONG_SHEAR] * tip.rows[ALONG_SHEAR, j]
             )
     return touching
 
 
 @inner_kernel
-def tips_are_far(memory: Pointer) -> bool:
-    """Whether both tips, at TIP_PLACE, are too far from each other to be looked at."""
-    place = layout.TIP_PLACE
-    way_x = memory[place + 4] - memory[place]
-    way_y = memory[place + 5] - memory[place + 1]
-    far = 2.0 * _FAR * memory[layout.RADIUS]
-    return bool(way_x * way_x + way_y * way_y > far * far)
+def touch_each_other(
+    plant: Plant, table: Pointer, now: Motion, stage: Stage, is_first: bool
+) -> None:
+    """Add the tips' torques on each other where they may meet; without an object always.
+
+    The first stage also hands their rows to the full matrix.
+    """
+    near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
+    touching = near and press_on_each_other(plant, table, now, stage)
+    for finger in range(2):
+        tip = stage.on_tip[finger]
+        stage.extra_rate[CORNERS + finger] = tip.shear_rate if touching else 0.0
+        if is_first and plant.tips_near and not near:
+            clear_contact(tip)
+            plant.state.extra_shear[CORNERS + finger] = 0.0
+    if not is_first:
+        return
+    plant.tips_near = near
+    if touching:
+        if not plant.coupled:
+            clear_extra(plant, 0, PALM_ROWS)
+        plant.coupled = True
+        for finger in range(2):
+            tip = stage.on_tip[finger]
+            for r in range(3):
+                extra = plant.extra[PALM_ROWS + 3 * finger + r]
+                extra.row[0] = tip.rows[r, 0]
+                extra.row[1] = tip.rows[r, 1]
+                extra.stiffness = tip.stiffness[r]
+                extra.damping = tip.damping[r]
+                extra.shear = 1 + CORNERS + finger if r == ALONG_SHEAR else 0
+    elif plant.coupled:
+        clear_extra(plant, PALM_ROWS, EXTRA_ROWS)
 
 
 @inner_kernel
-def mutual_rows(memory: Pointer) -> None:
-    """Hand the first stage's rows of both tips to the coupled matrix."""
-    for finger in range(2):
-        row = layout.MUTUAL + finger * layout.TIP_ROW
-        for number, place, stiffness, damping in (
-            (0, layout.JD, layout.K_D, layout.C_D),
-            (1, layout.JTHETA, layout.K_THETA, layout.C_THETA),
-            (2, layout.JT, layout.K_T, layout.C_T),
-        ):
-            extra = layout.EXTRA + (layout.PALM_ROWS + 3 * finger + number) * layout.EXTRA_ROW
-            memory[extra] = memory[row + place]
-            memory[extra + 1] = memory[row + place + 1]
-            memory[extra + 5] = memory[row + stiffness]
-            memory[extra + 6] = memory[row + damping]
-            memory[extra + 7] = 5.0 + finger if number == 2 else 0.0
+def clear_extra(plant: Plant, first: int, last: int) -> None:
+    """Take the extra rows from ``first`` to before ``last`` out of the matrix."""
+    for number in range(first, last):
+        plant.extra[number].stiffness = 0.0
+        plant.extra[number].damping = 0.0

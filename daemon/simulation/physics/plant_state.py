@@ -1,0 +1,259 @@
+"""The plant's record: its state, parameters, goals and scratch, one block that all kernels share.
+
+Pairs are (left, right). Coordinates are the joint angles q1, q2 and the object's x, y, φ.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.layout import Pair, Record, Records
+
+FloatArray = NDArray[np.float64]
+
+Three = Annotated[FloatArray, 3]
+Five = Annotated[FloatArray, 5]
+Six = Annotated[FloatArray, 6]
+Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 for each finger
+
+# Shapes of the object.
+NO_OBJECT = 0
+RECTANGLE = 1
+POLYGON = 2  # four edges
+DISC = 3
+
+# Operating modes, by the servos' own numbers.
+CURRENT_MODE = 0
+POSITION_MODE = 3
+CURRENT_BASED_POSITION_MODE = 5
+
+# Rows of a tip's contact.
+ALONG_D = 0
+ALONG_THETA = 1
+ALONG_SHEAR = 2
+
+CORNERS = 4  # of the object, which may lie on the palm
+PALM_ROWS = 8  # of the extra ones: height and slide of each corner
+EXTRA_ROWS = 14  # and d, θ and d_t of each tip on the other
+
+
+class Motion(Record):
+    """Coordinates, velocities, shears and currents: of a state, or their rates of change."""
+
+    position: Five  # [rad], [rad], [m], [m], [rad]
+    velocity: Five
+    shear: Pair  # d_t of the tips on the object [m]
+    extra_shear: Six  # of the palm under each corner, then of each tip on the other [m]
+    current: Pair  # [A]
+
+
+class Felt(Record):
+    """What each tip feels: of object and other tip the one that presses more."""
+
+    d: Pair  # [m], negative: a gap
+    theta: Pair  # [rad]
+    gain: Pair  # of the force against a plane
+    force: Pair  # on the tip's base [N]
+    normal: Pair  # N [N]
+    tangential: Pair  # T [N]
+    rim: Pair  # how far the backing plate's rim is pressed in [m]
+    bend: Pair  # curvature of what is touched [1/m]
+    mutual: Flags  # it is the other tip
+
+
+class Sample(Record):
+    """What the tips felt at a frame's instant; fields as in :class:`Felt`."""
+
+    number: int  # -1: none
+    t: float  # since the start [s]
+    d: Pair
+    theta: Pair
+    gain: Pair
+    bend: Pair
+
+
+class Edge(Record):
+    """An edge of the object's outline, in the object's frame."""
+
+    x: float  # where it starts [m]
+    y: float
+    normal_x: float  # outward
+    normal_y: float
+    length: float  # [m]
+
+
+class Parameters(Record):
+    """What the settings fix."""
+
+    step: float  # sub-step [s]
+    sample_period: float  # [s]
+    modulus: float  # of the real tip at zero strain [Pa]
+    radius: float  # of the tips [m]
+    scale: float  # real modulus over the table's
+    friction: float
+    loss: float  # damping over stiffness [s]
+    rim_stiffness: float  # [N/m]
+    tolerance: float  # share of the energy that smooth steps may gain
+    half_separation: float  # of the pivots [m]
+    length: float  # of a finger [m]
+    offset: float  # of the tip from the finger's axis [m]
+    present: Flags  # the tip takes part
+    shape: int  # of the object
+    half_width: float  # [m]
+    half_height: float  # [m]
+    roundness: float  # radius of a disc [m]
+    share: float  # stiffness of a tip on the object over that on a plane
+    extent: float  # farthest point from the object's centre [m]
+    outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
+    mass: float  # of the object [kg]
+    inertia: float  # of the object [kg·m²]
+    gravity: Pair  # x, y [m/s²]
+    table_force: float  # Coulomb friction of the table on the object [N]
+    table_torque: float  # likewise when it spins [N·m]
+    table_speed: float  # below it table friction is viscous [m/s]
+    table_spin: float  # [rad/s]
+    palm: float  # y of the palm [m]
+    palm_friction: float
+    joint_inertia: float  # [kg·m²]
+    joint_damping: float  # [N·m·s/rad]
+    joint_friction: float  # [N·m]
+    joint_speed: float  # below it joint friction is viscous [rad/s]
+    torque_constant: float  # [N·m/A]
+    electric_time: float  # lag of the current [s]
+    current_limit: float  # [A]
+    stall_current: float  # [A]
+    no_load_speed: float  # [rad/s]
+    position_gain: float  # [A/rad]
+    rate_gain: float  # [A·s/rad]
+    stop_low: Pair  # end stops [rad]
+    stop_high: Pair
+    stop_stiffness: float  # [N·m/rad]
+    joints_held: bool
+    object_held: bool
+    script_speed: float  # of a held object's to and fro; 0 leaves it still [m/s]
+    script_reach: Pair  # how far it goes to the left and to the right [m]
+    script_x: float  # where it starts [m]
+
+
+class Goals(Record):
+    """What servos and object are commanded."""
+
+    mode: Annotated[NDArray[np.int64], 2]
+    torque_on: Flags
+    q: Pair  # [rad]
+    current: Pair  # [A]
+    push: Three  # external force x, y [N] and torque [N·m] on the object
+
+
+class Finger(Record):
+    """Where a finger is: its tip's centre from the hand's origin."""
+
+    cosine: float  # of the joint angle
+    sine: float
+    x: float  # [m]
+    y: float
+    x_q: float  # derivatives by the joint angle [m/rad]
+    y_q: float
+
+
+class TipContact(Record):
+    """One tip on the object or on the other tip.
+
+    Rows are d, θ, d_t; columns q, x, y, φ, or q1, q2 for tip on tip.
+    """
+
+    d: float  # normal displacement [m], negative: a gap
+    theta: float  # tilt of the object against the tip [rad]
+    sine: float  # of θ
+    cosine: float
+    tangent: float  # tan θ, 0 where nothing soft is left
+    gain: float  # of the force against a plane: w(θ) and the face's curvature
+    bend: float  # curvature of what is touched [1/m]
+    reach: float  # how much deeper the step may lead [m]
+    rate_d: float  # [m/s]
+    rate_theta: float  # [rad/s]
+    slide: float  # velocity of what is touched less the tip's, along t [m/s]
+    shear: float  # d_t within its limits [m]
+    shear_rate: float  # stick rate of d_t [m/s]
+    force: float  # total force on the tip's base, what a pressure grid sums to [N]
+    energy: float  # elastic [J]
+    normal: float  # N [N]
+    tangential: float  # T [N]
+    rim: float  # how far the rim is pressed into the object [m], 0 when free
+    rim_energy: float  # of the rim alone, set where ``rim`` is above 0 [J]
+    rim_d: float  # its derivatives by d [N] and by θ [N·m]
+    rim_theta: float
+    rows: Annotated[FloatArray, 3, 4]  # ∂d, ∂θ and the increments of d_t by the coordinates
+    stiffness: Three  # along each row
+    damping: Three
+    along: Three  # forces along the rows, with losses
+    forces: Annotated[FloatArray, 4]  # generalised, on the coordinates
+
+
+class Stage(Record):
+    """All contacts as one of a step's two evaluations finds them."""
+
+    on_object: Annotated[Records[TipContact], 2]
+    on_tip: Annotated[Records[TipContact], 2]
+    extra_rate: Six  # stick rates of the extra shears [m/s]
+
+
+class ExtraRow(Record):
+    """A row over the coordinates, of a contact that only some scenes have."""
+
+    row: Five
+    stiffness: float
+    damping: float
+    shear: int  # 1 + the place of its shear among the extra ones, 0: none
+
+
+class Factors(Record):
+    """The step's matrix, factorised, of the scene where only the tips touch the object."""
+
+    joint: Pair  # inverse pivots
+    coupling: Annotated[FloatArray, 2, 3]  # of each joint to x, y, φ
+    pivot: Three  # inverse, of the object's 3 × 3 Schur complement as L D Lᵀ
+    l10: float
+    l20: float
+    l21: float
+
+
+class Full(Record):
+    """The step's matrix over all coordinates, factorised as L D Lᵀ."""
+
+    inverse: Five  # pivots
+    lower: Annotated[FloatArray, 5, 5]
+
+
+class Plant(Record):
+    """The simulated hand."""
+
+    parameters: Parameters
+    goals: Goals
+    state: Motion
+    felt: Felt  # at the state's instant
+    steps: int  # sub-steps done
+    samples: int  # taken
+    energy: float  # kinetic, elastic and gravitational [J]
+    allowed: float  # the most that it may be by the work done on the hand [J]
+    guarded: int  # sub-steps whose energy had to be brought down to that
+    earlier: Motion  # the state before the step
+    later: Motion  # where the second stage is evaluated
+    first: Motion  # k1 of the step
+    second: Motion  # k2
+    stages: Annotated[Records[Stage], 2]
+    fingers: Annotated[Records[Finger], 2]
+    forces: Five  # on the coordinates, but for the motors'
+    drag: Five  # friction over velocity
+    load: Five  # right-hand side of the step's equations
+    motor_by_q: Pair  # slopes of the motors' torques for the matrix
+    motor_by_rate: Pair
+    palm_energy: float  # [J]
+    tips_near: bool  # the tips on each other were evaluated
+    coupled: bool  # an extra row may act in this step
+    extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
+    factors: Factors
+    full: Full

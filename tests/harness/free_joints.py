@@ -1,0 +1,64 @@
+"""A plant of independent joints that touch nothing, for servo buses without a hand.
+
+Each joint is a motor with first-order current, inertia, viscous and Coulomb friction, and the
+servo's inner position loop in current; it is stepped with a fixed step, so a run is deterministic.
+The constants are about an XM430-W350 with nothing on its horn.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+STEP = 0.0005  # s
+INERTIA = 0.002  # kg·m², rotor through the gear
+VISCOUS = 0.05  # N·m·s/rad
+COULOMB = 0.02  # N·m
+TORQUE_CONSTANT = 1.78  # N·m/A
+CURRENT_LAG = 0.001  # s
+STIFFNESS = 8.0  # A/rad
+DAMPING = 0.10  # A·s/rad
+
+
+class FreeJoints:
+    """``count`` joints at rest at angle 0, as a servo bus wants them."""
+
+    def __init__(self, count: int = 2, start: float = 0.0) -> None:
+        self._start = start
+        self._done = 0  # steps since start
+        self.q: FloatArray = np.zeros(count)  # rad; may be written to place the joints
+        self.dq: FloatArray = np.zeros(count)  # rad/s
+        self.current: FloatArray = np.zeros(count)  # A
+        self._goals = [(False, 0.0, 0.0, 0.0)] * count  # torque on, signed current, angle, bound
+
+    def advance(self, t: float) -> None:
+        """Step up to time t [s]."""
+        count = int((t - self._start) / STEP + 1e-9) - self._done
+        if count > 0:
+            self._done += count
+            for joint in range(len(self.q)):
+                self._advance(joint, count)
+
+    def drive(
+        self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
+    ) -> None:
+        """Set what a joint's servo does, as :meth:`JointPlant.drive`."""
+        if mode == 0:
+            self._goals[joint] = torque_on, goal_current, 0.0, 0.0
+        else:
+            self._goals[joint] = torque_on, 0.0, goal_q, abs(goal_current)
+
+    def _advance(self, joint: int, count: int) -> None:
+        q, dq, current = (float(each[joint]) for each in (self.q, self.dq, self.current))
+        torque_on, fixed, goal, bound = self._goals[joint]
+        for _ in range(count):
+            wanted = min(max(STIFFNESS * (goal - q) - DAMPING * dq, -bound), bound) + fixed
+            current = current + (wanted - current) * STEP / CURRENT_LAG if torque_on else 0.0
+            dq += TORQUE_CONSTANT * current * STEP / INERTIA
+            dq /= 1.0 + VISCOUS * STEP / INERTIA
+            slow = COULOMB * STEP / INERTIA
+            dq -= min(max(dq, -slow), slow)
+            q += dq * STEP
+        self.q[joint], self.dq[joint], self.current[joint] = q, dq, current
