@@ -1,4 +1,4 @@
-"""``softfinger doctor``: is all well for the daemon? One line a check, and what mends it.
+"""``softfinger doctor``: checks ports, servos, boards, machine; one line each, with its fix.
 
 Arguments, order, printing and exit status; the checks are :mod:`softfinger.daemon.diagnosis`'s.
 """
@@ -13,8 +13,8 @@ from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
 from softfinger.daemon.diagnosis.hand import check_board, check_servos
 from softfinger.daemon.diagnosis.kernels import check_kernels
 from softfinger.daemon.diagnosis.machine import check_machine
-from softfinger.daemon.diagnosis.mending import mend_latency_timer, mend_servos
 from softfinger.daemon.diagnosis.ports import check_latency_timer, check_port, note_ports
+from softfinger.daemon.diagnosis.repair import repair_latency_timer, repair_servos
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     add_profile(parser)
-    parser.add_argument("--fix", action="store_true", help="mend what can be mended from here")
+    parser.add_argument("--fix", action="store_true", help="repair what can be repaired from here")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -54,14 +54,14 @@ def run(arguments: argparse.Namespace) -> int:
     for result in results(settings, arguments.fix):
         counts[result.status] = counts.get(result.status, 0) + 1
         print(f"{result.status:5}  {result.subject}: {result.text}", flush=True)
-        if result.mend:
-            print(f"       → {result.mend}", flush=True)
+        if result.fix:
+            print(f"       → {result.fix}", flush=True)
     print(f"{counts['pass']} passed, {counts['warn']} warnings, {counts['FAIL']} failed")
     return 1 if counts["FAIL"] else 0
 
 
 def results(settings: Settings, fix: bool) -> Iterator[Result]:
-    """All checks in the order of what needs what, with what was mended before them."""
+    """All checks in the order of what needs what, with what was repaired before them."""
     ports = _ports(settings)
     yield note_ports()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
@@ -101,9 +101,9 @@ def _ports(settings: Settings) -> list[tuple[str, str]]:
 
 def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Result]:
     if fix:
-        mended = mend_latency_timer(path)
-        if mended is not None:
-            yield mended
+        repaired = repair_latency_timer(path)
+        if repaired is not None:
+            yield repaired
     servos = path == settings.servos.port
     # A board sends by itself: the timer makes its frames late and none of them fail.
     found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
@@ -119,5 +119,5 @@ def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Re
     if not free[servos.port]:
         return
     if fix:
-        yield from mend_servos(settings)
+        yield from repair_servos(settings)
     yield from check_servos(settings)

@@ -81,7 +81,7 @@ def _serve(
 
     hold_collector()
     from softfinger.daemon.loop.build import Daemon
-    from softfinger.daemon.loop.rates import Schedule
+    from softfinger.daemon.loop.publishing import plan
     from softfinger.tools.processes.kernel_build import build_kernels, table_cache
 
     log.line("info", "start", f"softfinger: {_scene(settings)}")
@@ -96,7 +96,7 @@ def _serve(
         signals.hand_over(loop)
         for event in measures.events():
             loop.emit(*event)
-        loop.emit("info", "schedule", str(Schedule(settings)))
+        loop.emit("info", "schedule", plan(settings))
         log.line("info", "start", _ready(settings, daemon))
         recording: Any = nullcontext()
         if arguments.record is not None:

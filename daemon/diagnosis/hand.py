@@ -89,8 +89,8 @@ def _search(settings: Settings, model: ServoModel, wait: float) -> list[Result]:
         fix = f"softfinger doctor --fix makes it {change.name}: {change}; or set {other}"
         lines.append(Result("note", "found", str(change.servo), fix))
     for each in what.strangers:
-        mend = ALONE if what.missing and each.number == model.number else ""
-        lines.append(Result("note", "found", str(each), mend))
+        fix = ALONE if what.missing and each.number == model.number else ""
+        lines.append(Result("note", "found", str(each), fix))
     return lines or [Result("note", "found", "no other servo answers at any rate")]
 
 
@@ -103,9 +103,9 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
     try:
         sensor.open()
     except TactileError as error:
-        what, _, mend = str(error).rpartition(": ")
-        if mend.startswith(("set ", "move ")):
-            return Result("FAIL", name, what, mend)
+        what, _, fix = str(error).rpartition(": ")
+        if fix.startswith(("set ", "move ")):
+            return Result("FAIL", name, what, fix)
         return Result("FAIL", name, str(error), "check tactile.port, its baud and its cable")
     try:
         before, start = sensor.counters(), time.monotonic()

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from softfinger.daemon.diagnosis.result import Result
-from softfinger.daemon.loop import rights
+from softfinger.daemon.loop.realtime import GRANT_LATENCY, GRANT_MEMORY_LOCK, GRANT_PRIORITY
 
 _MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
 _WAKE_UPS = 100
@@ -45,7 +45,7 @@ def check_scheduling() -> Result:
             "warn",
             "scheduling",
             f"SCHED_FIFO is not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick",
-            rights.PRIORITY,
+            GRANT_PRIORITY,
         )
     os.sched_setscheduler(0, *before)
     return Result("pass", "scheduling", "SCHED_FIFO is allowed")
@@ -64,7 +64,7 @@ def check_memory_lock(limit: int) -> Result:
         "warn",
         "memory lock",
         f"{size} may be locked, {_MEMORY >> 20} MiB wanted: pages of the loop can be swapped out",
-        rights.MEMORY_LOCK,
+        GRANT_MEMORY_LOCK,
     )
 
 
@@ -79,7 +79,7 @@ def check_idle_states(path: Path) -> Result:
         "warn",
         name,
         "no permission to hold it: wake-ups take what idle states take",
-        rights.LATENCY,
+        GRANT_LATENCY,
     )
 
 

@@ -87,8 +87,8 @@ def _busy(path: str, mode_of_daemon: str) -> Result:
         text = f"the softfinger daemon that runs here has it ({mode_of_daemon}, process "
         return Result("warn", path, f"{text}{daemons[0]})", "end that one to have its port checked")
     names = ", ".join(f"process {pid} ({name})" for pid, name in others) or "another process"
-    mend = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end that one"
-    return Result("FAIL", path, f"in use by {names}", mend)
+    fix = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end that one"
+    return Result("FAIL", path, f"in use by {names}", fix)
 
 
 def _is_daemon(process: int) -> bool:

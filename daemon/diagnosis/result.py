@@ -1,4 +1,4 @@
-"""What a check found: one line and, unless all is well, the command that mends it."""
+"""What a check found: one line and, unless all is well, the command that fixes it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Result:
     status: Status
     subject: str  # what was looked at
     text: str  # what was found
-    mend: str = ""  # a command, or what to do by hand; empty when nothing is to be done
+    fix: str = ""  # a command, or what to do by hand; empty when nothing is to be done
 
     @property
     def failed(self) -> bool:

@@ -11,6 +11,6 @@ neither NumPy nor the loop.
     message's parts nor a client's subscriptions, and can't tell what arrived before a stop
 ``curve``
     clients with keys, by libzmq and pyzmq's authenticator
-``requests``
+``admission``
     which request goes to the loop next, and which is refused
 """

@@ -165,7 +165,7 @@ class Daemon:
 
 
 def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFacts:
-    """What subscribers are told of this hand once: settings, calibrations, tables' certificates."""
+    """Published once for each subscriber: settings, calibrations, the tables' certificates."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
     ]

@@ -1,7 +1,7 @@
-"""How late this machine is with the loop's ticks: told now and then, and named as a fault's cause.
+"""How late this machine is with the loop's ticks: an event now and then, and a fault's cause.
 
-All times are the machine's own. A hand on real time has then been left alone for as long; a
-simulated one on its own time has waited (`clock.HandClock`).
+All times are the machine's own. Meanwhile a hand on real time was left alone; a simulated one on
+its own time has waited (`daemon.clock.HandClock`).
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ import math
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
 
-LATE = 0.05  # s from which lateness is told
-EVERY = 5.0  # s between two tellings
-RECENT = 0.25  # s after a late tick in which a fault may be its doing
-FIRST = 1.0  # s of ticks after which it is told how steady they were
-_STEADY = 0.2  # share of the servos' watchdog that a pause may take without a warning
-# Rows of `safety.limits` that stand when a tick comes late.
+LATE = 0.05  # s of lateness that is reported
+EVERY = 5.0  # s between two reports
+RECENT = 0.25  # s after a late tick in which it may be a fault's cause
+FIRST = 1.0  # s of ticks after which their steadiness is reported
+_STEADY = 0.2  # share of the servos' watchdog time that a pause may take without a warning
+# Limits that a late tick alone can break.
 _BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
 
 
 class Lateness:
-    """One loop's: `look` is for every tick, `with_cause` for what was found at one."""
+    """Follows one loop's ticks."""
 
     def __init__(self, settings: Settings, timing: Timing) -> None:
         """``timing`` is the loop's own; what is written there is ``busy_s`` alone."""
@@ -34,13 +34,13 @@ class Lateness:
         self._begin = math.nan
         self._worst = 0.0  # s by which a pause of the first second was longer than the period
         self._sum = 0.0  # s that ticks came late in all, or that the hand has waited
-        self._told = (0.0, -math.inf)  # that sum, and when
+        self._reported = (0.0, -math.inf)  # that sum, and when
         self._busy_until = -math.inf
 
     def look(self, t: float, own_doing: bool) -> Event | None:
         """Take in the tick that began at ``t`` [s] and whose ``timing`` is up to its start.
 
-        ``own_doing``: the last one took its time for a command. The event to be told, if any.
+        ``own_doing``: the last one was late because of a command. The event to emit, if any.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period
@@ -52,9 +52,9 @@ class Lateness:
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATE:
             self._sum += gap
-        new = self._sum - self._told[0]
-        if new > LATE and t - self._told[1] > EVERY:
-            self._told = (self._sum, t)
+        new = self._sum - self._reported[0]
+        if new > LATE and t - self._reported[1] > EVERY:
+            self._reported = (self._sum, t)
             return "warning", "late", self._text(new)
         return self._steadiness(t, gap) if self._watchdog else None
 
@@ -63,7 +63,7 @@ class Lateness:
         return f"this machine is busy: {did}, {self._sum:.1f} s in all"
 
     def _steadiness(self, t: float, gap: float) -> Event | None:
-        """Once, the first second's longest pause against what the servos bear."""
+        """Once, the longest pause of the first second, against the servos' watchdog time."""
         if math.isnan(self._begin):
             self._begin = t
         self._worst = max(self._worst, gap)
@@ -85,10 +85,9 @@ class Lateness:
         )
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
-        """What was found, behind its cause where this machine was busy a moment ago.
+        """A finding's text, after "this machine was busy" where it was so a moment ago.
 
-        ``name`` is that of a row in `safety.limits`; ``at_work`` [s] how long the present tick has
-        been at it.
+        ``name`` is the broken limit's; ``at_work`` [s] how long the present tick has taken so far.
         """
         timing = self._timing
         if self._waits or name not in _BY_TIME:

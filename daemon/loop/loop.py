@@ -17,13 +17,13 @@ from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskOver
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.lateness import Lateness
-from softfinger.daemon.loop.publishing import Broadcast
+from softfinger.daemon.loop.publishing import Publishing
 from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.supervisor import BUS, Safety
-from softfinger.daemon.safety.torque_state import Drive
+from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import State, Truth
 from softfinger.daemon.wire.command_server import Handler
@@ -44,7 +44,7 @@ class Commands(Protocol):
 
     @property
     def notices(self) -> deque[str]:
-        """What is to be told of the process that serves clients."""
+        """News of the process that serves clients, for events."""
 
     def serve(self, handler: Handler) -> None:
         """Carry out through ``handler`` what is due at this tick."""
@@ -78,7 +78,7 @@ class Loop:
         self._control = Control(settings, self.state, grasp)
         self._task = Task.named(settings)
         self._safety = Safety(settings, servos is not None, bool(sensors), grasp, sensors)
-        self._drive = Drive(
+        self._torque = TorqueState(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
         self._requests = Requests(
@@ -86,16 +86,16 @@ class Loop:
             self.state,
             self._control,
             self._safety,
-            self._drive,
+            self._torque,
             perception,
             self.emit,
         )
         self._fault_after_opening = ("", "")  # name and reason
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing)
-        self._broadcast = None
+        self._publishing = None
         if publisher is not None:
-            self._broadcast = Broadcast(settings, publisher, sensors, self.statistics)
+            self._publishing = Publishing(settings, publisher, sensors, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
         self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
         self._ending = False
@@ -106,11 +106,11 @@ class Loop:
     @property
     def servos(self) -> Servos | None:
         """What is read and driven."""
-        return self._drive.servos
+        return self._torque.servos
 
     @servos.setter
     def servos(self, servos: Servos | None) -> None:
-        self._drive.servos = servos
+        self._torque.servos = servos
 
     # What may be asked from outside the tick, a signal handler included
 
@@ -128,8 +128,8 @@ class Loop:
 
     def tell_truth(self, truth: Truth | None) -> None:
         """Publish what a simulated hand knows, too, to those who ask."""
-        if self._broadcast is not None:
-            self._broadcast.truth = truth
+        if self._publishing is not None:
+            self._publishing.truth = truth
 
     # Time
 
@@ -144,7 +144,7 @@ class Loop:
             self.advance(duration)
         finally:
             self._control.torque = False
-            self._drive.end()
+            self._torque.end()
             if self.state.torque:
                 self.emit("error", "end", "ended, torque MAY STILL BE ON")
             else:
@@ -157,7 +157,7 @@ class Loop:
         real time has gone on meanwhile, a simulated hand's own has waited.
         """
         clock, timing = self._clock, self.state.timing
-        clock.sleep_until(clock.now())  # what went before is no lateness of a tick
+        clock.sleep_until(clock.now())  # what went before does not count as late
         before = clock.behind - timing.behind_s
         deadline = clock.now()
         last = clock.host() - self.period
@@ -203,10 +203,10 @@ class Loop:
         self.perception.update(state)
         self._decide()
         decided = clock.host()
-        self._drive.write(self._control.torque, now)
+        self._torque.write(self._control.torque, now)
         written = clock.host()
-        if self._broadcast is not None:
-            self._broadcast(state)
+        if self._publishing is not None:
+            self._publishing(state)
         done = clock.host()
         state.timing.compute_s = done - began
         record(
@@ -223,7 +223,7 @@ class Loop:
         state, reading = self.state, self.state.reading
         state.read_error = state.write_error = ""
         try:
-            self._drive.read(reading)
+            self._torque.read(reading)
         except ServoError as error:
             reading.valid = False
             state.read_error = str(error)

@@ -1,8 +1,8 @@
-"""The loop run again on what it took in: recorded readings, frames and commands, tick by tick.
+"""Re-run of a recording through today's code: its readings, frames and commands, tick by tick.
 
-Servos, sensors, clock and commands here say what the recording says; estimator, tables, prediction,
-control and limits are today's. Whoever gives it all inputs from the first tick on, with the same
-code and settings, gets the same states to the last bit.
+Servos, sensors, clock and commands are the recording's; estimator, tables, filter, control and
+limits are today's. All inputs from the first tick on, with the same code and settings, give the
+same states to the last bit.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
 from softfinger.daemon.wire.command_server import Handler
 
 
-class Recomputation:
-    """A loop that is fed. ``calibrations`` are the recorded ones as JSON, empty where none was."""
+class ProcessReplay:
+    """A loop on recorded inputs; ``calibrations`` as JSON, empty where there was none."""
 
     def __init__(
         self, settings: Settings, calibrations: Sequence[str], cache: Path | None = None
@@ -116,7 +116,7 @@ class _Clock:
 
 
 class _Servos:
-    """The recorded readings; what is written goes nowhere, and fails where it failed."""
+    """The recorded readings and failures; what is written goes nowhere."""
 
     def __init__(self) -> None:
         self.taken: Mapping[str, Any] = {}
@@ -180,7 +180,7 @@ class _Commands:
             try:
                 handler(request)
             except Refused:
-                pass  # it was carried out when it was recorded: the states will differ and be told
+                pass  # carried out when it was recorded: the comparison will show it
         self.waiting = []
 
     def begin_epoch(self) -> None:

@@ -1,14 +1,14 @@
-"""What goes out to subscribers on which tick, and how often that really was.
+"""What goes out to subscribers on which tick, and at what rates that really was.
 
-Holds the decimation of the published topics. It sends through `wire.publisher` and looks at what
-the loop shows it; it changes nothing there.
+A topic goes out on exactly every n-th tick, counted by ``seq``, with the n whose rate is nearest to
+the wanted one; statistics on ticks of their own where n allows it, so that no tick carries all. Of
+every n frames one is published. What is sent, `wire.publisher` sends; nothing is changed here.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softfinger.daemon.loop.rates import Schedule
 from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -20,6 +20,29 @@ from softfinger.daemon.wire.schema import Rates
 _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
+_STATS_RATE = 1.0  # Hz of the loop's own statistics
+_STATS_PHASE = 3  # ticks after those of the state
+
+
+def every(rate: float, wanted: float) -> int:
+    """Of how many at ``rate`` one comes nearest to the ``wanted`` rate."""
+    return max(round(rate / wanted), 1)
+
+
+def plan(settings: Settings) -> str:
+    """What is done how often, in one line for people."""
+    rate, frames, stream = settings.loop.rate, settings.tactile.rate, settings.stream
+    parts = [f"every tick ({rate:g} Hz) read, feel, decide, bound, write"]
+    if settings.tactile.backend != "none":
+        parts[0] += f", tactile frames as they come ({frames:g} Hz)"
+        n = every(frames, stream.tactile_rate)
+        each = "frame" if n == 1 else f"{n} frames"
+        parts.append(f"every {each} hand/tactile ({frames / n:.4g} Hz)")
+    for topic, wanted in (("hand/state", stream.state_rate), ("hand/stats", _STATS_RATE)):
+        n = every(rate, wanted)
+        each = "tick" if n == 1 else f"{n} ticks"
+        parts.append(f"every {each} {topic} ({rate / n:.4g} Hz)")
+    return "; ".join(parts)
 
 
 @dataclass(slots=True)
@@ -43,7 +66,7 @@ def parts(settings: Settings) -> Parts:
     )
 
 
-class Broadcast:
+class Publishing:
     """Publishes what is due at a tick and wanted by somebody."""
 
     def __init__(
@@ -56,19 +79,23 @@ class Broadcast:
         self._publisher = publisher
         self._perceptions = perceptions
         self._statistics = statistics
-        self._schedule = Schedule(settings)
-        self._period = 1.0 / settings.loop.rate
+        rate, stream = settings.loop.rate, settings.stream
+        self._period = 1.0 / rate
+        self._state_every = every(rate, stream.state_rate)
+        self._stats_every = every(rate, _STATS_RATE)
+        self._stats_phase = _STATS_PHASE % self._stats_every
+        self._frames_every = every(settings.tactile.rate, stream.tactile_rate)
         self._scene = parts(settings)
         self.truth: Truth | None = None  # a simulated hand's
         self._numbers = [0, 0]  # frames of each finger that went out
         self._seen: list[Frame | None] = [None, None]  # newest of each finger
         self._published = [-1, -1]  # of which n frames one went out, for each finger
         self._states = self._maps = 0  # messages that went out
-        self._told = _Counts()  # when the rates were last told
+        self._counted = _Counts()  # when the rates were last published
 
     def __call__(self, state: State) -> None:
         """All that is due at this tick."""
-        publisher, schedule, seq = self._publisher, self._schedule, state.seq
+        publisher, seq = self._publisher, state.seq
         wanted = publisher.wanted
         if wanted & _TACTILE:
             for perception in self._perceptions:
@@ -79,40 +106,38 @@ class Broadcast:
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
             publisher.input(state, (frames[0], frames[1]))
-        if schedule.state.due(seq):
+        if seq % self._state_every == 0:
             if wanted & _STATE:
                 self._states += 1
-                publisher.state(state, self._scene, schedule.state.every)
+                publisher.state(state, self._scene, self._state_every)
             if wanted & _TRUTH and self.truth is not None:
-                publisher.truth(state, self.truth, schedule.state.every)
-        if schedule.stats.due(seq):
+                publisher.truth(state, self.truth, self._state_every)
+        if seq % self._stats_every == self._stats_phase:
             rates = self._rates(state)
             if wanted & _STATS:
-                publisher.stats(state, self._period, rates, self._statistics, schedule.stats.every)
+                publisher.stats(state, self._period, rates, self._statistics, self._stats_every)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:
         frame = self._seen[perception.finger] = perception.frame
-        every = self._schedule.tactile_every
-        if frame is None or frame.seq // every == self._published[perception.finger]:
+        n = self._frames_every
+        if frame is None or frame.seq // n == self._published[perception.finger]:
             return
-        self._published[perception.finger] = frame.seq // every
+        self._published[perception.finger] = frame.seq // n
         self._numbers[perception.finger] += 1
         self._maps += 1
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.shown(frame)
         number = self._numbers[perception.finger]
-        self._publisher.tactile(
-            frame, data, perception.finger, perception.facts, wall, every, number
-        )
+        self._publisher.tactile(frame, data, perception.finger, perception.facts, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
         """Rates [Hz] since they were last asked for, by the machine's time."""
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frames
-        last = self._told
+        last = self._counted
         t = state.t + state.timing.behind_s
-        now = self._told = _Counts(t, state.seq, self._states, self._maps, *frames)
+        now = self._counted = _Counts(t, state.seq, self._states, self._maps, *frames)
         per = 1.0 / (now.t - last.t) if now.t > last.t else 0.0
         return Rates(
             tick=per * (now.ticks - last.ticks),

@@ -1,8 +1,7 @@
-"""How the process is made fit for a steady tick: each measure is asked for once, after warm-up.
+"""Scheduling, memory and timers for a steady tick: the section ``[realtime]``, once, after warm-up.
 
-Holds the measures of the settings' section ``[realtime]``, what became of each, and nothing that
-the tick itself does (the spin before a deadline is `daemon.clock`'s). No measure is needed: what
-the system does not allow is told, with what is lost and the command that grants it.
+No measure is needed: one that the system refuses is reported, with what is lost and the command
+that grants it. The spin before a deadline is `daemon.clock`'s.
 """
 
 from __future__ import annotations
@@ -19,11 +18,22 @@ from functools import partial
 from types import TracebackType
 from typing import NamedTuple
 
-from softfinger.daemon.loop import rights
 from softfinger.daemon.profile.settings import Realtime, Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
 _LATENCY = "/dev/cpu_dma_latency"
+
+# The commands that grant a user what is asked of the system.
+_LIMITS = "/etc/security/limits.d/softfinger.conf"
+_RULE = "/etc/udev/rules.d/99-softfinger.rules"
+_LATENCY_RULE = 'KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"'
+
+GRANT_PRIORITY = f'echo "$USER - rtprio 80" | sudo tee -a {_LIMITS}, then log in again'
+GRANT_MEMORY_LOCK = f'echo "$USER - memlock unlimited" | sudo tee -a {_LIMITS}, then log in again'
+GRANT_LATENCY = (
+    f"echo '{_LATENCY_RULE}' | sudo tee -a {_RULE} && sudo udevadm control --reload "
+    "&& sudo udevadm trigger /dev/cpu_dma_latency"
+)
 
 # From <sys/prctl.h> and <sys/mman.h>.
 _PR_SET_TIMERSLACK = 29
@@ -45,11 +55,10 @@ def hold_collector() -> None:
 
 
 def settle(freeze: bool = True) -> None:
-    """Keep the collector and other threads from holding up what is to be answered in time.
+    """Keep the collector and other threads from delaying the loop.
 
-    A full collection over everything that numpy and numba brought along takes tens of
-    milliseconds, so what exists now is frozen out of it, without a last collection for the same
-    reason. A thread may keep the interpreter for a switch interval, 5 ms unless it is set lower.
+    A full collection over all of numpy and numba takes tens of milliseconds: what exists now is
+    frozen out of it. A thread may keep the interpreter for a switch interval, 5 ms by default.
     """
     if freeze:
         gc.freeze()
@@ -69,11 +78,10 @@ class Outcome(NamedTuple):
 
 
 class RealTime:
-    """The measures, held while this is open: ``with RealTime(settings): loop.loop.run()``.
+    """The measures, held while this is open: ``with RealTime(settings): loop.run()``.
 
-    To be opened in the thread that ticks, after warm-up, when all that lasts has been built.
-    Never raises; ``outcomes`` says what came of each. On virtual time, which waits for nothing,
-    only the collector and other threads are kept from the tick.
+    To be opened in the thread that ticks, after warm-up. Never raises; ``outcomes`` says what came
+    of each. On virtual time only the collector and other threads are kept from the tick.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -110,8 +118,8 @@ class RealTime:
         """For the loop's events: one that names all that is had, one for each refusal."""
         had = ", ".join(outcome.text for outcome in self.outcomes if outcome.granted)
         refused = [str(outcome) for outcome in self.outcomes if not outcome.granted]
-        told = [("info", "realtime", had)] if had else []
-        return told + [("warning", "realtime", text) for text in refused]
+        events = [("info", "realtime", had)] if had else []
+        return events + [("warning", "realtime", text) for text in refused]
 
     def close(self) -> None:
         """Give everything back. Never raises."""
@@ -161,7 +169,7 @@ def _schedule(wanted: Realtime) -> Asked:
             f"SCHED_FIFO {wanted.priority} refused ({error.strerror}): "
             "other processes can hold up a tick"
         )
-        return Outcome(False, text, rights.PRIORITY), []
+        return Outcome(False, text, GRANT_PRIORITY), []
     return Outcome(True, f"SCHED_FIFO {wanted.priority}"), undo
 
 
@@ -175,8 +183,7 @@ def _fifo(thread: int, priority: int) -> Callable[[], None]:
 def _shorten_slice(wanted: Realtime) -> Asked:
     """Under the usual scheduling, a short slice for the loop and the threads of its interpreter.
 
-    Of all that wait for a busy processor, Linux (from 6.12 on) takes the one whose slice would be
-    over first: who asks for little at a time gets it sooner, and no more of it in the end.
+    Linux (from 6.12 on) runs the thread whose slice would end first: a short one runs sooner.
     """
     usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
     calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
@@ -203,10 +210,10 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
     asked = _ATTRIBUTES.pack(size, os.SCHED_OTHER, 0, nice, 0, nanoseconds, 0, 0)
     if libc.syscall(set_call, thread, ctypes.create_string_buffer(asked), 0) != 0:
         return False
-    told = ctypes.create_string_buffer(size)
-    if libc.syscall(get_call, thread, told, size, 0) != 0:
+    found = ctypes.create_string_buffer(size)
+    if libc.syscall(get_call, thread, found, size, 0) != 0:
         return False
-    return bool(_ATTRIBUTES.unpack(told.raw)[5] == nanoseconds)
+    return bool(_ATTRIBUTES.unpack(found.raw)[5] == nanoseconds)
 
 
 def _keep_to_processors(wanted: Realtime) -> Asked:
@@ -228,11 +235,10 @@ def _keep_to_processors(wanted: Realtime) -> Asked:
 
 
 def _lock_memory(wanted: Realtime) -> Asked:
-    """Pages stay in memory once they have been touched, which after warm-up they are.
+    """Lock pages in memory once they have been touched, as after warm-up they are.
 
-    Not all that is mapped: of a compiler's libraries two thirds are never touched, and to read them
-    in takes most of a second. Under a limit only what is mapped now is locked, since whatever is
-    mapped later could then no longer be had.
+    Two thirds of a compiler's libraries never are, and reading them in takes most of a second.
+    Under a limit only what is mapped now is locked, or later mappings would fail.
     """
     if not wanted.lock_memory:
         return None, []
@@ -244,7 +250,7 @@ def _lock_memory(wanted: Realtime) -> Asked:
     if libc.mlockall(flags) != 0:
         why = os.strerror(ctypes.get_errno())
         text = f"memory lock refused ({why}): pages of the loop can be swapped out"
-        return Outcome(False, text, rights.MEMORY_LOCK), []
+        return Outcome(False, text, GRANT_MEMORY_LOCK), []
     return Outcome(True, "memory locked"), [libc.munlockall]
 
 
@@ -257,7 +263,7 @@ def _hold_latency(wanted: Realtime) -> Asked:
     except OSError as error:
         text = f"{_LATENCY} refused ({error.strerror}): wake-ups take what idle states take"
         missing = isinstance(error, FileNotFoundError)
-        return Outcome(False, text, "" if missing else rights.LATENCY), []
+        return Outcome(False, text, "" if missing else GRANT_LATENCY), []
     try:
         os.write(descriptor, bytes(4))
     except OSError as error:

@@ -17,7 +17,7 @@ from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.daemon.safety.supervisor import Safety
-from softfinger.daemon.safety.torque_state import Drive
+from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, State
 
 _COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
@@ -101,7 +101,7 @@ class Requests:
         state: State,
         control: Control,
         safety: Safety,
-        drive: Drive,
+        torque: TorqueState,
         perception: Perception,
         emit: Callable[[str, str, str], None],
     ) -> None:
@@ -110,7 +110,7 @@ class Requests:
         self._state = state
         self._control = control
         self._safety = safety
-        self._drive = drive
+        self._torque = torque
         self._perception = perception
         self._emit = emit
         self._lease = Lease(settings.commands.lease)
@@ -137,7 +137,7 @@ class Requests:
         if queued:
             reply |= {"queued": name, "until": Mode.HOLDING.value}
         elif name in ("stop", "disarm"):
-            reply["torque_off"] = "confirmed" if self._drive.off() else "unconfirmed"
+            reply["torque_off"] = "confirmed" if self._torque.off() else "unconfirmed"
         elif name == "status":
             reply |= self._status()
         return reply
@@ -151,7 +151,7 @@ class Requests:
         if judged and (cause := self._safety.cause(state, gripping=name != "arm")):
             yield cause
         if name == "arm":
-            if self._drive.servos is None:
+            if self._torque.servos is None:
                 yield "this scene has no servos"
             elif not state.reading.valid:
                 yield "the servos were not read at this tick"
@@ -202,12 +202,12 @@ class Requests:
         """
         state = self._state
         silent = state.t - state.reading.t > self._settings.servos.fault_after
-        if self._drive.servos is None or not silent:
+        if self._torque.servos is None or not silent:
             return
-        if self._drive.pending and not state.read_error:
+        if self._torque.pending and not state.read_error:
             return  # the port is there: connecting would only disturb the silence on it
         try:
-            self._drive.reconnect()
+            self._torque.reconnect()
         except ServoError as error:
             raise Refused(f"clear: {error}") from None
         self._emit("info", "servos", "connected anew")
@@ -235,7 +235,7 @@ class Requests:
                 self._perception.update(self._state)
 
     def _status(self) -> dict[str, Any]:
-        state, servos = self._state, self._drive.servos
+        state, servos = self._state, self._torque.servos
         counters = {} if servos is None else {"servos": servos.counters()}
         for perception in self._perception.fingers:
             counters[f"tactile-{FINGERS[perception.finger]}"] = perception.sensor.counters()

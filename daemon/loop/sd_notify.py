@@ -1,7 +1,7 @@
-"""What systemd is told: ready, alive, stopping. Nothing without it.
+"""Notifications to systemd (sd_notify): ready, alive, stopping; nothing without it.
 
-A service of ``Type=notify`` is told by one datagram each; the loop calls `Service.alive` at every
-tick, which sends a few times within the watchdog's time and is a comparison otherwise.
+Each is one datagram. The loop calls `Service.alive` at every tick, which sends a few times within
+the watchdog's time and is a comparison otherwise.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Histograms of the loop's own times: one kernel call a tick, read out once a second.
 
 Holds bins, counting and quantiles, and nothing that knows the loop or the wire. Each octave from
-1 ns up is cut into 32 bins, so that a quantile, told as its bin's upper edge, is never understated
+1 ns up is cut into 32 bins, so that a quantile, given as its bin's upper edge, is never understated
 and at most 3.2 % too great; the largest value is kept as it is.
 """
 
@@ -107,8 +107,8 @@ class Statistics:
     def spreads(self) -> dict[str, Spread]:
         """What was counted, by the names in `TIMES`; all 0 before the first tick."""
         _quantiles(self.counts, self.largest, self._shares, self._out)
-        told = zip(TIMES, self._out.tolist(), self.largest.tolist(), strict=True)
-        return {name: Spread(row[0], row[1], row[2], largest) for name, row, largest in told}
+        rows = zip(TIMES, self._out.tolist(), self.largest.tolist(), strict=True)
+        return {name: Spread(row[0], row[1], row[2], largest) for name, row, largest in rows}
 
     def table(self) -> list[str]:
         """The same for people, in µs."""

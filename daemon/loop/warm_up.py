@@ -29,7 +29,7 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 class Scene:
     """A scene whose kernels are wanted; ``cache`` is where contact tables are kept.
 
-    What is wrong with a kept table is told to ``on_event``.
+    ``on_event`` takes a warning where a kept table can't be used.
     """
 
     def __init__(
@@ -192,6 +192,6 @@ _SENSOR = Part("simulated sensor", 16, _sensor)
 _CONTROL = Part("filter and grip", 38, _control, after=_TABLE.name)
 _MANY = Part("lookup of many points", 2, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _CONTROL, _MANY)
-EMULATED = (_TABLE, _HAND, _SENSOR)  # what the stand-in hand needs
+EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
 LANDSCAPE = (_TABLE, _MANY)  # what a picture of the energy needs
 FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # what frames are analysed with

@@ -1,4 +1,4 @@
-"""From settings to the objects of `kinematics` that they describe, and nothing else."""
+"""Makes what settings describe: tip, material, contact table, sensor grid."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def make_tip(settings: Settings) -> Fingertip:
 
 
 def make_material(law: MaterialLaw) -> Material:
-    """The settings' stress-strain law. Raises SettingsError when the points are no such law."""
+    """The settings' stress-strain law. Raises SettingsError for points that are no usable law."""
     if law.law == "constant":
         return Material.constant(law.modulus)
     if law.law == "table_i":
@@ -43,8 +43,8 @@ def make_table(
 ) -> ContactTable:
     """The contact table, from its file in ``cache`` where one fits.
 
-    What is wrong with that file is told to ``on_event``. Raises SettingsError when no table of this
-    material reaches the tolerance.
+    ``on_event`` takes a warning where that file can't be used. Raises SettingsError when no table
+    of this material reaches the tolerance.
     """
     tip = make_tip(settings)
     tolerance = settings.table.tolerance

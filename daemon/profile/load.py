@@ -1,7 +1,7 @@
 """Profiles: a TOML file in, validated `Settings` out, or one report with everything that is wrong.
 
-Holds the reading and the report's words. What the keys allow one by one stands in
-`profile.settings`, what they don't allow together in `profile.validation`.
+What each key allows stands in `profile.settings`, what they don't allow together in
+`profile.validation`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic_core import ErrorDetails
 import softfinger
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.validation import contradictions, shown
+from softfinger.daemon.profile.validation import problems, shown
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
 _DEEPEST = 8  # tables and arrays in each other
@@ -46,18 +46,18 @@ def load(
     data = _read(find(path), name) if path else {}
     changed = {_change(data, change) for change in changes}
     wrong: set[str] = set()
-    problems: list[str] = []
+    found: list[str] = []
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
         settings, wrong = _sound_sections(data)
-        problems = [_line(details) for details in error.errors()]
-    problems += contradictions(settings, directory, wrong)
-    if problems:
+        found = [_line(details) for details in error.errors()]
+    found += problems(settings, directory, wrong)
+    if found:
         raise SettingsError(
             "\n".join(
                 f"{'--set' if problem.split(':')[0] in changed else name}: {problem}"
-                for problem in problems
+                for problem in found
             )
         )
     return settings if directory is None else _with_directory(settings, directory)

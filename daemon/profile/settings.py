@@ -154,7 +154,7 @@ class TactileSettings(Section):
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
-    sensor: tuple[str, str] = ("", "")  # what tells the sensors from others, as a serial number
+    sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
     calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
     recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, folder of .npy, ASCII export
     replay_again: bool = True  # backend = "replay": from the start at the end, else it ends
@@ -168,7 +168,7 @@ class EstimatorSettings(Section):
 
 
 class Loop(Section):
-    """The tick, and whose time it goes by.
+    """The tick and its clock.
 
     ``real`` is this machine's time; ``hand`` a simulated hand's own, which waits while the machine
     is busy; ``virtual`` runs as fast as the machine can. The latter two need simulated backends;
@@ -180,7 +180,7 @@ class Loop(Section):
 
 
 class Realtime(Section):
-    """How the process is made fit for a steady tick; what isn't allowed is told and done without.
+    """Measures for a steady tick; the daemon reports what the system refuses and runs without it.
 
     All but the priority are harmless: a program at SCHED_FIFO keeps others off its processor.
     """

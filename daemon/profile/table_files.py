@@ -1,8 +1,7 @@
-"""Contact tables kept in files, so that a start does not build them again; and nothing else.
+"""Contact tables kept in files, so that a start does not build them again.
 
 A file is written beside its place and moved there, so that it appears whole or not at all. One
-that is damaged, foreign or can't be read is replaced; where nothing can be kept, the table is built
-all the same.
+that is damaged or can't be read is replaced; where no file can be kept, the table is built anyway.
 """
 
 from __future__ import annotations
@@ -67,12 +66,12 @@ def load_or_build(
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, TableError) as error:
-        warn(f"the contact table is built anew: {error}")
+        warn(f"the contact table is built again: {error}")
     table = ContactTable.build(tip, material, tolerance)
     try:
         save_table(file, table, tip, material)
     except OSError as error:
-        warn(f"the contact table can't be kept, each start builds it anew: {error}")
+        warn(f"the contact table can't be kept, each start builds it again: {error}")
     return table
 
 

@@ -1,7 +1,7 @@
-"""What each key of a profile allows and all of them together don't.
+"""Cross-field validation of a profile: what its keys don't allow together.
 
-One function a question, in one table with the sections it looks at; each gives lines of key, found
-and expected. A question is left out when one of its sections is wrong already.
+One function a check, in one table with the sections it reads; each yields lines of key, found and
+expected. A check is left out when one of its sections is wrong already.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
 
-def contradictions(settings: Settings, directory: Path | None, wrong: set[str]) -> list[str]:
-    """All that contradicts itself. ``wrong``: sections that must not be looked at."""
+def problems(settings: Settings, directory: Path | None, wrong: set[str]) -> list[str]:
+    """What does not fit together. ``wrong``: sections that must not be looked at."""
     found: list[str] = []
-    for sections, question in _QUESTIONS:
+    for sections, check in _CHECKS:
         if not wrong.intersection(sections):
-            found += question(settings)
+            found += check(settings)
     if directory is None and not wrong.intersection(("servos", "tactile")):
         found += _folder(settings)
     return found
@@ -167,8 +167,8 @@ def _forces(settings: Settings) -> Iterator[str]:
             yield f"{key}: found {force:g} N, expected above {low:g} to {high:g}"
 
 
-def address_fault(address: str, lacking: str) -> str:
-    """What speaks against binding a socket to ``address``; empty: nothing.
+def address_problem(address: str, lacking: str) -> str:
+    """Why no socket may be bound to ``address``; empty where one may.
 
     Without keys only this machine's addresses may be bound; ``lacking`` says where keys would be
     named, and is empty where they are.
@@ -191,9 +191,9 @@ def address_fault(address: str, lacking: str) -> str:
 def _addresses(settings: Settings) -> Iterator[str]:
     stream, commands = settings.stream.address, settings.commands.address
     for key, address in (("stream.address", stream), ("commands.address", commands)):
-        fault = address_fault(address, "" if settings.access.keys else "access.keys")
-        if fault:
-            yield f"{key}: {fault}"
+        problem = address_problem(address, "" if settings.access.keys else "access.keys")
+        if problem:
+            yield f"{key}: {problem}"
     if stream == commands:
         yield f"commands.address: found {shown(commands)}, expected another than stream.address"
 
@@ -209,7 +209,7 @@ def _folder(settings: Settings) -> Iterator[str]:
             yield f"{key}: found {shown(port)}, expected --dir to say which folder {{dir}} is"
 
 
-_QUESTIONS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...] = (
+_CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...] = (
     (("scene",), _fingers),
     (("servos", "tactile"), _backends),
     (("hand",), _joints),

@@ -1,7 +1,7 @@
-"""Whether a joint's angle goes where its velocity says, and no faster than a joint can.
+"""Whether a joint's angle agrees with its velocity, and is no faster than a joint can be.
 
-An encoder whose zero jumps, that stands still while the joint turns, or walks while it rests, says
-angles that the velocity beside them contradicts. One pass of a few operations a tick.
+An encoder whose zero jumps, that stands still while the joint turns or drifts while it rests, gives
+angles that contradict the velocity beside them.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from softfinger.daemon.types import Reading
 _AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way in one reading
 _APART = 0.1  # rad that it may be off the way that the velocity says …
 _MEMORY = 0.1  # … over the last so many s: a velocity lags
-_LATE = 0.02  # s between two readings, or 3 ticks, from which on a way can't be told: begun anew
-_GAP = 0.1  # s from which on nothing is
+_LATE = 0.02  # s between two readings, or 3 ticks, from which on the sum begins again
+_GAP = 0.1  # s from which on the step is not judged either
 
 
 class JointMotion:

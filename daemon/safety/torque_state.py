@@ -1,10 +1,8 @@
-"""Torque on and off as the loop drives it: off counts once the servos have confirmed it.
+"""Tracks the confirmed torque state: on from the request on, off once the servos confirm it.
 
-From the moment torque is asked for it counts as on. From the moment off is wanted it is sent at
-every tick until the servos' own registers say so. Where they do not within half of their bus
-watchdog's time, nothing at all is sent for as long as that watchdog takes to stop the motors: a
-servo that hears the daemon's readings, and none of its writes, would drive on for ever. Then it is
-tried again.
+Off is sent at every tick until the servos' own registers say so. Where they do not within half of
+their bus watchdog's time, nothing is sent for as long as that watchdog takes to stop the motors: a
+servo that receives read requests but loses all writes would drive on. Then it is tried again.
 """
 
 from __future__ import annotations
@@ -20,12 +18,12 @@ from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
 _TRY = 0.5  # of the watchdog's time in which torque off is tried before the bus falls silent
-_TRY_UNGUARDED = 0.05  # s that it is tried before that is told, with servos.watchdog = 0
+_TRY_UNGUARDED = 0.05  # s of tries before a report, with servos.watchdog = 0
 _LAST_TRIES = 15  # when the daemon ends
 
 
-class Drive:
-    """One hand's servos, or none. Keeps ``state.torque``, ``torque_off`` and ``write_error``."""
+class TorqueState:
+    """Torque of one hand's servos. Writes ``state.torque``, ``torque_off`` and ``write_error``."""
 
     def __init__(
         self,
@@ -36,7 +34,7 @@ class Drive:
         fail: Callable[[str, str], None],
         emit: Callable[[str, str, str], None],
     ) -> None:
-        """``fail`` latches a fault for a reason and its row's name, ``emit`` sends an event."""
+        """``fail`` latches a fault by reason and limit, ``emit`` sends an event."""
         self.servos = servos
         self._state = state
         self._safety = safety
@@ -50,10 +48,10 @@ class Drive:
         self._tried_since = math.inf  # torque off is wanted and not confirmed since then
         self._silent_until = -math.inf
         self._first = math.inf  # when off was first asked for
-        self._told = False
+        self._reported = False
         self._gone = False  # the port: nothing can be sent
         self._last_try = -1  # seq of the tick with the last try
-        self._aside = Reading()  # what is read after the tick has decided goes here
+        self._unused = Reading()  # takes what is read after the tick has decided
 
     @property
     def pending(self) -> bool:
@@ -108,7 +106,7 @@ class Drive:
             self._silent_until = -math.inf
         if self._last_try != state.seq and not self._is_silent():
             try:
-                self._try(servos, self._aside)
+                self._try(servos, self._unused)
             except ServoError as error:
                 state.write_error = str(error)
         return not state.torque
@@ -122,7 +120,7 @@ class Drive:
             self.off()
 
     def reconnect(self) -> None:
-        """Connect servos that have gone silent anew, as after an unplug. Raises ServoError."""
+        """Connect servos again that have gone silent, as after an unplug. Raises ServoError."""
         if self.servos is None:
             return
         self.servos.connect()
@@ -154,8 +152,8 @@ class Drive:
         state = self._state
         state.torque, state.torque_off = False, True
         self._tried_since = math.inf
-        if self._told:
-            self._told = False
+        if self._reported:
+            self._reported = False
             waited = state.t - self._first
             self._emit(
                 "info", TORQUE_OFF, f"torque off confirmed by the servos after {waited:.2f} s"
@@ -168,16 +166,16 @@ class Drive:
             return True
         if t - self._tried_since < self._patience:
             return False
-        self._tell()
+        self._report()
         silence = 0.0 if self._gone else self._silence
         self._silent_until = self._tried_since = t + silence
         return silence > 0.0
 
-    def _tell(self) -> None:
-        """That torque off is not confirmed: once, and as a fault where none is latched."""
-        if self._told:
+    def _report(self) -> None:
+        """Report once that torque off is not confirmed, as a fault where none is latched."""
+        if self._reported:
             return
-        self._told = True
+        self._reported = True
         state = self._state
         text = f"torque off not confirmed by the servos for {state.t - self._first:.2f} s: "
         if not self._silence:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.diagnosis import addresses as sockets
-from softfinger.daemon.diagnosis import hand, kernels, machine, mending, ports
+from softfinger.daemon.diagnosis import hand, kernels, machine, ports, repair
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.profile.load import load
@@ -82,7 +82,7 @@ def with_status(lines: list[str], status: str) -> list[str]:
     return [line[7:] for line in lines if line.startswith(status)]
 
 
-def test_factory_new_servos_fail_and_are_mended_only_when_asked(hands, capsys):
+def test_factory_new_servos_fail_and_are_repaired_only_when_asked(hands, capsys):
     hand = hands(prepared=False)
     before = hand.registers()
     status, lines = hand.doctor(capsys)
@@ -200,7 +200,7 @@ def terminal() -> Iterator[tuple[int, str]]:
 def test_ports_that_can_not_be_used(tmp_path):
     missing = ports.check_port(str(tmp_path / "none"), "servos.port")
     assert (missing.status, missing.text) == ("FAIL", "no such file or directory")
-    assert "servos.port" in missing.mend
+    assert "servos.port" in missing.fix
     dangling = tmp_path / "dangling"
     dangling.symlink_to(tmp_path / "gone")
     assert ports.check_port(str(dangling), "servos.port").text == "leads nowhere"
@@ -214,7 +214,7 @@ def test_a_port_without_permission(monkeypatch, terminal):
     monkeypatch.setattr(os, "access", lambda *_: False)
     found = ports.check_port(terminal[1], "servos.port")
     assert found.text == "no permission to open it"
-    assert found.mend.startswith("sudo ")
+    assert found.fix.startswith("sudo ")
 
 
 @pytest.mark.parametrize("locked", [True, False])
@@ -237,12 +237,12 @@ def test_who_has_a_port_is_named(terminal, locked):
         other.wait(60)
     assert found.status == "FAIL"
     assert f"in use by process {other.pid} (python" in found.text
-    assert found.mend == f"kill {other.pid}"
+    assert found.fix == f"kill {other.pid}"
     assert well.status == "warn", "a daemon that answers is well, and not to be killed"
     assert (
         f"the softfinger daemon that runs here has it (holding, process {other.pid})" in well.text
     )
-    assert "kill" not in well.mend
+    assert "kill" not in well.fix
     assert ports.check_port(path, "servos.port").status == "pass"
 
 
@@ -254,16 +254,16 @@ def latency(tmp_path: Path, value: str) -> tuple[str, Path]:
     return "/dev/ttyUSB7", tmp_path / "sys"
 
 
-def test_latency_timer_is_judged_and_mended(tmp_path):
+def test_latency_timer_is_judged_and_repaired(tmp_path):
     path, sysfs = latency(tmp_path, "16\n")
     slow = ports.check_latency_timer(path, 0.004, sysfs)
     assert slow.failed
-    assert "softfinger doctor --fix" in slow.mend
+    assert "softfinger doctor --fix" in slow.fix
     assert ports.check_latency_timer(path, 0.05, sysfs).status == "warn"
-    assert mending.mend_latency_timer(path, sysfs).status == "fixed"
+    assert repair.repair_latency_timer(path, sysfs).status == "fixed"
     assert ports.latency_file(path, sysfs).read_text() == "1"
     assert ports.check_latency_timer(path, 0.004, sysfs).status == "pass"
-    assert mending.mend_latency_timer(path, sysfs) is None
+    assert repair.repair_latency_timer(path, sysfs) is None
     assert ports.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
 
 
@@ -274,9 +274,9 @@ def test_a_latency_timer_that_can_not_be_set_is_told_with_the_command(tmp_path, 
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "write_text", refuse)
-    found = mending.mend_latency_timer(path, sysfs)
+    found = repair.repair_latency_timer(path, sysfs)
     assert found.status == "warn"
-    assert found.mend == f"echo 1 | sudo tee {ports.latency_file(path, sysfs)}"
+    assert found.fix == f"echo 1 | sudo tee {ports.latency_file(path, sysfs)}"
 
 
 # This machine.
@@ -293,20 +293,20 @@ def test_scheduling_is_tried_and_taken_back(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     found = machine.check_scheduling()
     assert found.status == "warn"
-    assert "rtprio" in found.mend
+    assert "rtprio" in found.fix
 
 
 def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert machine.check_memory_lock(resource.RLIM_INFINITY).status == "pass"
     assert machine.check_memory_lock(1 << 30).status == "pass"
-    assert "memlock" in machine.check_memory_lock(8 << 20).mend
+    assert "memlock" in machine.check_memory_lock(8 << 20).fix
     place = tmp_path / "cpu_dma_latency"
     assert machine.check_idle_states(place).status == "warn"
     place.touch()
     assert machine.check_idle_states(place).status == "pass"
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert "udevadm" in machine.check_idle_states(place).mend
+    assert "udevadm" in machine.check_idle_states(place).fix
     source = tmp_path / "source"
     source.write_text("tsc\n")
     assert machine.check_clock_source(source).status == "pass"
@@ -335,7 +335,7 @@ def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
     assert "others may write to it" in found.text
-    assert "NUMBA_CACHE_DIR" in found.mend
+    assert "NUMBA_CACHE_DIR" in found.fix
 
 
 # Sockets.
@@ -357,7 +357,7 @@ def test_free_and_taken_sockets(addresses, monkeypatch):
         taken, free = check(settings)
     assert taken.status == "FAIL"
     assert "no softfinger daemon" in taken.text
-    assert "stream.address" in taken.mend
+    assert "stream.address" in taken.fix
     assert free.status == "pass"
 
 

@@ -363,11 +363,11 @@ def test_a_disc_rolls_down_an_incline():
 
 
 def test_a_long_wedge_whose_faces_meet_is_refused():
-    from softfinger.daemon.profile.validation import contradictions
+    from softfinger.daemon.profile.validation import problems
 
     def found(**simulation):
         settings = Settings.model_validate({"simulation": {"object_shape": "wedge", **simulation}})
-        return contradictions(settings, None, set())
+        return problems(settings, None, set())
 
     assert found(object_taper=1.1) == []
     assert "object_taper" in found(object_taper=1.2)[0]

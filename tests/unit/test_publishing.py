@@ -9,8 +9,7 @@ import pytest
 import zmq
 
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.publishing import Broadcast
-from softfinger.daemon.loop.rates import Schedule
+from softfinger.daemon.loop.publishing import Publishing, every, plan
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
@@ -52,13 +51,13 @@ def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
     listener = Listener()
     with Daemon(settings, wire=False) as daemon:
         loop = daemon.loop
-        sending = Broadcast(settings, listener, loop.perception.fingers, loop.statistics)  # type: ignore[arg-type]
+        sending = Publishing(settings, listener, loop.perception.fingers, loop.statistics)  # type: ignore[arg-type]
 
-        def broadcast(state: State) -> None:
+        def publish(state: State) -> None:
             listener.seq = state.seq
             sending(state)
 
-        loop._broadcast = broadcast  # type: ignore[assignment]
+        loop._publishing = publish  # type: ignore[assignment]
         loop.advance(seconds)
     return listener, daemon
 
@@ -86,22 +85,19 @@ def test_rates_are_what_really_happened_in_the_last_second() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "wanted", "every"), [(500.0, 100.0, 5), (1000.0, 100.0, 10), (500.0, 300.0, 2),
+    ("rate", "wanted", "ticks"), [(500.0, 100.0, 5), (1000.0, 100.0, 10), (500.0, 300.0, 2),
                                   (100.0, 400.0, 1), (10.0, 0.1, 100)]
 )  # fmt: skip
-def test_the_schedule_takes_the_nearest_whole_number_of_ticks(
-    rate: float, wanted: float, every: int
+def test_a_rate_is_the_nearest_whole_number_of_ticks(
+    rate: float, wanted: float, ticks: int
 ) -> None:
     settings = Settings.model_validate({"loop": {"rate": rate}, "stream": {"state_rate": wanted}})
-    schedule = Schedule(settings)
-    assert schedule.state.every == every
-    due = [seq for seq in range(1, 10 * every + 1) if schedule.state.due(seq)]
-    assert due == list(range(every, 10 * every + 1, every))
-    assert f"hand/state ({rate / every:.4g} Hz)" in str(schedule)
+    assert every(rate, wanted) == ticks
+    assert f"hand/state ({rate / ticks:.4g} Hz)" in plan(settings)
 
 
-def test_the_schedule_tells_every_rate() -> None:
-    told = str(Schedule(Settings.model_validate({"stream": {"tactile_rate": 25.0}})))
+def test_the_plan_names_every_rate() -> None:
+    told = plan(Settings.model_validate({"stream": {"tactile_rate": 25.0}}))
     for words in (
         "every tick (500 Hz)",
         "frames as they come (100 Hz)",
@@ -110,7 +106,7 @@ def test_the_schedule_tells_every_rate() -> None:
         "every 500 ticks hand/stats (1 Hz)",
     ):
         assert words in told
-    blind = str(Schedule(Settings.model_validate({"tactile": {"backend": "none"}})))
+    blind = plan(Settings.model_validate({"tactile": {"backend": "none"}}))
     assert "frames" not in blind
 
 

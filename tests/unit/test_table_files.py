@@ -75,7 +75,7 @@ def test_a_damaged_or_foreign_file_is_replaced(
         load_table(file, TIP, CONSTANT, 1e-9)
     assert kept(tmp_path, said).form.name == "closed"
     assert len(said) == 1
-    assert "built anew" in said[0]
+    assert "built again" in said[0]
     assert str(file) in said[0]
     load_table(file, TIP, CONSTANT, 1e-9)
 

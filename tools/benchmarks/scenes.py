@@ -99,7 +99,7 @@ def _always_predicted(daemon: Daemon) -> None:
 
 def _always_packed(daemon: Daemon) -> None:
     can(daemon)
-    broadcast = daemon.loop._broadcast
+    broadcast = daemon.loop._publishing
     assert broadcast is not None
     broadcast._publisher._link.wanted = bit(schema.STATE) | bit(schema.TACTILE)
 

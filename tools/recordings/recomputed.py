@@ -13,7 +13,7 @@ import msgpack
 import numpy as np
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.loop.process_replay import Recomputation
+from softfinger.daemon.loop.process_replay import ProcessReplay
 from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
@@ -85,7 +85,7 @@ def recompute(
     if not recording.count(schema.INPUT):
         raise RecordingError(f"{recording.path}: no hand/input in it: record with --topics all")
     used = settings or own
-    machine = Recomputation(used, calibrations, cache)
+    machine = ProcessReplay(used, calibrations, cache)
     scene = parts(used)
     pack_state = packer(schema.STATE)
     result = Comparison()

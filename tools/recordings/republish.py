@@ -9,7 +9,7 @@ from typing import Any
 from softfinger.daemon.errors import AddressError, RecordingError
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
-from softfinger.daemon.profile.validation import address_fault
+from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
@@ -25,7 +25,7 @@ class Wire:
     """
 
     def __init__(self, address: str, keys: Path | None = None) -> None:
-        fault = address_fault(address, "" if keys is not None else "--keys")
+        fault = address_problem(address, "" if keys is not None else "--keys")
         if fault:
             raise RecordingError(f"--address: {fault}")
         folder = "" if keys is None else str(keys)

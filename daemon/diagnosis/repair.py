@@ -14,8 +14,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.provisioning import provision
 
 
-def mend_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
-    """Set the adapter's latency timer to 1 ms; None when there is nothing to mend."""
+def repair_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
+    """Set the adapter's latency timer to 1 ms; None when there is nothing to do."""
     places = () if sysfs is None else (sysfs,)
     place = latency_file(path, *places)
     found = check_latency_timer(path, 1.0, *places)
@@ -34,14 +34,14 @@ def mend_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
     return Result("fixed", subject, "set to 1 ms")
 
 
-def mend_servos(settings: Settings) -> list[Result]:
+def repair_servos(settings: Settings) -> list[Result]:
     """Set the scene's servos up as the daemon needs them; one line for each thing done."""
     try:
         result = provision(settings)
     except ServoError as error:
-        return [Result("warn", "servos", f"not mended: {error}")]
+        return [Result("warn", "servos", f"not repaired: {error}")]
     problems = [
-        Result("warn", each.subject, f"not mended: {each.problem}", each.fix.replace("`", ""))
+        Result("warn", each.subject, f"not repaired: {each.problem}", each.fix.replace("`", ""))
         for each in result.problems
     ]
     return problems + [Result("fixed", name, change) for name, change in result.done]
