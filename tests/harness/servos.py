@@ -126,17 +126,23 @@ class BusClient:
 class DirectPort(SerialPort):
     """A port whose other end is a bus in this thread: a reply is there at once or never comes.
 
-    ``t`` is the bus's time, set by hand; waiting for a reply that does not come takes its deadline.
-    ``baud`` 0 is heard at every rate.
+    The bus's time is ``clock``'s; without one it is ``t``, set by hand, and waiting for a reply
+    that does not come takes its deadline. ``baud`` 0 is heard at every rate.
     """
 
     def __init__(
-        self, bus: ServoBus, baud: int = 2_000_000, timeout: float = 0.01, t: float = 0.0
+        self,
+        bus: ServoBus,
+        baud: int = 0,
+        timeout: float = 0.01,
+        t: float = 0.0,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         super().__init__("direct", baud or 2_000_000, timeout)
-        self._heard_at = baud
         self.bus = bus
         self.t = t
+        self._clock = clock
+        self._heard_at = baud
 
     def openPort(self) -> bool:
         return True
@@ -144,7 +150,8 @@ class DirectPort(SerialPort):
     def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
         if reply:
             self.received.clear()
-        self.received += self.bus.feed(packet, self.t, self._heard_at)
+        t = self.t if self._clock is None else self._clock()
+        self.received += self.bus.feed(packet, t, self._heard_at)
         return True
 
     def fill(self) -> bool:

@@ -57,7 +57,7 @@ def out_of_reach(address: int, data: bytes) -> bool:
 def test_any_instruction_equals_direct_access(
     steps: list[tuple[str, int, int, bytes | int]], angles: tuple[float, float]
 ) -> None:
-    port, twin = DirectPort(placed(angles), baud=0), placed(angles)
+    port, twin = DirectPort(placed(angles)), placed(angles)
     handler = PacketHandler()
     servos = {servo.id: servo for servo in twin.servos}
     for number, (kind, servo_id, address, what) in enumerate(steps):

@@ -1,4 +1,4 @@
-"""What every servo backend owes, in each operating mode: the simulated one and Dynamixel on a pty.
+"""What every servo backend owes, in each operating mode: the simulated one and Dynamixel.
 
 The same tests run over both; a backend that joins them is added to ``RIGS``.
 """
@@ -17,7 +17,9 @@ from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos import dynamixel
 from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.joint import current_toward
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
@@ -26,7 +28,7 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from tests.harness.free_joints import FreeJoints
-from tests.harness.servos import RunningBus
+from tests.harness.servos import DirectPort
 
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
@@ -51,7 +53,7 @@ class Rig(Protocol):
 class SimulatedRig:
     """The simulated backend on a virtual clock."""
 
-    def __init__(self, **sections: Any) -> None:
+    def __init__(self, _: pytest.MonkeyPatch, **sections: Any) -> None:
         settings = Settings.model_validate({"material": {"law": "constant"}, **sections})
         self.clock: Clock = VirtualClock()
         self._hand = SimulatedHand(settings, table=TABLE)
@@ -68,41 +70,43 @@ class SimulatedRig:
 
 
 class DynamixelRig:
-    """The Dynamixel backend, through SDK and pyserial, on an emulated bus in a thread.
+    """The Dynamixel backend, through the SDK, on an emulated bus that lives in the same time.
 
-    Bytes go to and fro in real time; the servos' own time is virtual.
+    Bytes go across at once and not through a terminal, so that a busy machine changes nothing.
     """
 
-    def __init__(self, servos: dict[str, Any] | None = None, **sections: Any) -> None:
-        chosen = {"backend": "dynamixel", "reply_timeout": 1.0, **(servos or {})}
-        settings = Settings.model_validate({"servos": chosen, **sections})
+    def __init__(
+        self, patch: pytest.MonkeyPatch, *, servos: dict[str, Any], **sections: Any
+    ) -> None:
+        settings = Settings.model_validate(
+            {"servos": {"backend": "dynamixel", **servos}, **sections}
+        )
         self.clock: Clock = VirtualClock()
-        bus = ServoBus.from_settings(settings, FreeJoints(2, 0.0), t=0.0)
-        self._running = RunningBus(bus, clock=self.clock.now)
-        port = settings.servos.model_copy(update={"port": self._running.path})
-        made = make_servos(settings.model_copy(update={"servos": port}), self.clock, None)
-        assert made is not None
-        self.servos = made
+        self.bus = ServoBus.from_settings(settings, FreeJoints(2))
+        port = DirectPort(self.bus, clock=self.clock.now)
+        patch.setattr(dynamixel, "SerialPort", lambda *_: port)
+        self.servos = DynamixelServos(settings, self.clock)
 
     def torque(self) -> list[bool]:
-        return [bool(self._running.memory(i)[reg.TORQUE_ENABLE]) for i in (0, 1)]
+        return [servo.torque_on for servo in self.bus.servos]
 
     def close(self) -> None:
         self.servos.close()
-        self._running.close()
 
 
 RIGS: dict[str, Callable[..., Rig]] = {"simulated": SimulatedRig, "dynamixel": DynamixelRig}
 
 
 @pytest.fixture(params=RIGS)
-def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Rig]]:
+def make(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Rig]]:
     """Makes rigs of one backend, which end with the test."""
     made: list[Rig] = []
 
     def start(mode: str = MODES[0], **sections: Any) -> Rig:
         servos = {"mode": mode, "watchdog": 0.5, **sections.pop("servos", {})}
-        made.append(RIGS[request.param](servos=servos, **sections))
+        made.append(RIGS[request.param](monkeypatch, servos=servos, **sections))
         return made[-1]
 
     yield start
@@ -302,17 +306,17 @@ def test_the_loop_of_current_mode():
     assert current_toward(servos, -9.0, -0.3, 0.0, 0.0) == -0.3
 
 
-def test_position_limits_that_the_joint_does_not_fit_in_are_told():
-    rig = DynamixelRig(servos={"mode": "position"})
-    try:
-        rig._running.call(lambda: rig._running.servo(1).table.set(reg.MAX_POSITION_LIMIT, 2100))
-        with pytest.raises(ServoError, match=r"servo 2 .*limits are 0 … 2100, the joint needs"):
-            rig.servos.connect()
-        rig._running.call(lambda: rig._running.servo(1).table.set(reg.MAX_POSITION_LIMIT, 4095))
+def test_position_limits_that_the_joint_does_not_fit_in_are_told(monkeypatch):
+    rig = DynamixelRig(monkeypatch, servos={"mode": "position"})
+    table = rig.bus.servos[1].table
+    table.set(reg.MAX_POSITION_LIMIT, 2100)
+    with pytest.raises(ServoError, match=r"servo 2 .*limits are 0 … 2100, the joint needs"):
         rig.servos.connect()
-        assert sum("nothing bounds its current" in n for n in map(str, rig.servos.notices)) == 2
-    finally:
-        rig.close()
+    table.set(reg.MAX_POSITION_LIMIT, 4095)
+    rig.servos.connect()
+    notices = [each.problem for each in rig.servos.notices]
+    assert notices.count("in position mode nothing bounds its current") == 2
+    rig.close()
 
 
 @pytest.mark.parametrize("mode", BOUNDED)
