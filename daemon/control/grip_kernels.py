@@ -145,7 +145,7 @@ def press(
     """Torque [N·m] of one ``finger`` on an object that stands by itself."""
     g = grips[0]
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
-    g.push = wanted + _correction(g, wanted, grasps[0].tip[finger].force)
+    g.push = wanted + _correction(g, wanted, grasps[0].force[finger])
     return _torque_alone(g, grasps[0], finger, g.force.speed, dq)
 
 
@@ -179,7 +179,7 @@ def place(
 
 @inner_kernel
 def _felt(grasp: GraspState) -> float:
-    felt: float = 0.5 * (grasp.tip[0].force + grasp.tip[1].force)
+    felt: float = 0.5 * (grasp.force[0] + grasp.force[1])
     return felt
 
 

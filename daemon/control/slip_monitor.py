@@ -192,7 +192,7 @@ def _watch_turning(s: SlipState, grasp: GraspState) -> None:
     """Look for turning beyond what the tips' shear explains."""
     s.away += grasp.stray - s.stray - s.away * s.law.dt / _FORGET
     s.stray = grasp.stray
-    depth = grasp.tip[0].d + grasp.tip[1].d
+    depth = grasp.d[0] + grasp.d[1]
     sheared = 0.5 * s.law.friction * depth / s.law.width
     if abs(s.away) > _WELL * sheared + _SIGNS * grasp.angle_std:
         s.turned = True

@@ -68,8 +68,6 @@ class ContactFilter:
         )
         self._history["t"] = -math.inf
         self.grasp = state.grasp
-        published: Any = state.grasp.array
-        self._tips = published["tip"][0]  # a view: both tips are read at once
         self._read = False  # the joints are known
         self._live = [False, False]  # tips that touch and are carried on by the joints
         self._sound = [False, False]  # the newest frame's estimate can be used
@@ -132,27 +130,26 @@ class ContactFilter:
         pose.valid = live[0] and live[1] and self._with_object
         pose.angle = pose.width = 0.0
         if live[0] or live[1]:
-            angle, width = kernels.publish(self._state.array, *self._tables)
-            for contact, carried, tip in zip(contacts, live, self._tips.tolist(), strict=True):
-                if carried:
-                    (
-                        contact.d,
-                        contact.theta,
-                        contact.force,
-                        contact.energy,
-                        contact.d_std,
-                        contact.theta_std,
-                        contact.inside,
-                    ) = tip
+            left, right, angle, width = kernels.publish(self._state.array, *self._tables)
+            tips = left, right
             if pose.valid:
                 pose.angle, pose.width = angle, width
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
-            fresh = contact.t_sound >= oldest
-            contact.valid = fresh and self._sound[finger]
-            if not fresh:
-                pose.valid = False
+            if live[finger]:
+                (
+                    contact.d,
+                    contact.theta,
+                    contact.force,
+                    contact.energy,
+                    contact.d_std,
+                    contact.theta_std,
+                    contact.inside,
+                ) = tips[finger]
+            contact.valid = self._sound[finger]
+            if not contact.t_sound >= oldest:
+                contact.valid = pose.valid = False
 
 
 def _fill_from_frame(contact: Contact, estimate: ContactEstimate, table: FloatArray) -> None:

@@ -19,6 +19,7 @@ from softfinger.kinematics.hand.grasp_state import held_motion, holding_levers, 
 
 FloatArray = NDArray[np.float64]
 Two = tuple[float, float]  # (left, right)
+Tip = tuple[float, float, float, float, float, float, bool]  # as `publish` says
 
 HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
@@ -52,22 +53,11 @@ class TrackedTip(Record):
     live: bool  # touches, and is carried on
 
 
-class PublishedTip(Record):
-    """One tip's contact at this tick; names as in `types.Contact`."""
-
-    d: float
-    theta: float
-    force: float
-    energy: float
-    d_std: float
-    theta_std: float
-    inside: bool
-
-
 class GraspState(Record):
     """How the held object answers the joints at this tick: what a grip law needs."""
 
-    tip: Annotated[Records[PublishedTip], 2]
+    d: Pair  # displacements [m]
+    force: Pair  # of the tips, by their tables [N]
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # α between the object's faces, as both tips feel them [rad]
     stray: float  # turning of the object that no joint explains, summed [rad]
@@ -355,9 +345,38 @@ def _between(first: float, last: float, share: float) -> float:
     return first + share * (last - first)
 
 
+@inner_kernel
+def _publish_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -> Tip:
+    tip = f.tip[finger]
+    grasp = f.grasp
+    force, energy, stiffness, _, _, _, inside = lookup(
+        table, tip.d.mean, total_tilt(theta, tip.tilt_y)
+    )
+    grasp.q[finger] = tip.q
+    grasp.d[finger] = max(tip.d.mean, 0.0)
+    # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
+    grasp.force[finger] = tip.gain * force
+    grasp.stiffness[finger] = tip.gain * stiffness
+    return (
+        grasp.d[finger],
+        theta,
+        grasp.force[finger],
+        tip.gain * energy,
+        math.sqrt(_variance(tip.d, f.count * f.length)),
+        math.sqrt(_face_variance(f, -1.0 if finger == 0 else 1.0)),
+        inside,
+    )
+
+
 @kernel
-def publish(filters: Records[FilterState], table1: FloatArray, table2: FloatArray) -> Two:
-    """Write what the estimates mean into ``grasp``; the object's angle [rad] and width [m]."""
+def publish(
+    filters: Records[FilterState], table1: FloatArray, table2: FloatArray
+) -> tuple[Tip, Tip, float, float]:
+    """Write what the estimates mean into ``grasp``.
+
+    Returns d, θ, force, energy, the standard deviations of d and θ, and whether they are inside the
+    table, for each tip; then the object's angle [rad] and width [m].
+    """
     f = filters[0]
     grasp = f.grasp
     left = f.tip[0]
@@ -367,23 +386,8 @@ def publish(filters: Records[FilterState], table1: FloatArray, table2: FloatArra
     motion = _motion(f)
     theta1 = angle - 0.5 * taper + left.q
     theta2 = angle + 0.5 * taper - right.q
-    for finger in range(2):
-        tip = f.tip[finger]
-        seen = grasp.tip[finger]
-        theta = theta1 if finger == 0 else theta2
-        table = table1 if finger == 0 else table2
-        force, energy, stiffness, _, _, _, inside = lookup(
-            table, tip.d.mean, total_tilt(theta, tip.tilt_y)
-        )
-        seen.d = max(tip.d.mean, 0.0)
-        seen.theta = theta
-        seen.force = tip.gain * force
-        seen.energy = tip.gain * energy
-        seen.d_std = math.sqrt(_variance(tip.d, f.count * f.length))
-        seen.theta_std = math.sqrt(_face_variance(f, -1.0 if finger == 0 else 1.0))
-        seen.inside = inside
-        grasp.stiffness[finger] = tip.gain * stiffness
-        grasp.q[finger] = tip.q
+    seen1 = _publish_tip(f, 0, theta1, table1)
+    seen2 = _publish_tip(f, 1, theta2, table2)
     grasp.angle_std = math.sqrt(_variance(f.angle, f.count))
     grasp.taper = taper
     grasp.stray = f.stray
@@ -419,4 +423,4 @@ def publish(filters: Records[FilterState], table1: FloatArray, table2: FloatArra
             right.torque / right.gain,
         )
         grasp.load = 0.5 * (left.gain + right.gain) * load
-    return angle, width
+    return seen1, seen2, angle, width

@@ -118,8 +118,7 @@ def change(held: GraspState, generator: np.random.Generator) -> None:
 def some_held(generator: np.random.Generator, force: float = 0.0) -> GraspState:
     held = GraspState()
     change(held, generator)
-    for finger in range(2):
-        held.tip[finger].force = force
+    held.force = [force, force]
     return held
 
 
@@ -147,7 +146,7 @@ def test_the_torques_are_those_of_the_law_in_plain_python(law: str) -> None:
         forces = generator.uniform(5.0, 9.0, 2)
         reading.dq[:] = generator.uniform(-0.3, 0.3, 2)
         pose = ObjectPose(True, generator.uniform(0.0, 0.2), 0.03)
-        held.tip[0].force, held.tip[1].force = forces
+        held.force = forces
         found = grip.torques(reading, pose, False)
         expected = twin.torques(held, forces.mean(), pose.angle, (reading.dq[0], reading.dq[1]))
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-11)

@@ -85,8 +85,7 @@ class Watched:
         self.held = held = GraspState()
         held.load_lever = 0.03
         held.arm, held.turn, held.stiffness = [0.079, 0.079], [0.75, 0.75], [6e3, 6e3]
-        for finger in range(2):
-            held.tip[finger].d, held.tip[finger].force = 4e-3, asked
+        held.d, held.force = [4e-3, 4e-3], [asked, asked]
         self.grip = Grip(Settings.model_validate({"control": control}), [0, 1], held)
         self.grip.start(asked, asked)
 
