@@ -68,15 +68,29 @@ class Record(metaclass=_Slotted):
         if one.dtype != self.dtype:
             raise TypeError(f"{type(self).__name__}: expected {self.dtype}, found {one.dtype}")
         self.array = one
-        # Views that are kept: making one takes ten times as long as reading by it.
-        parts = ((name, one[name][:1]) for name in one.dtype.names)
-        self._fields = {name: part.reshape(part.shape[1:]) for name, part in parts}
-        for name, view in self._fields.items():
-            inner = getattr(type(self), name).inner
-            if inner is not None:
-                self._fields[name] = (
-                    inner(view.reshape(1)) if view.ndim == 0 else _Many(inner, view)
-                )
+        self._fields = _Views(type(self), one)
+
+    def assign(self, other: Self) -> None:
+        """Take over every field of ``other``."""
+        mine: Any = self.array
+        mine[:] = other.array
+
+
+class _Views(dict[str, Any]):
+    """A record's fields, views that are kept: to make one takes ten times as long as to use it."""
+
+    def __init__(self, kind: type[Record], one: Any) -> None:
+        self._kind = kind
+        self._one = one
+
+    def __missing__(self, name: str) -> Any:
+        part = self._one[name][:1]
+        view = part.reshape(part.shape[1:])
+        inner = getattr(self._kind, name).inner
+        if inner is not None:
+            view = inner(view.reshape(1)) if view.ndim == 0 else _Many(inner, view)
+        self[name] = view
+        return view
 
 
 class _Many(list[Any]):

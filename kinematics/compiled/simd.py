@@ -37,6 +37,7 @@ SIZES = tuple(STRIDE * sum(shape) for shape in SHAPES)  # numbers of one set of 
 
 # What `address` gives, as far as kernels index it.
 Pointer: TypeAlias = NDArray[np.float64]
+IntPointer: TypeAlias = NDArray[np.int64]
 
 _DOUBLE = ir.DoubleType()
 _VECTOR = ir.VectorType(_DOUBLE, STRIDE)
@@ -106,7 +107,7 @@ def _in_powers(builder: Any, fma: Any, rows: list[Any], y: Any) -> Any:
 
 def _address(context: Any, array: Any) -> Any:
     """Signature and code generator; see :data:`address`."""
-    signature = cast(Any, types).CPointer(types.float64)(array)
+    signature = cast(Any, types).CPointer(array.dtype)(array)
 
     def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         return codegen.make_array(sig.args[0])(codegen, builder, arguments[0]).data
@@ -114,12 +115,24 @@ def _address(context: Any, array: Any) -> Any:
     return signature, generate
 
 
+def _further(context: Any, start: Any, number: Any) -> Any:
+    """Signature and code generator; see :data:`further`."""
+
+    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.gep(arguments[0], [arguments[1]])
+
+    return start(start, types.intp), generate
+
+
 # polynomials(pointer, at, shape, x, y): the five sums Σ c_ij x^i y^j over a shape of SHAPES, whose
 # number is a literal. From pointer[at] on stand, for j = 0, 1, …, the coefficients of falling
 # powers of x, STRIDE numbers each.
 polynomials = cast(Any, intrinsic(prefer_literal=True))(_polynomials)
 
-# address(array): where a contiguous float64 array starts. Numba counts the references to an array
+# address(array): where a contiguous array starts. Numba counts the references to an array
 # wherever a function that has it returns in several ways, and each count is an atomic instruction
 # that costs as much as a lookup; it counts none for an address. The caller keeps the array.
 address = cast(Any, intrinsic)(_address)
+
+# further(address, n): the address n numbers further.
+further = cast(Any, intrinsic)(_further)

@@ -58,18 +58,6 @@ def _weighted(
     return signature, generate
 
 
-def _further(context: Any, start: Any, number: Any) -> Any:
-    """Signature and code generator; see :data:`further`."""
-
-    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return builder.gep(arguments[0], [arguments[1]])
-
-    return start(start, types.intp), generate
-
-
 # weighted(out, source, at, stride, weights, first, count): adds Σ weights[first + k]
 # source[at + k stride : … + 8] over k < count to out[0 : 8], all addresses of float64.
 weighted = cast(Any, intrinsic)(_weighted)
-
-# further(address, n): the address n numbers further.
-further = cast(Any, intrinsic)(_further)

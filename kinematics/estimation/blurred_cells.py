@@ -8,14 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer, address
-from softfinger.kinematics.compiled.simd_sums import LANES, further, weighted
-from softfinger.kinematics.estimation.cut_cells import READING, WEIGHT
-from softfinger.kinematics.sensing.cell_integrals import LIVE
-from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
+from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
+from softfinger.kinematics.compiled.simd_sums import LANES, weighted
+from softfinger.kinematics.estimation.packing import PLACE_BITS
+from softfinger.kinematics.estimation.state import READING, WEIGHT, State
+from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
+from softfinger.kinematics.sensing.footprint import FloatArray
 
-PLANES = 4  # of the fit: stress and its derivatives
-PLACE_BITS = 16  # of the column in a place; the row is above
+PLANES = 4  # spread: stress and its derivatives
 
 
 def parts_to_fit(width: float) -> int:
@@ -44,26 +44,27 @@ def _clear(out: Pointer, first: int, last: int) -> None:
 
 
 @fast_inner_kernel
-def _read(row: FloatArray, live: FloatArray, scale: float, out: FloatArray) -> None:
-    for j in range(row.shape[0]):
+def _read(row: Pointer, live: Pointer, scale: float, n: int, size: int, out: Pointer) -> None:
+    for j in range(n):
         reading = row[j] * scale
-        out[READING, j] = reading if live[j] > 0.0 else 0.0
-        out[WEIGHT, j] = live[j]
+        out[READING * size + j] = reading if live[j] > 0.0 else 0.0
+        out[WEIGHT * size + j] = live[j]
 
 
 @fast_inner_kernel
-def _locate(
-    places: IntArray, count: int, parts_x: int, width: int, phase: int
-) -> tuple[int, int, int, int]:
+def _locate(state: State, places: IntPointer) -> tuple[int, int, int, int]:
     """Turn ``places`` into those in the scratch of :func:`spread`; the box they lie in.
 
-    There, columns of one remainder by ``parts_x`` stand together: ``phase`` apart.
+    There, columns of one remainder by the parts of a cell stand together.
     """
+    width = state.blur.width
+    parts_x = state.blur.parts_x
+    phase = width // parts_x
     shift = 0 if parts_x == 1 else parts_x // 2
     rest = parts_x - 1
     low = left = 1 << 30
     high = right = 0
-    for k in range(count):
+    for k in range(state.fit.count):
         i = places[k] >> PLACE_BITS
         j = places[k] & ((1 << PLACE_BITS) - 1)
         low = min(low, i)
@@ -75,78 +76,59 @@ def _locate(
 
 
 @inner_kernel
-def spread(
-    packed: FloatArray,
-    count: int,
-    places: IntArray,
-    frame: FloatArray,
-    scale: float,
-    cells: FloatArray,
-    across: FloatArray,
-    along: FloatArray,
-    parts_y: int,
-    fine: FloatArray,
-    half: FloatArray,
-) -> int:
+def spread(state: State, frame: Pointer, arena: Pointer, places: IntPointer) -> None:
     """Blur the first four planes of packed parts of cells, and average them over cells.
 
-    ``places`` [n] are the parts' rows and columns, see PLACE_BITS. ``across`` and ``along`` are
-    what :func:`weights` gives. ``packed`` takes all cells of the box as far as the weights reach,
-    with readings and weights; their number is returned. ``fine`` [rows of parts + 1, n] and
-    ``half`` [n] are scratch, n = parts of a row + weights along x + 2 · LANES · parts.
+    ``places`` are the parts' rows and columns, see PLACE_BITS. The packed cells are then all cells
+    of the box as far as the weights reach, with readings and weights.
     """
-    if count == 0:
-        return 0
-    rows, cols = frame.shape
-    parts_x = across.shape[0]
-    n_x = across.shape[1]
-    n_y = along.shape[0]
-    width = half.shape[0]
+    if state.fit.count == 0:
+        return
+    blur = state.blur
+    size = state.model.rows * state.model.cols
+    cols = state.grid.cols
+    parts_x = blur.parts_x
+    parts_y = blur.parts_y
+    n_x = blur.weights_x
+    n_y = blur.weights_y
+    width = blur.width
     phase = width // parts_x
-    low, high, left, right = _locate(places, count, parts_x, width, phase)
+    low, high, left, right = _locate(state, places)
     first = max(left // parts_x - n_x + 1, 0)
     last = min((right - 1) // parts_x + 1, cols)
     bottom = max((low - n_y + parts_y) // parts_y, 0)
-    top = min((high - 1) // parts_y + 1, rows)
+    top = min((high - 1) // parts_y + 1, state.grid.rows)
     wide = last - first
-    # The columns of `half` that the box needs, of each phase; what lies right of them is 0.
+    # The columns of ``between`` that the box needs, of each phase; what lies right of them is 0.
     ahead = wide + n_x + LANES
-    source = address(fine)
-    between = address(half)
+    packed = further(arena, state.at.packed)
+    source = further(arena, state.at.fine)
+    between = further(arena, state.at.half)
+    across = further(arena, state.at.across)
+    along = further(arena, state.at.along)
     for plane in range(PLANES):
         _clear(source, low * width, high * width)
-        for k in range(count):
-            source[places[k]] = packed[plane, k]
+        for k in range(state.fit.count):
+            source[places[k]] = packed[plane * size + k]
         for i in range(bottom, top):
-            start = max(parts_y * i, low)
-            number = min(parts_y * i + n_y, high) - start
-            out = address(packed[plane, (i - bottom) * wide :])
+            begin = max(parts_y * i, low)
+            number = min(parts_y * i + n_y, high) - begin
+            out = further(packed, plane * size + (i - bottom) * wide)
             _clear(out, 0, wide)
             _clear(between, 0, width)
             for p in range(parts_x):
                 at = p * phase + first
                 for j in range(at, min(at + ahead, (p + 1) * phase - LANES + 1), LANES):
-                    weighted(
-                        further(between, j),
-                        source,
-                        start * width + j,
-                        width,
-                        address(along),
-                        start - parts_y * i,
-                        number,
-                    )
+                    here = further(between, j)
+                    skip = begin - parts_y * i
+                    weighted(here, source, begin * width + j, width, along, skip, number)
             for j in range(0, wide, LANES):
                 for p in range(parts_x):
-                    weighted(
-                        further(out, j),
-                        between,
-                        p * phase + first + j,
-                        1,
-                        address(across),
-                        p * n_x,
-                        n_x,
-                    )
+                    at = p * phase + first + j
+                    weighted(further(out, j), between, at, 1, across, p * n_x, n_x)
+    cells = further(arena, state.at.cells)
     for i in range(bottom, top):
-        at = (i - bottom) * wide
-        _read(frame[i, first:last], cells[i, LIVE, first:last], scale, packed[:, at : at + wide])
-    return int((top - bottom) * wide)
+        live = further(cells, (i * CELL_PLANES + LIVE) * cols + first)
+        out = further(packed, (i - bottom) * wide)
+        _read(further(frame, i * cols + first), live, state.signal.scale, wide, size, out)
+    state.fit.count = (top - bottom) * wide

@@ -1,4 +1,4 @@
-"""A grid's cells by their middles: those that may be touched, and sums over them, as kernels.
+"""A grid's cells by their centres: those that may be touched, and sums over them, as kernels.
 
 The planes here lie flat, cell after cell, so that a sum over many cells is one loop in SIMD lanes
 without a start and an end for each row; which cells count is decided cell by cell, by a comparison
@@ -14,30 +14,25 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.sensing.footprint import FloatArray, Geometry, IntArray
+from softfinger.kinematics.estimation.state import Moments, Reach
+from softfinger.kinematics.sensing.footprint import FloatArray, Grid
 
-# Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's middle, or
-# over its nearest corner where the middle lies beyond the rim, and −∞ for a cell that is dead or
-# out of reach; the middle's x and y.
+# Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's centre, or
+# over its nearest corner where the centre lies beyond the rim, and −∞ for a cell that is dead or
+# out of reach; the centre's x and y.
 HEIGHT, X, Y = range(3)
 PLANES = 3
 
-# What goes with them, int64: the flat range of the rows in reach, and the number of cells in reach.
-FIRST, LAST, NUMBER = range(3)
-BOUNDS = 3
 
-
-def cell_middles(
-    geometry: Geometry, live: NDArray[np.bool_], reach: float
-) -> tuple[FloatArray, IntArray]:
-    """The planes and bounds of a grid whose ``live`` cells [rows, cols] are marked.
+def cell_centres(grid: Grid, live: NDArray[np.bool_], reach: float, found: Reach) -> FloatArray:
+    """The planes of a grid whose ``live`` cells [rows, cols] are marked; fills in ``found``.
 
     A cell is in reach when the disc of radius ``reach`` [m] round the tip's centre touches it.
     """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
+    a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     rows, cols = live.shape
     x, y = np.meshgrid(
-        x_first + pitch_x * (np.arange(cols) + 0.5), y_first + pitch_y * (np.arange(rows) + 0.5)
+        grid.x + pitch_x * (np.arange(cols) + 0.5), grid.y + pitch_y * (np.arange(rows) + 0.5)
     )
     nearest_x = np.maximum(np.abs(x) - 0.5 * pitch_x, 0.0)
     nearest_y = np.maximum(np.abs(y) - 0.5 * pitch_y, 0.0)
@@ -45,11 +40,11 @@ def cell_middles(
     near = np.maximum(a * a - nearest_x**2 - nearest_y**2, 0.0)
     inside = a * a - x * x - y * y
     height = np.sqrt(np.where(inside > 0.0, inside, near))
-    planes = np.stack([np.where(touched & live, height, -math.inf), x, y]).reshape(PLANES, -1)
     reached = np.flatnonzero(touched.any(axis=1))
-    first, last = (int(reached[0]), int(reached[-1]) + 1) if len(reached) else (0, 0)
-    bounds = np.array([first * cols, last * cols, np.count_nonzero(touched & live)], np.int64)
-    return planes, bounds
+    if len(reached):
+        found.first, found.last = int(reached[0]) * cols, (int(reached[-1]) + 1) * cols
+    found.number = int(np.count_nonzero(touched & live))
+    return np.stack([np.where(touched & live, height, -math.inf), x, y]).reshape(PLANES, -1)
 
 
 @fast_inner_kernel
@@ -71,41 +66,40 @@ def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[floa
 
 @fast_inner_kernel
 def sums_above(
-    frame: Pointer, middles: Pointer, size: int, first: int, last: int, level: float
-) -> tuple[float, float, float, float]:
-    """Σ p, Σ p x, Σ p y and the number of the cells in first..last with p above ``level``."""
+    m: Moments, reach: Reach, frame: Pointer, centres: Pointer, size: int, level: float
+) -> None:
+    """Σ p, Σ p x, Σ p y and the number of the cells in reach with p above ``level``, into ``m``.
+
+    ``size`` is that of a plane.
+    """
     total = sum_x = sum_y = number = 0.0
-    for k in range(first, last):
+    for k in range(reach.first, reach.last):
         value = frame[k]
-        counts = (middles[k] >= 0.0) & (value > level)
+        counts = (centres[k] >= 0.0) & (value > level)
         value = value if counts else 0.0
         total += value
-        sum_x += value * middles[size + k]
-        sum_y += value * middles[2 * size + k]
+        sum_x += value * centres[size + k]
+        sum_y += value * centres[2 * size + k]
         number += 1.0 if counts else 0.0
-    return total, sum_x, sum_y, number
+    m.total = total
+    m.x = sum_x
+    m.y = sum_y
+    m.number = number
 
 
 @fast_inner_kernel
 def sums_inside(
-    frame: Pointer,
-    middles: Pointer,
-    size: int,
-    first: int,
-    last: int,
-    u: float,
-    v: float,
-    w: float,
-) -> tuple[float, float, float, float, float]:
-    """Σ p, Σ p x, Σ p y, Σ p (x² + y²) and the number of cells whose middle the face has pressed.
-
-    ``size`` is that of a plane; (u, v, w) is the face, see footprint.py.
-    """
+    m: Moments, frame: Pointer, centres: Pointer, size: int, first: int, last: int
+) -> None:
+    """Σ p, Σ p x, Σ p y, Σ p (x² + y²), cells first..last whose centre ``m.face`` has pressed."""
+    u = m.face.u
+    v = m.face.v
+    w = m.face.w
     total = sum_x = sum_y = square = number = 0.0
     for k in range(first, last):
-        x = middles[size + k]
-        y = middles[2 * size + k]
-        inside = middles[k] > u - v * x - w * y
+        x = centres[size + k]
+        y = centres[2 * size + k]
+        inside = centres[k] > u - v * x - w * y
         value = frame[k]
         value = value if inside else 0.0
         along_x = value * x
@@ -115,7 +109,11 @@ def sums_inside(
         sum_y += along_y
         square += along_x * x + along_y * y
         number += 1.0 if inside else 0.0
-    return total, sum_x, sum_y, square, number
+    m.total = total
+    m.x = sum_x
+    m.y = sum_y
+    m.trace = square
+    m.number = number
 
 
 @fast_inner_kernel

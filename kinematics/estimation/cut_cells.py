@@ -16,37 +16,26 @@ import math
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.sensing.footprint import (
-    GAUSS_NODES,
-    GAUSS_WEIGHTS,
-    Crossings,
-    FloatArray,
-    IntArray,
+from softfinger.kinematics.compiled.simd import Pointer
+from softfinger.kinematics.estimation.state import (
+    ALONG_X,
+    ALONG_Y,
+    PLAIN,
+    SHARE,
+    VARIANCE,
+    WEIGHT,
+    State,
+    Strips,
 )
+from softfinger.kinematics.sensing.footprint import GAUSS_NODES, GAUSS_WEIGHTS, Face, Grid
 
-# Planes of the packed footprint cells: share, means of g, x g, y g over it, variance of strain,
-# reading, weight.
-SHARE, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
-PLANES = 7
-
-# Rows of the scratch for strips across cut cells, first what goes in: the strip's lower end and
-# length, the cell's left side, and 1 where the rim is on the cell's left, else 0. Then the ends of
-# the line at work, and the sums that come out.
-FROM, LENGTH, CELL_X, SIDE, LEFT, WIDTH, AREA, SUM_G, SUM_X, SUM_Y, SUM_SQUARE = range(11)
-STRIP_ROWS = 11
 STRIPS_A_CELL = 5
-STRIPS = 264  # at once, of each level
-OWNERS = 128
 
 # How near the rim a cell is, and where a line's parts end by that, counted from the rim's far side.
 COARSE, FINE, FINEST = range(3)
-LEVELS = 3
 PART_ENDS = np.array(
     [[0.0, 1.0, 1.0, 1.0, 1.0], [0.0, 0.5, 1.0, 1.0, 1.0], [0.0, 0.5, 0.75, 0.9, 1.0]]
 )
-
-# Where the queues of strips stand in the integer scratch: strips and cells of each level.
-FILLED, WAITING = range(2)
 
 # The two-point Gauss rule on [0, 1].
 NEAR = 0.5 - 0.5 / math.sqrt(3.0)
@@ -54,65 +43,72 @@ FAR = 0.5 + 0.5 / math.sqrt(3.0)
 
 
 @fast_inner_kernel
-def integrate_strips(
-    strips: FloatArray,
-    count: int,
-    level: int,
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    pitch_x: float,
-) -> None:
-    """Integrals over the footprint's part of each strip of ``strips`` [STRIP_ROWS, n], in lanes.
+def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> None:
+    """Area of the footprint's part of each strip, and over it the integrals of g, x g, y g, (z g)².
 
-    In: rows FROM, LENGTH, CELL_X, SIDE. Out: rows AREA, and the integrals of g, x g, y g and
-    (face g)², with the face's height over the base.
+    z is the face's height over the base. In SIMD lanes.
     """
+    u = face.u
+    v = face.v
+    w = face.w
+    pitch_x = grid.pitch_x
+    start = strips.start
+    length = strips.length
+    cell_x = strips.cell_x
+    side = strips.side
+    left = strips.left
+    width = strips.width
+    area = strips.area
+    sum_g = strips.sum_g
+    sum_x = strips.sum_x
+    sum_y = strips.sum_y
+    sum_square = strips.sum_square
+    # Whole lanes: what is left of earlier strips in the last ones does no harm.
+    count = (strips.count + 7) & ~7
     stretch = 1.0 + v * v
     e = 1.0 / stretch
-    a2 = a * a
+    a2 = grid.radius * grid.radius
     n = 2 * level + 2  # 2, 4, 6 lines
     parts = 1 << level  # 1, 2, 4 parts a line
     for k in range(count):
-        strips[AREA, k] = 0.0
-        strips[SUM_G, k] = 0.0
-        strips[SUM_X, k] = 0.0
-        strips[SUM_Y, k] = 0.0
-        strips[SUM_SQUARE, k] = 0.0
+        area[k] = 0.0
+        sum_g[k] = 0.0
+        sum_x[k] = 0.0
+        sum_y[k] = 0.0
+        sum_square[k] = 0.0
     for line in range(n):
         node = GAUSS_NODES[n, line]
         share = GAUSS_WEIGHTS[n, line]
         for k in range(count):
-            y = strips[FROM, k] + strips[LENGTH, k] * node
-            x0 = strips[CELL_X, k]
+            y = start[k] + length[k] * node
+            x0 = cell_x[k]
             rim = a2 - y * y
             q = u - w * y
             root = math.sqrt(max(stretch * rim - q * q, 0.0))
             # A root under the base plane is no edge: there the rim is.
             edge = math.sqrt(max(rim, 0.0))
-            left = (v * q - root) * e
-            right = (v * q + root) * e
-            left = -edge if q < v * left else left
-            right = edge if q < v * right else right
-            left = max(left, x0)
-            width = max(min(right, x0 + pitch_x) - left, 0.0)
-            strips[LEFT, k] = left
-            strips[WIDTH, k] = width
-            strips[AREA, k] += share * strips[LENGTH, k] * width
+            near = (v * q - root) * e
+            far = (v * q + root) * e
+            near = -edge if q < v * near else near
+            far = edge if q < v * far else far
+            near = max(near, x0)
+            across = max(min(far, x0 + pitch_x) - near, 0.0)
+            left[k] = near
+            width[k] = across
+            area[k] += share * length[k] * across
         for part in range(parts):
-            start = PART_ENDS[level, part]
-            length = PART_ENDS[level, part + 1] - start
-            mirrored = 1.0 - 2.0 * start - length
+            begin = PART_ENDS[level, part]
+            portion = PART_ENDS[level, part + 1] - begin
+            mirrored = 1.0 - 2.0 * begin - portion
             for k in range(count):
-                y = strips[FROM, k] + strips[LENGTH, k] * node
+                y = start[k] + length[k] * node
                 rim = a2 - y * y
                 q = u - w * y
-                width = strips[WIDTH, k]
-                left = strips[LEFT, k] + width * (start + mirrored * strips[SIDE, k])
-                width *= length
-                xa = left + width * NEAR
-                xb = left + width * FAR
+                across = width[k]
+                near = left[k] + across * (begin + mirrored * side[k])
+                across *= portion
+                xa = near + across * NEAR
+                xb = near + across * FAR
                 ga = 1.0 / math.sqrt(max(rim - xa * xa, 1e-9 * a2))
                 gb = 1.0 / math.sqrt(max(rim - xb * xb, 1e-9 * a2))
                 # Under the base plane the strain stays 1.
@@ -120,90 +116,71 @@ def integrate_strips(
                 gb = gb if q > v * xb else 0.0
                 face_a = (q - v * xa) * ga
                 face_b = (q - v * xb) * gb
-                half = 0.5 * share * strips[LENGTH, k] * width
-                strips[SUM_G, k] += half * (ga + gb)
-                strips[SUM_X, k] += half * (xa * ga + xb * gb)
-                strips[SUM_Y, k] += half * y * (ga + gb)
-                strips[SUM_SQUARE, k] += half * (face_a * face_a + face_b * face_b)
+                half = 0.5 * share * length[k] * across
+                sum_g[k] += half * (ga + gb)
+                sum_x[k] += half * (xa * ga + xb * gb)
+                sum_y[k] += half * y * (ga + gb)
+                sum_square[k] += half * (face_a * face_a + face_b * face_b)
 
 
 @inner_kernel
-def flush(
-    strips: FloatArray,
-    owners: IntArray,
-    filled: IntArray,
-    level: int,
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    pitch_x: float,
-    pitch_y: float,
-    packed: FloatArray,
-) -> None:
-    """Sum the strips of one level's cut cells into the cells' places in ``packed``; empties it.
-
-    ``strips`` [STRIP_ROWS, n] and ``owners`` [2, OWNERS] are the level's: each cell's place and the
-    end of its strips; ``filled`` [2] their numbers.
-    """
-    # Whole lanes: what is left of earlier strips in the last ones does no harm.
-    integrate_strips(strips, (filled[FILLED] + 7) & ~7, level, u, v, w, a, pitch_x)
-    whole = 1.0 / (pitch_x * pitch_y)
+def flush(state: State, level: int, packed: Pointer) -> None:
+    """Sum the strips of one level's cut cells into the cells' places in ``packed``; empties it."""
+    strips = state.strips[level]
+    grid = state.model
+    face = state.fit.face
+    size = grid.rows * grid.cols
+    _integrate_strips(strips, level, face, grid)
+    whole = 1.0 / (grid.pitch_x * grid.pitch_y)
     strip = 0
-    for k in range(filled[WAITING]):
+    for k in range(strips.owners):
         area = g = g_x = g_y = square = 0.0
-        while strip < owners[1, k]:
-            area += strips[AREA, strip]
-            g += strips[SUM_G, strip]
-            g_x += strips[SUM_X, strip]
-            g_y += strips[SUM_Y, strip]
-            square += strips[SUM_SQUARE, strip]
+        while strip < strips.ends[k]:
+            area += strips.area[strip]
+            g += strips.sum_g[strip]
+            g_x += strips.sum_x[strip]
+            g_y += strips.sum_y[strip]
+            square += strips.sum_square[strip]
             strip += 1
-        place = owners[0, k]
+        place = strips.places[k]
         share = area * whole
+        variance = 0.0
         if share > 1e-9:
             per_area = 1.0 / area
             g *= per_area
             g_x *= per_area
             g_y *= per_area
-            face = u * g - v * g_x - w * g_y
-            packed[SHARE, place] = share
-            packed[PLAIN, place] = g
-            packed[ALONG_X, place] = g_x
-            packed[ALONG_Y, place] = g_y
+            height = face.u * g - face.v * g_x - face.w * g_y
             # The strain's variance is that of the face's height times g.
-            packed[VARIANCE, place] = square * per_area - face * face
+            variance = square * per_area - height * height
         else:
-            packed[SHARE, place] = 0.0
-            packed[PLAIN, place] = 0.0
-            packed[ALONG_X, place] = 0.0
-            packed[ALONG_Y, place] = 0.0
-            packed[VARIANCE, place] = 0.0
-            packed[WEIGHT, place] = 0.0
-    filled[FILLED] = 0
-    filled[WAITING] = 0
+            share = g = g_x = g_y = 0.0
+            packed[WEIGHT * size + place] = 0.0
+        packed[SHARE * size + place] = share
+        packed[PLAIN * size + place] = g
+        packed[ALONG_X * size + place] = g_x
+        packed[ALONG_Y * size + place] = g_y
+        packed[VARIANCE * size + place] = variance
+    strips.count = 0
+    strips.owners = 0
 
 
 @inner_kernel
 def push_strips(
-    strips: FloatArray,
-    count: int,
+    strips: Strips,
     x0: float,
-    y0: float,
-    y1: float,
-    low: float,
-    high: float,
-    crossings: Crossings,
-) -> int:
-    """Cut a cell into strips where the outline crosses its sides; their number with the new ones.
+    start: float,
+    stop: float,
+    height: float,
+    crossings: tuple[float, float, float, float],
+) -> None:
+    """Cut a cell into strips where the outline crosses its sides.
 
-    ``low``, ``high`` bound the footprint in y; ``crossings`` are the four y where the outline
-    crosses the cell's left and right side.
+    ``start`` and ``stop`` are the cell's ends in y within the footprint, ``height`` is the whole
+    cell's; ``crossings`` are the four y where the outline crosses its left and right side.
     """
-    start = max(y0, low)
-    stop = min(y1, high)
     if not start < stop:
-        return count
+        return
     b0 = min(max(crossings[0], start), stop)
     b1 = min(max(crossings[1], start), stop)
     b2 = min(max(crossings[2], start), stop)
@@ -214,14 +191,15 @@ def push_strips(
     b1, b3 = min(b1, b3), max(b1, b3)
     b1, b2 = min(b1, b2), max(b1, b2)
     side = 1.0 if x0 < 0.0 else 0.0
-    least = 1e-6 * (y1 - y0)
+    least = 1e-6 * height
+    count = strips.count
     for end in (b0, b1, b2, b3, stop):
-        strips[FROM, count] = start
-        strips[LENGTH, count] = end - start
-        strips[CELL_X, count] = x0
-        strips[SIDE, count] = side
+        strips.start[count] = start
+        strips.length[count] = end - start
+        strips.cell_x[count] = x0
+        strips.side[count] = side
         # Written anyway, and kept if it's worth it: no branch that can't be foreseen.
         kept = end - start > least
         count += 1 if kept else 0
         start = end if kept else start
-    return count
+    strips.count = count

@@ -1,8 +1,7 @@
 """Pressure grid → displacement, tilt, gain and their covariance.
 
-Holds `ContactEstimator` and its result. The ladder it climbs for a frame, in one compiled call, is
-in ladder.py: an activity test (activity.py); centroid and extent over the footprint (moments.py);
-Gauss-Newton on the likelihood of every cell in the footprint (gauss_newton.py).
+Holds `ContactEstimator` and its result. What happens to a frame, in one compiled call, is in
+frame_pipeline.py.
 """
 
 from __future__ import annotations
@@ -14,14 +13,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation import frame_pipeline, scratch
 from softfinger.kinematics.estimation.blurred_cells import parts_to_fit, weights
-from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_middles
-from softfinger.kinematics.estimation.likelihood import fit_law
+from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
+from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
+from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
-from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE, face_integrals
+from softfinger.kinematics.estimation.state import PLANES, State
+from softfinger.kinematics.sensing.cell_integrals import LIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
@@ -34,8 +35,7 @@ class ContactEstimate:
     tilts are 0 and that is valid. ``covariance`` is of (d, tilt_x, tilt_y, gain); a fixed gain has
     a zero row, and without contact all is zero. ``chi2`` is the misfit's square a cell over the
     noise's, ``explained`` the share of the frame's squared pressure that the model accounts for;
-    both are 0 where nothing was fitted, as by the moments. ``misfit`` tells a contact that is
-    another than the model's.
+    both are 0 where nothing was fitted, as by the moments.
     """
 
     contact: bool = False
@@ -49,7 +49,7 @@ class ContactEstimate:
     peak: float = 0.0  # largest cell [Pa]
     cells: int = 0  # cells in the fit
     iterations: int = 0
-    rejected: int = 0  # hot cells left out
+    rejected: int = 0  # outliers left out
     second: bool = False  # something else presses too, off the footprint
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
@@ -57,8 +57,8 @@ class ContactEstimate:
     def misfit(self) -> bool:
         """χ² is beyond what the noise makes once in 3.5 million frames (Wilson-Hilferty, 5 σ).
 
-        So the numbers are those of a contact that this model doesn't describe, or the noise is
-        larger than was told; the covariance is widened then, but knows no bias.
+        The contact is then none that this model describes, or the noise is larger than given; the
+        covariance is widened, but holds no bias.
         """
         spread = 2.0 / (9.0 * max(self.cells - 4, 1))
         return self.chi2 > (1.0 - spread + 5.0 * math.sqrt(spread)) ** 3
@@ -141,46 +141,32 @@ class ContactEstimator:
         if live is not None and np.shape(live) != grid.shape:
             raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
         self.grid = grid
-        geometry = grid.geometry(tip)
-        rows, cols = grid.shape
         self.saturation = saturation
         self._quantum = quantum
-        self._cells = np.zeros((rows, CELL_PLANES, cols))
-        face_integrals(geometry, self._cells)
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
-        middles, bounds = cell_middles(geometry, alive, tip.radius + 3.0 * grid.blur)
-        # A blur reaches cells that no contact is looked for in; whatever they read, it's not used.
-        self._cells[:, LIVE] = (middles[HEIGHT] >= 0.0).reshape(grid.shape)
-        self._tables = np.concatenate(
-            [moment_ratios(tip, material).ravel(), fit_law(material.law).ravel()]
-        )
-        self._floats, self._integers = scratch.make(
-            middles, bounds, grid.shape, _parts(grid, tip) if grid.blur > 0.0 else None
-        )
-        plan = np.zeros(frame_pipeline.OPTIONS)
-        plan[:5] = geometry
-        plan[frame_pipeline.NOISE] = noise
-        plan[frame_pipeline.SATURATION] = math.inf
-        plan[frame_pipeline.FREE_GAIN] = free_gain
-        plan[frame_pipeline.FIXED_GAIN] = gain
-        plan[frame_pipeline.TOLERANCE] = tolerance
-        plan[frame_pipeline.ITERATIONS_MAX] = iterations
-        plan[frame_pipeline.MOMENTS_ONLY] = method == "moments"
-        plan[frame_pipeline.PEAK_LEVEL] = peak_level
-        plan[frame_pipeline.PATCH_LEVEL] = patch_level
-        plan[frame_pipeline.EXPLAINED_MIN] = explained_min
-        plan[frame_pipeline.MODULUS] = material.reference_modulus
-        plan[frame_pipeline.ROTATION] = grid.rotation
-        plan[frame_pipeline.BLUR] = grid.blur
+        state = self._state = State()
+        options = state.options
+        options.noise = noise
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
-        plan[frame_pipeline.FLOOR] = max(threshold - 0.5, 0.0)
-        self._plan = plan
-        self._state = np.zeros(frame_pipeline.STATE)
-        self._frame = np.zeros((rows, cols))
+        options.floor = max(threshold - 0.5, 0.0)
+        options.free_gain = free_gain
+        options.fixed_gain = gain
+        options.tolerance = tolerance
+        options.iterations = iterations
+        options.moments_only = method == "moments"
+        options.peak_level = peak_level
+        options.patch_level = patch_level
+        options.explained_min = explained_min
+        options.modulus = material.reference_modulus
+        options.blur = grid.blur
+        options.rotation = grid.rotation
+        set_law(state.law, material.law)
+        state.moments.ratios = moment_ratios(tip, material)
+        self._arena, self._places = _lay_out(state, grid, tip, alive)
+        self._estimate: Any = state.estimate.array
+        self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
-        self._last = ContactEstimate(
-            covariance=self._state[frame_pipeline.COVARIANCE :].reshape(4, 4)
-        )
+        self._last = ContactEstimate(covariance=state.estimate.covariance)
 
     @property
     def saturation(self) -> float | None:
@@ -202,14 +188,14 @@ class ContactEstimator:
 
         Frames as for :meth:`update`. Raises ValueError for a wrong shape or type.
         """
-        kept = self._state.copy()
+        estimate = self._state.estimate
+        kept = self._estimate.copy()
         try:
-            self._state[frame_pipeline.WARM] = 0.0
+            estimate.warm = False
             self._run(frame, pascal_per_count)
-            covariance = self._state[frame_pipeline.COVARIANCE :].reshape(4, 4).copy()
-            return self._tell(ContactEstimate(covariance=covariance))
+            return self._publish(ContactEstimate(covariance=estimate.covariance.copy()))
         finally:
-            self._state[:] = kept
+            self._estimate[:] = kept
 
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
@@ -225,30 +211,22 @@ class ContactEstimator:
             return self._last
         self._run(frame, pascal_per_count)
         self._seq = seq
-        return self._tell(self._last)
+        return self._publish(self._last)
 
     def reset(self) -> None:
         """Forget the last estimate: the next frame starts cold."""
-        self._state[frame_pipeline.WARM] = 0.0
+        self._state.estimate.warm = False
         self._seq = None
 
-    def compiled_arguments(
-        self,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
-        """What :func:`estimation.frame_pipeline.estimate_frame` takes behind the frame and its
-        scale.
+    @property
+    def state(self) -> State:
+        """The memory of :func:`estimation.frame_pipeline.estimate_frame`, for compiled callers."""
+        return self._state
 
-        For callers that are compiled themselves. Options, cells, tables, state, floats, integers;
-        the arrays are the estimator's own. Saturation is as for the last frame of :meth:`update`.
-        """
-        return (
-            self._plan,
-            self._cells,
-            self._tables,
-            self._state,
-            self._floats,
-            self._integers,
-        )
+    @property
+    def arena(self) -> tuple[FloatArray, IntArray | None]:
+        """The arrays that the same function takes last; see `estimation.state`."""
+        return self._arena, self._places
 
     def _run(self, frame: NDArray[Any], pascal_per_count: float) -> None:
         full = _FULL.get(frame.dtype) if isinstance(frame, np.ndarray) else None
@@ -259,49 +237,77 @@ class ContactEstimator:
             raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
-        self._plan[frame_pipeline.SATURATION] = (
-            full if self._saturation is None else self._saturation
-        )
+        self._state.options.saturation = full if self._saturation is None else self._saturation
         # One copy makes every type, layout and read-only frame the same to the compiled entry.
         np.copyto(self._frame, frame)
-        frame_pipeline.estimate_frame(
+        step = self._quantum if full == math.inf else pascal_per_count
+        estimate_frame(
+            self._state.array,
             self._frame,
             float(pascal_per_count),
-            self._quantum if full == math.inf else float(pascal_per_count),
-            *self.compiled_arguments(),
+            float(step),
+            self._arena,
+            self._places,
         )
 
-    def _tell(self, result: ContactEstimate) -> ContactEstimate:
-        state = self._state[: frame_pipeline.TOLD].tolist()
-        result.contact = state[frame_pipeline.CONTACT] > 0.0
-        result.valid = state[frame_pipeline.VALID] > 0.0
-        result.d = state[frame_pipeline.D]
-        result.tilt_x = state[frame_pipeline.TILT_X]
-        result.tilt_y = state[frame_pipeline.TILT_Y]
-        result.gain = state[frame_pipeline.GAIN]
-        result.chi2 = state[frame_pipeline.CHI2]
-        result.explained = state[frame_pipeline.EXPLAINED]
-        result.peak = state[frame_pipeline.PEAK]
-        result.cells = int(state[frame_pipeline.CELLS])
-        result.iterations = int(state[frame_pipeline.ITERATIONS])
-        result.rejected = int(state[frame_pipeline.REJECTED])
-        result.second = state[frame_pipeline.SECOND] > 0.0
+    def _publish(self, result: ContactEstimate) -> ContactEstimate:
+        (
+            result.d,
+            result.gain,
+            result.chi2,
+            result.tilt_x,
+            result.tilt_y,
+            result.explained,
+            result.peak,
+            result.cells,
+            result.iterations,
+            result.rejected,
+            result.contact,
+            result.valid,
+            result.second,
+            *_,
+        ) = self._estimate.item()
         return result
 
 
-def _parts(grid: SensorGrid, tip: Fingertip) -> scratch.Parts:
-    """The parts of cells that a blurred grid is modelled on."""
-    pitch_x, pitch_y = grid.pitches
-    number = parts_to_fit(grid.blur / pitch_x), parts_to_fit(grid.blur / pitch_y)
-    (across, along), finer = grid.finer(number)
-    planes = np.zeros((finer.rows, CELL_PLANES, finer.cols))
-    face_integrals(finer.geometry(tip), planes)
-    planes[:, LIVE] = 1.0
-    return scratch.Parts(
-        number,
-        (len(across) // 2, len(along) // 2),
+def _lay_out(
+    state: State, grid: SensorGrid, tip: Fingertip, live: NDArray[np.bool_]
+) -> tuple[FloatArray, IntArray | None]:
+    """The arena of a grid, and scratch for the places of a blurred one's parts; see `state`."""
+    geometry = grid.on(tip)
+    state.grid.assign(geometry)
+    state.model.assign(geometry)
+    centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
+    cells = cell_integrals(geometry)
+    # A blur reaches cells that no contact is looked for in; whatever they read, it's not used.
+    cells[:, LIVE] = (centres[HEIGHT] >= 0.0).reshape(grid.shape)
+    arrays = {"centres": centres, "cells": cells}
+    places = None
+    if grid.blur > 0.0:
+        pitch_x, pitch_y = grid.pitches
+        number = parts_to_fit(grid.blur / pitch_x), parts_to_fit(grid.blur / pitch_y)
+        (across, along), finer = grid.finer(number)
+        parts = cell_integrals(finer.on(tip))
+        parts[:, LIVE] = 1.0
+        model, blur = state.model, state.blur
+        model.rows, model.cols = finer.shape
+        model.pitch_x, model.pitch_y = pitch_x / number[0], pitch_y / number[1]
+        model.x = geometry.x - len(across) // 2 * model.pitch_x
+        model.y = geometry.y - len(along) // 2 * model.pitch_y
         # By the remainder of a part's column first.
-        weights(across, number[0]).reshape(-1, number[0]).T.ravel(),
-        weights(along, number[1]),
-        planes,
-    )
+        across = weights(across, number[0]).reshape(-1, number[0]).T
+        along = weights(along, number[1])
+        blur.parts_x, blur.parts_y = number
+        blur.weights_x, blur.weights_y = across.shape[1], len(along)
+        blur.width = number[0] * (grid.cols + 2 * LANES) + across.size
+        fine, half = np.zeros((finer.rows + 1, blur.width)), np.zeros(blur.width)
+        arrays |= {"parts": parts, "across": across, "along": along, "fine": fine, "half": half}
+        places = np.zeros(finer.rows * finer.cols, dtype=np.int64)
+    rows, cols = state.model.rows, state.model.cols
+    arrays["columns"], arrays["lines"] = np.zeros(2 * (cols + 1)), np.zeros(2 * (rows + 1))
+    arrays["packed"] = np.zeros(PLANES * rows * cols)
+    start = 0
+    for name, array in arrays.items():
+        setattr(state.at, name, start)
+        start += array.size
+    return np.concatenate([array.ravel() for array in arrays.values()]), places

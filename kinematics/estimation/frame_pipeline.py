@@ -1,7 +1,7 @@
-"""The estimator's one compiled entry: one pressure frame up the ladder.
+"""The estimator's one compiled entry: the order of the steps for one pressure frame.
 
-Holds the order of the steps for a frame and the layout of the arrays that go in and out: activity
-test, hot cells, then moments or maximum likelihood, from the last estimate or from the frame alone.
+Activity test, outliers, then moments or maximum likelihood, from the last estimate or from the
+frame alone.
 """
 
 from __future__ import annotations
@@ -9,153 +9,55 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.compiled.unowned import borrowed
-from softfinger.kinematics.estimation import gauss_newton
-from softfinger.kinematics.estimation.cell_centres import NUMBER
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.detection import presses_outside
-from softfinger.kinematics.estimation.gauss_newton import RESULT, fit
-from softfinger.kinematics.estimation.moments import RATIO_POINTS, coarse, coarse_weak, refine
-from softfinger.kinematics.estimation.outliers import revive, without_spikes
-from softfinger.kinematics.estimation.scratch import MIDDLES, SPIKES_MAX
+from softfinger.kinematics.estimation.gauss_newton import fit
+from softfinger.kinematics.estimation.moments import refine, start_from_frame
+from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
+from softfinger.kinematics.estimation.state import OUTLIERS_MAX, State
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
-
-# Places in the state: what a frame leaves, and where the next one starts. The estimate in the
-# sensor's axes comes first, then what is told in the finger's.
-(
-    D,
-    N_X,
-    N_Y,
-    GAIN,
-    CHI2,
-    CELLS,
-    ITERATIONS,
-    RESIDUAL,
-    WARM,
-    CONTACT,
-    VALID,
-    TILT_X,
-    TILT_Y,
-    EXPLAINED,
-    PEAK,
-    REJECTED,
-    SECOND,
-) = range(17)
-TOLD = 17
-COVARIANCE = TOLD  # 4 × 4 of (d, tilt_x, tilt_y, gain) in the finger's axes
-STATE = COVARIANCE + 16
-
-# Places in the options, after the five of the geometry.
-(
-    NOISE,
-    SATURATION,
-    FREE_GAIN,
-    FIXED_GAIN,
-    TOLERANCE,
-    ITERATIONS_MAX,
-    MOMENTS_ONLY,
-    PEAK_LEVEL,
-    PATCH_LEVEL,
-    EXPLAINED_MIN,
-    MODULUS,
-    ROTATION,
-    FLOOR,
-    BLUR,
-) = range(5, 19)
-OPTIONS = 19
 
 # Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
 CLIPPED_MORE = 0.5
-WEAK = 15.0  # noise: a largest cell below is looked for together with its neighbours
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
 
 
 @inner_kernel
-def _start(
-    frame: FloatArray,
-    middles: FloatArray,
-    bounds: IntArray,
-    ratios: FloatArray,
-    plan: FloatArray,
-    scale: float,
-    noise: float,
-    row: int,
-    col: int,
-    state: FloatArray,
-    covariance: FloatArray,
-) -> None:
-    """First estimate from the frame alone, into ``state``."""
-    geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
-    peak = frame[row, col]
-    if peak > WEAK * noise:
-        level = max(4.0 * noise, 0.15 * peak)
-        d, n_x, n_y = coarse(frame, middles, bounds, geometry, level, row, col)
-    else:
-        level = 2.0 * noise
-        patch = plan[PATCH_LEVEL] * noise
-        d, n_x, n_y = coarse_weak(frame, middles, bounds, geometry, level, patch, row, col)
-    fixed = 0.0 if plan[FREE_GAIN] > 0.0 else plan[FIXED_GAIN]
-    modulus = plan[MODULUS] / scale
-    gain = 1.0
-    for _ in range(2):
-        d, n_x, n_y, gain = refine(
-            frame,
-            middles,
-            bounds,
-            geometry,
-            ratios,
-            modulus,
-            fixed,
-            noise,
-            plan[BLUR],
-            d,
-            n_x,
-            n_y,
-            covariance,
-        )
-    state[D] = d
-    state[N_X] = n_x
-    state[N_Y] = n_y
-    state[GAIN] = min(max(gain, 0.02), 50.0)
+def _take_moments(state: State) -> None:
+    """The moments' contact becomes the estimate."""
+    estimate = state.estimate
+    estimate.d = state.moments.d
+    estimate.n_x = state.moments.n_x
+    estimate.n_y = state.moments.n_y
+    estimate.gain = state.moments.gain
 
 
 @inner_kernel
-def _moments(
-    frame: FloatArray,
-    middles: FloatArray,
-    bounds: IntArray,
-    ratios: FloatArray,
-    plan: FloatArray,
-    scale: float,
-    noise: float,
-    state: FloatArray,
-    covariance: FloatArray,
-) -> bool:
+def _start(state: State, frame: Pointer, centres: Pointer) -> None:
+    """The estimate from the frame's moments alone."""
+    start_from_frame(state, frame, centres)
+    _take_moments(state)
+    state.estimate.gain = min(max(state.moments.gain, 0.02), 50.0)
+
+
+@inner_kernel
+def _track_moments(state: State, frame: Pointer, centres: Pointer) -> bool:
     """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
-    geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
-    a = plan[0]
-    fixed = 0.0 if plan[FREE_GAIN] > 0.0 else plan[FIXED_GAIN]
-    near = 0.5 * min(plan[3], plan[4])
+    estimate = state.estimate
+    m = state.moments
+    a = state.grid.radius
+    near = 0.5 * min(state.grid.pitch_x, state.grid.pitch_y)
     for _ in range(8):
-        d, n_x, n_y, gain = refine(
-            frame,
-            middles,
-            bounds,
-            geometry,
-            ratios,
-            plan[MODULUS] / scale,
-            fixed,
-            noise,
-            plan[BLUR],
-            state[D],
-            state[N_X],
-            state[N_Y],
-            covariance,
-        )
-        grown = math.sqrt(d * (2.0 * a - d)) - math.sqrt(state[D] * (2.0 * a - state[D]))
-        moved = a * math.hypot(n_x - state[N_X], n_y - state[N_Y])
-        state[D], state[N_X], state[N_Y], state[GAIN] = d, n_x, n_y, gain
-        if not gain > 0.0:
+        m.d = estimate.d
+        m.n_x = estimate.n_x
+        m.n_y = estimate.n_y
+        refine(state, frame, centres)
+        grown = math.sqrt(m.d * (2.0 * a - m.d)) - math.sqrt(estimate.d * (2.0 * a - estimate.d))
+        moved = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
+        _take_moments(state)
+        if not m.gain > 0.0:
             return False
         if abs(grown) + moved < near:
             return True
@@ -164,245 +66,155 @@ def _moments(
 
 @inner_kernel
 def _likelihood(
-    frame: FloatArray,
-    scale: float,
-    cells: FloatArray,
-    middles: FloatArray,
-    law: FloatArray,
-    ratios: FloatArray,
-    plan: FloatArray,
-    variance: float,
-    energy: float,
-    row: int,
-    col: int,
-    state: FloatArray,
-    covariance: FloatArray,
-    floats: FloatArray,
-    integers: IntArray,
-    clipped: bool,
+    state: State, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
 ) -> bool:
     """Maximum likelihood from the last estimate, or from the frame's moments if that fails."""
-    geometry = (plan[0], plan[1], plan[2], plan[3], plan[4])
-    free = plan[FREE_GAIN] > 0.0
-    noise = math.sqrt(variance) / scale
-    number = float(integers[NUMBER])
+    estimate = state.estimate
+    options = state.options
+    signal = state.signal
+    variance = signal.variance
+    energy = signal.energy * signal.scale * signal.scale
+    number = float(state.reach.number)
     for attempt in range(2):
-        if attempt == 0 and not state[WARM] > 0.0:
+        if attempt == 0 and not estimate.warm:
             continue
-        state[SECOND] = 0.0
+        estimate.second = False
         if attempt == 1:
-            _start(
-                frame, middles, integers, ratios, plan, scale, noise, row, col, state, covariance
-            )
-        if not free:
-            state[GAIN] = plan[FIXED_GAIN]
-        if fit(
-            frame,
-            scale,
-            geometry,
-            cells,
-            law,
-            free,
-            plan[SATURATION] * scale,
-            plan[FLOOR] * scale if clipped or plan[FLOOR] > 0.0 else -math.inf,
-            clipped,
-            energy,
-            number,
-            variance,
-            plan[TOLERANCE] if attempt == 0 else min(plan[TOLERANCE], 1.0),
-            int(plan[ITERATIONS_MAX]),
-            floats,
-            integers,
-            state[:RESULT],
-            covariance,
-        ):
+            _start(state, frame, centres)
+        if not options.free_gain:
+            estimate.gain = options.fixed_gain
+        tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
+        if fit(state, frame, arena, places, energy, tolerance):
             # Share of the frame's squared pressure, noise apart, that the model accounts for.
             scatter = variance * math.sqrt(2.0 * number)
-            misfit = max(energy + state[RESIDUAL] - number * variance, 0.0)
-            signal = max(energy - number * variance, scatter)
-            state[EXPLAINED] = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / signal, 1.0)
-            if state[EXPLAINED] < plan[EXPLAINED_MIN]:
+            misfit = max(energy + estimate.residual - number * variance, 0.0)
+            power = max(energy - number * variance, scatter)
+            estimate.explained = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / power, 1.0)
+            if estimate.explained < options.explained_min:
                 continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
             if misfit > 8.0 * scatter + 0.003 * energy:
-                level = max(5.0 * noise, 0.15 * state[PEAK] / scale)
-                state[SECOND] = presses_outside(
-                    frame,
-                    middles,
-                    geometry,
-                    integers,
-                    level,
-                    state[D],
-                    state[N_X],
-                    state[N_Y],
-                    plan[BLUR],
-                )
-            if not state[SECOND] > 0.0:
+                level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
+                estimate.second = presses_outside(state, frame, centres, level)
+            if not estimate.second:
                 return True
     return False
 
 
 @inner_kernel
-def _tell(plan: FloatArray, state: FloatArray, covariance: FloatArray) -> None:
+def _publish(state: State) -> None:
     """Turn the estimate from normals in the sensor's axes to tilts in the finger's."""
-    c = math.cos(plan[ROTATION])
-    s = math.sin(plan[ROTATION])
-    n_x = c * state[N_X] - s * state[N_Y]
-    n_y = s * state[N_X] + c * state[N_Y]
-    state[TILT_X] = math.asin(n_x)
-    state[TILT_Y] = math.asin(n_y)
+    estimate = state.estimate
+    covariance = state.fit.covariance
+    published = estimate.covariance
+    c = math.cos(state.options.rotation)
+    s = math.sin(state.options.rotation)
+    n_x = c * estimate.n_x - s * estimate.n_y
+    n_y = s * estimate.n_x + c * estimate.n_y
+    estimate.tilt_x = math.asin(n_x)
+    estimate.tilt_y = math.asin(n_y)
     # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns turn.
     per_x = 1.0 / math.sqrt(1.0 - n_x * n_x)
     per_y = 1.0 / math.sqrt(1.0 - n_y * n_y)
     for j in range(4):
-        along = covariance[4 + j]
-        across = covariance[8 + j]
-        covariance[4 + j] = per_x * (c * along - s * across)
-        covariance[8 + j] = per_y * (s * along + c * across)
-    for i in range(0, 16, 4):
-        along = covariance[i + 1]
-        across = covariance[i + 2]
-        state[COVARIANCE + i] = covariance[i]
-        state[COVARIANCE + i + 1] = per_x * (c * along - s * across)
-        state[COVARIANCE + i + 2] = per_y * (s * along + c * across)
-        state[COVARIANCE + i + 3] = covariance[i + 3]
+        along = covariance[1, j]
+        across = covariance[2, j]
+        covariance[1, j] = per_x * (c * along - s * across)
+        covariance[2, j] = per_y * (s * along + c * across)
+    for i in range(4):
+        along = covariance[i, 1]
+        across = covariance[i, 2]
+        published[i, 0] = covariance[i, 0]
+        published[i, 1] = per_x * (c * along - s * across)
+        published[i, 2] = per_y * (s * along + c * across)
+        published[i, 3] = covariance[i, 3]
 
 
 @inner_kernel
-def _climb(
-    frame: FloatArray,
-    scale: float,
-    clipped: bool,
-    variance: float,
-    energy: float,
-    row: int,
-    col: int,
-    plan: FloatArray,
-    cells: FloatArray,
-    middles: FloatArray,
-    tables: FloatArray,
-    state: FloatArray,
-    floats: FloatArray,
-    integers: IntArray,
+def _estimate(
+    state: State, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
 ) -> bool:
-    """The estimate of a frame with a contact into ``state``; whether it can be used."""
-    ratios = tables[: 3 * RATIO_POINTS].reshape(RATIO_POINTS, 3)
-    covariance = floats[:16]  # see workspace.py
-    noise = math.sqrt(variance) / scale
+    """The estimate of a frame with a contact; whether it can be used."""
+    estimate = state.estimate
     done = False
-    if plan[MOMENTS_ONLY] > 0.0:
-        if state[WARM] > 0.0:
-            done = _moments(frame, middles, integers, ratios, plan, scale, noise, state, covariance)
+    if state.options.moments_only:
+        if estimate.warm:
+            done = _track_moments(state, frame, centres)
         if not done:
-            _start(
-                frame, middles, integers, ratios, plan, scale, noise, row, col, state, covariance
-            )
+            _start(state, frame, centres)
             done = True
     else:
-        done = _likelihood(
-            frame,
-            scale,
-            cells,
-            middles,
-            tables[3 * RATIO_POINTS :].reshape((tables.size - 3 * RATIO_POINTS) // 4, 4),
-            ratios,
-            plan,
-            variance,
-            energy,
-            row,
-            col,
-            state,
-            covariance,
-            floats,
-            integers,
-            clipped,
-        )
-    if not (GAIN_MIN < state[GAIN] < GAIN_MAX and state[D] < D_MAX * plan[0]):
-        done = False
-    _tell(plan, state, covariance)
-    return done
+        done = _likelihood(state, frame, arena, centres, places)
+    in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
+    _publish(state)
+    return done and in_range
+
+
+@inner_kernel
+def _begin(state: State, scale: float, step: float) -> None:
+    """Take the frame's unit and clear what the last one left but the contact."""
+    options = state.options
+    signal = state.signal
+    grid = state.grid
+    signal.scale = scale
+    signal.clipped = step > 0.0
+    signal.variance = options.noise**2 + step * step / 12.0
+    signal.noise = math.sqrt(signal.variance) / scale
+    signal.saturation = options.saturation * scale
+    signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
+    signal.patch_level = options.patch_level + (CLIPPED_MORE if step > 0.0 else 0.0)
+    # A contact no wider than a cell strains it by about pitch²/2a² at most; gains up to 3.
+    pitch = max(grid.pitch_x, grid.pitch_y)
+    signal.confined = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
+    estimate = state.estimate
+    estimate.chi2 = 0.0
+    estimate.tilt_x = 0.0
+    estimate.tilt_y = 0.0
+    estimate.explained = 0.0
+    estimate.cells = 0
+    estimate.iterations = 0
+    estimate.second = False
+    estimate.covariance[:] = 0.0
 
 
 @kernel
 def estimate_frame(
+    states: Records[State],
     frame: FloatArray,
     scale: float,
     step: float,
-    plan: FloatArray,
-    cells: FloatArray,
-    tables: FloatArray,
-    state: FloatArray,
-    floats: FloatArray,
-    integers: IntArray,
+    arena: FloatArray,
+    places: IntArray | None,
 ) -> None:
-    """One frame → the estimate in ``state``. The only compiled entry of the estimator.
+    """One frame → the estimate in the state. The only compiled entry of the estimator.
 
     ``frame`` float64 [rows, cols] in counts, contiguous, ``scale`` Pa a count, ``step`` the width
-    of a count's quantum [Pa], 0 for none. ``cells`` are the grid's planes, ``tables`` the moments'
-    ratios and the law, ``floats`` and ``integers`` what workspace.py says.
+    of a count's quantum [Pa], 0 for none. ``arena`` as `state.Places` says; ``places`` is scratch
+    for a blur, None without one, and then nothing for a blur is compiled.
     """
-    frame = borrowed(frame)
-    plan = borrowed(plan)
-    cells = borrowed(cells)
-    tables = borrowed(tables)
-    state = borrowed(state)
-    floats = borrowed(floats)
-    integers = borrowed(integers)
-    size = frame.size
-    middles = floats[: MIDDLES * size].reshape(MIDDLES, size)
-    scratch = floats[MIDDLES * size :]
-    variance = plan[NOISE] ** 2 + step * step / 12.0
-    noise = math.sqrt(variance) / scale
-    state[CONTACT:STATE] = 0.0
-    state[CHI2] = 0.0
-    state[CELLS] = 0.0
-    state[ITERATIONS] = 0.0
-    # A contact no wider than a cell strains it by about pitch²/2a² at most; gains up to 3.
-    confined = 6.0 * plan[MODULUS] * (max(plan[3], plan[4]) / plan[0]) ** 2 / scale
-    patch_level = plan[PATCH_LEVEL] + (CLIPPED_MORE if step > 0.0 else 0.0)
-    rejected, seen = without_spikes(
-        frame, noise, plan[PEAK_LEVEL], patch_level, confined, cells, middles, integers
-    )
-    contact, row, col, peak, mean, energy, finite = seen
-    state[PEAK] = peak * scale
-    state[REJECTED] = rejected
+    state = states[0]
+    estimate = state.estimate
+    readings = address(frame)
+    start = address(arena)
+    centres = further(start, state.at.centres)
+    cells = further(start, state.at.cells)
+    _begin(state, scale, step)
+    rejected = without_outliers(state, readings, cells, centres)
+    signal = state.signal
+    estimate.peak = signal.peak * scale
+    estimate.rejected = rejected
+    estimate.contact = signal.contact
     done = False
-    if contact:
-        state[CONTACT] = 1.0
-        done = _climb(
-            frame,
-            scale,
-            step > 0.0,
-            variance,
-            energy * scale * scale,
-            row,
-            col,
-            plan,
-            cells,
-            middles,
-            tables,
-            state,
-            scratch,
-            integers,
-        )
+    if signal.contact:
+        done = _estimate(state, readings, start, centres, places)
     else:
-        state[D] = 0.0
-        state[N_X] = 0.0
-        state[N_Y] = 0.0
-        state[GAIN] = plan[FIXED_GAIN]
+        estimate.d = 0.0
+        estimate.n_x = 0.0
+        estimate.n_y = 0.0
+        estimate.gain = state.options.fixed_gain
     # A baseline far below zero is a sensor to tare, not a tip in the air.
-    sound = finite and mean > -3.0 * noise and rejected < SPIKES_MAX and (done or not contact)
-    state[VALID] = 1.0 if sound else 0.0
-    state[WARM] = 1.0 if done else 0.0
+    sound = signal.finite and signal.mean > -3.0 * signal.noise and rejected < OUTLIERS_MAX
+    estimate.valid = sound and (done or not signal.contact)
+    estimate.warm = done
     if rejected > 0:
-        revive(rejected, cells, middles, integers)
-
-
-# The fit leaves its result at the start of the state.
-assert (D, N_X, N_Y, GAIN, RESIDUAL) == (
-    gauss_newton.D,
-    gauss_newton.N_X,
-    gauss_newton.N_Y,
-    gauss_newton.GAIN,
-    gauss_newton.RESIDUAL,
-)
+        restore_outliers(state, rejected, cells, centres)

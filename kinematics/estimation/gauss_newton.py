@@ -1,7 +1,7 @@
 """Gauss-Newton on the likelihood of one pressure frame, as kernels.
 
-Holds the solution of the normal equations, the iteration with its stopping rule, and the covariance
-of what comes out. Parameters are (gain, u, v, w) inside and (d, n_x, n_y, gain) outside; see
+The solution of the normal equations, the iteration with its stopping rule, and the covariance of
+what comes out. Parameters are (gain, u, v, w) inside and (d, n_x, n_y, gain) outside; see
 footprint.py for (u, v, w).
 """
 
@@ -10,81 +10,53 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd_sums import LANES
+from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.blurred_cells import spread
-from softfinger.kinematics.estimation.cut_cells import LEVELS, OWNERS, PLANES, STRIP_ROWS, STRIPS
-from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, is_bent, press
+from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, press
 from softfinger.kinematics.estimation.packing import pack
-from softfinger.kinematics.estimation.scratch import (
-    GRID,
-    INTEGERS,
-    INVERSE,
-    OWNED,
-    PARTS_X,
-    PARTS_Y,
-    QUEUES,
-    SPREAD_X,
-    SPREAD_Y,
-    STEP,
-    SUMS,
-    WEIGHTS_X,
-    WEIGHTS_Y,
-    WORK,
-)
-from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES
-from softfinger.kinematics.sensing.footprint import FloatArray, Geometry, IntArray, plane
+from softfinger.kinematics.estimation.state import Fit, State
+from softfinger.kinematics.sensing.footprint import IntArray, set_face
 
-# Places in what a fit leaves in ``result``.
-D, N_X, N_Y, GAIN, CHI2, CELLS, ITERATIONS, RESIDUAL = range(8)
-RESULT = 8
 # Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
 # square over what a straight model gives rises so.
 GAIN_CURVATURE = 6.0
+_MOST_HALVINGS = 5
 
 
 @inner_kernel
-def solve(
-    sums: FloatArray,
-    gain: float,
-    free: bool,
-    step: FloatArray,
-    inverse: FloatArray,
-    work: FloatArray,
-) -> tuple[bool, float]:
-    """Gauss-Newton step in (gain, u, v, w), the inverse normal matrix, (solvable, decrement).
+def solve(fit: Fit, free: bool) -> bool:
+    """Gauss-Newton step in (gain, u, v, w), the inverse normal matrix and the decrement.
 
-    ``sums`` are :func:`estimation.likelihood.accumulate`'s. Without a ``free`` gain its row is left
-    out. The decrement is the fall of the sum of squares that the step promises. Not solvable where
-    a pivot of the scaled matrix is below 1e-11: the frame doesn't determine every parameter.
-    ``work`` [40] is scratch.
+    Without a ``free`` gain its row is left out. False where a pivot of the scaled matrix is below
+    1e-11: the frame doesn't determine every parameter.
     """
     first = 0 if free else 1
-    matrix = work[:16].reshape(4, 4)
-    lower = work[16:32].reshape(4, 4)
-    right = work[32:36]
-    scale = work[36:40]
+    matrix = fit.matrix
+    lower = fit.lower
+    right = fit.right
+    scale = fit.scale
+    gain = fit.gain
     factor = (1.0, -gain, gain, gain)
     k = 0
     for i in range(4):
         for j in range(i, 4):
-            matrix[j, i] = sums[k] * factor[i] * factor[j]
+            matrix[j, i] = fit.sums.normal[k] * factor[i] * factor[j]
             k += 1
-        right[i] = sums[10 + i] * factor[i]
+        right[i] = fit.sums.right[i] * factor[i]
     for i in range(first, 4):
         if not matrix[i, i] > 0.0:
-            return False, 0.0
+            return False
         scale[i] = 1.0 / math.sqrt(matrix[i, i])
     for i in range(first, 4):
         for j in range(first, i + 1):
             matrix[i, j] *= scale[i] * scale[j]
     # Cholesky in the lower triangle, its inverse in ``lower``.
-    lower[:] = 0.0
     for j in range(first, 4):
         pivot = matrix[j, j]
         for k in range(first, j):
             pivot -= matrix[j, k] * matrix[j, k]
         if not pivot > 1e-11:
-            return False, 0.0
+            return False
         pivot = math.sqrt(pivot)
         matrix[j, j] = pivot
         lower[j, j] = 1.0 / pivot
@@ -99,6 +71,8 @@ def solve(
             for k in range(j, i):
                 value -= matrix[i, k] * lower[k, j]
             lower[i, j] = value * lower[i, i]
+    inverse = fit.inverse
+    step = fit.step
     inverse[:] = 0.0
     step[:] = 0.0
     decrement = 0.0
@@ -110,17 +84,18 @@ def solve(
             inverse[i, j] = value * scale[i] * scale[j]
             step[i] += inverse[i, j] * right[j]
         decrement += step[i] * right[i]
-    return math.isfinite(decrement), decrement
+    fit.decrement = decrement
+    return math.isfinite(decrement)
 
 
 @inner_kernel
-def covariance_of(
-    inverse: FloatArray, a: float, u: float, v: float, w: float, variance: float, out: FloatArray
-) -> None:
-    """Covariance of (d, n_x, n_y, gain), rows after another in ``out`` [16].
-
-    ``inverse`` is that of the normal matrix in (gain, u, v, w), ``variance`` a cell's.
-    """
+def set_covariance(fit: Fit, a: float, variance: float) -> None:
+    """Covariance of (d, n_x, n_y, gain) at the fit's face, from a cell's ``variance``."""
+    inverse = fit.inverse
+    out = fit.covariance
+    u = fit.face.u
+    v = fit.face.v
+    w = fit.face.w
     n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
     cube = n_z * n_z * n_z
     # d = a − u n_z, n_x = v n_z, n_y = w n_z, ∂n_z/∂v = −v n_z³. Rows by (u, v, w).
@@ -138,10 +113,10 @@ def covariance_of(
         by_w = p * inverse[1, 3] + q * inverse[2, 3] + r * inverse[3, 3]
         for j in range(3):
             x, y, z = rows[j]
-            out[4 * i + j] = (by_u * x + by_v * y + by_w * z) * variance
-        out[4 * i + 3] = by_gain * variance
-        out[12 + i] = by_gain * variance
-    out[15] = inverse[0, 0] * variance
+            out[i, j] = (by_u * x + by_v * y + by_w * z) * variance
+        out[i, 3] = by_gain * variance
+        out[3, i] = by_gain * variance
+    out[3, 3] = inverse[0, 0] * variance
 
 
 @inner_kernel
@@ -168,189 +143,134 @@ def free_noise(square: float, floor: float) -> float:
 
 
 @inner_kernel
-def fit(
-    frame: FloatArray,
-    scale: float,
-    geometry: Geometry,
-    cells: FloatArray,
-    law: FloatArray,
-    free: bool,
-    saturation: float,
-    floor: float,
-    clipped: bool,
-    energy: float,
-    number: float,
-    variance: float,
-    tolerance: float,
-    iterations: int,
-    floats: FloatArray,
-    integers: IntArray,
-    result: FloatArray,
-    covariance: FloatArray,
-) -> bool:
-    """Gauss-Newton from the contact in ``result`` (D, N_X, N_Y, GAIN), the estimate left there.
+def _clip_noise(state: State, packed: Pointer, energy: float) -> float:
+    """Noise [Pa] of the cells that end at the floor, by those that nothing presses.
 
-    ``variance`` [Pa²] is a cell's, ``saturation`` [Pa] its end;
-    ``floor`` as for :func:`estimation.likelihood.accumulate`;
-    ``clipped``: none reads below the floor. ``energy`` and ``number`` are Σ p² [Pa²] and the number
-    of the live cells in the tip's disc. Stops when the promised decrement
-    is below ``tolerance`` · variance, that is the step is that part of the noise floor, squared.
-    ``floats`` and ``integers`` are scratch, see workspace.py.
-    RESIDUAL takes Σ over the footprint of (reading − model)² − reading² [Pa²]. False when the
-    frame doesn't determine the contact or the iteration doesn't settle.
+    These show how much of the noise there is; where a board sends none at all there is nothing to
+    correct.
     """
-    a = geometry[0]
-    rows, cols = frame.shape
-    sums = floats[SUMS:STEP]
-    step = floats[STEP:INVERSE]
-    inverse = floats[INVERSE:WORK].reshape(4, 4)
-    work = floats[WORK:GRID]
-    # With a blur the parts of cells are modelled, and more of them than the sensor has.
-    places = integers[INTEGERS:]
-    blurred = places.shape[0] > 0
-    parts_x = integers[PARTS_X]
-    parts_y = integers[PARTS_Y]
-    high = rows * parts_y + 2 * integers[SPREAD_Y]
-    wide = cols * parts_x + 2 * integers[SPREAD_X]
-    size = high * wide
-    at = GRID
-    columns = floats[at : at + 2 * (wide + 1)].reshape(2, wide + 1)
-    at += 2 * (wide + 1)
-    lines = floats[at : at + 2 * (high + 1)].reshape(2, high + 1)
-    at += 2 * (high + 1)
-    strips = floats[at : at + LEVELS * STRIP_ROWS * STRIPS].reshape(LEVELS, STRIP_ROWS, STRIPS)
-    at += LEVELS * STRIP_ROWS * STRIPS
-    packed = floats[at : at + PLANES * size].reshape(PLANES, size)
-    at += PLANES * size
-    queues = integers[QUEUES:OWNED].reshape(LEVELS, 2)
-    owners = integers[OWNED:INTEGERS].reshape(LEVELS, 2, OWNERS)
-    modelled = geometry
-    readings = frame
-    planes = cells
-    along = half = floats[at:at]
-    across = fine = floats[at:at].reshape(0, 0)
-    if blurred:
-        pitch_x = geometry[3] / parts_x
-        pitch_y = geometry[4] / parts_y
-        modelled = (
-            a,
-            geometry[1] - integers[SPREAD_X] * pitch_x,
-            geometry[2] - integers[SPREAD_Y] * pitch_y,
-            pitch_x,
-            pitch_y,
-        )
-        n_x = integers[WEIGHTS_X]
-        n_y = integers[WEIGHTS_Y]
-        across = floats[at : at + n_x].reshape(parts_x, n_x // parts_x)
-        at += n_x
-        along = floats[at : at + n_y]
-        at += n_y
-        planes = floats[at : at + CELL_PLANES * size].reshape(high, CELL_PLANES, wide)
-        at += CELL_PLANES * size
-        padded = parts_x * (cols + 2 * LANES) + n_x
-        fine = floats[at : at + (high + 1) * padded].reshape(high + 1, padded)
-        # Parts have no readings of their own; what stands here is not used.
-        readings = floats[at : at + size].reshape(high, wide)
-        at += (high + 1) * padded
-        half = floats[at : at + padded]
-    bent = is_bent(law)
-    u, v, w = plane(a, result[D], result[N_X], result[N_Y])
-    gain = result[GAIN]
+    inside, inside_number = footprint_energy(state, packed)
+    clip = math.sqrt(state.signal.variance)
+    number = float(state.reach.number)
+    if number - inside_number >= 16.0:
+        free_square = max(energy - inside, 0.0) / (number - inside_number)
+        clip = min(clip, free_noise(free_square, state.signal.floor))
+    return clip
+
+
+@inner_kernel
+def _take_step(fit: Fit, a: float) -> bool:
+    """Go on by the step, the face kept between the tip's top and its base plate; False if kept."""
+    face = fit.face
+    shallow = a - face.u / math.sqrt(1.0 + face.v**2 + face.w**2)
+    fit.gain = max(fit.gain + fit.step[0], 0.2 * fit.gain)
+    u = face.u + fit.step[1]
+    v = face.v + fit.step[2]
+    w = face.w + fit.step[3]
+    tilt = math.hypot(v, w)
+    if tilt > 3.0:
+        v *= 3.0 / tilt
+        w *= 3.0 / tilt
+    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
+    d = a - u * n_z
+    limited = min(max(d, 0.3 * shallow, 1e-4 * a), 0.95 * a)
+    face.u = u if limited == d else (a - limited) / n_z
+    face.v = v
+    face.w = w
+    return bool(limited == d)
+
+
+@inner_kernel
+def _finish(state: State, iterations: int) -> bool:
+    """The estimate and its covariance at the fit's end; whether there are cells enough."""
+    fit = state.fit
+    estimate = state.estimate
+    a = state.grid.radius
+    free = state.options.free_gain
+    variance = state.signal.variance
+    v = fit.face.v
+    w = fit.face.w
+    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
+    freedom = fit.sums.weight - (4.0 if free else 3.0)
+    misfit = max(fit.sums.misfit - fit.decrement, 0.0)
+    d = a - fit.face.u * n_z
+    estimate.d = d
+    estimate.n_x = v * n_z
+    estimate.n_y = w * n_z
+    estimate.gain = fit.gain
+    estimate.chi2 = misfit / (variance * max(freedom, 1.0))
+    estimate.cells = int(fit.sums.weight)
+    estimate.iterations = iterations
+    estimate.residual = misfit - fit.sums.readings
+    # A misfit beyond its own scatter widens the covariance.
+    excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 / max(freedom, 1.0)), 1.0)
+    set_covariance(fit, a, variance * excess)
+    if free:
+        # The more d is uncertain, the less straight it is in the gain.
+        covariance = fit.covariance
+        wider = 1.0 + GAIN_CURVATURE * min(covariance[0, 0] / (d * d), 1.0)
+        for i in range(4):
+            for j in range(4):
+                covariance[i, j] *= wider
+    return bool(freedom > 0.0)
+
+
+@inner_kernel
+def fit(
+    state: State,
+    frame: Pointer,
+    arena: Pointer,
+    places: IntArray | None,
+    energy: float,
+    tolerance: float,
+) -> bool:
+    """Gauss-Newton from the contact in ``state.estimate``, the new estimate left there.
+
+    ``energy`` is Σ p² [Pa²] of the cells in reach. Stops when the promised decrement is below
+    ``tolerance`` · variance, that is the step is that part of the noise floor, squared. False when
+    the frame doesn't determine the contact or the iteration doesn't settle.
+    """
+    fit = state.fit
+    face = fit.face
+    a = state.grid.radius
+    variance = state.signal.variance
+    packed = further(arena, state.at.packed)
+    set_face(face, a, state.estimate.d, state.estimate.n_x, state.estimate.n_y)
+    fit.gain = state.estimate.gain
+    u = v = w = gain = 0.0  # before the last step
     cost = math.inf
-    before = (u, v, w, gain)
     halvings = 0
     solved = False
-    for iteration in range(iterations):
-        count = pack(
-            u,
-            v,
-            w,
-            modelled,
-            planes,
-            readings,
-            scale,
-            bent,
-            columns,
-            lines,
-            strips,
-            queues,
-            owners,
-            packed,
-            places,
-        )
-        press(packed, count, u, v, w, law)
-        if blurred:
-            count = spread(
-                packed,
-                count,
-                places,
-                frame,
-                scale,
-                cells,
-                across,
-                along,
-                parts_y,
-                fine,
-                half,
-            )
-        clip = 0.0
-        if clipped:
-            # Free cells show how much of the noise there is; where a board sends none at all
-            # there is nothing to correct.
-            inside, inside_number = footprint_energy(packed, count)
-            clip = math.sqrt(variance)
-            if number - inside_number >= 16.0:
-                free_square = max(energy - inside, 0.0) / (number - inside_number)
-                clip = min(clip, free_noise(free_square, floor))
-        accumulate(packed, count, gain, saturation, floor, clip, sums)
-        now = sums[14] - sums[15]
-        if solved and not now <= cost + variance and halvings < 5:
+    for iteration in range(state.options.iterations):
+        if places is None:
+            pack(state, further(arena, state.at.cells), frame, arena, None)
+        else:
+            # Parts have no readings of their own; what stands in ``fine`` is not used.
+            parts = further(arena, state.at.parts)
+            pack(state, parts, further(arena, state.at.fine), arena, address(places))
+        press(state, packed)
+        if places is not None:
+            spread(state, frame, arena, address(places))
+        fit.clip = _clip_noise(state, packed, energy) if state.signal.clipped else 0.0
+        accumulate(state, packed)
+        now = fit.sums.misfit - fit.sums.readings
+        if solved and not now <= cost + variance and halvings < _MOST_HALVINGS:
             # Too far: half way back.
-            u = 0.5 * (u + before[0])
-            v = 0.5 * (v + before[1])
-            w = 0.5 * (w + before[2])
-            gain = 0.5 * (gain + before[3])
+            face.u = 0.5 * (face.u + u)
+            face.v = 0.5 * (face.v + v)
+            face.w = 0.5 * (face.w + w)
+            fit.gain = 0.5 * (fit.gain + gain)
             halvings += 1
             continue
         cost = now
-        solved, decrement = solve(sums, gain, free, step, inverse, work)
+        solved = solve(fit, state.options.free_gain)
         if not solved:
             return False
-        before = (u, v, w, gain)
+        u = face.u
+        v = face.v
+        w = face.w
+        gain = fit.gain
         halvings = 0
-        gain = max(gain + step[0], 0.2 * gain)
-        u += step[1]
-        v += step[2]
-        w += step[3]
-        # Keep the face between the tip's top and its base plate.
-        tilt = math.hypot(v, w)
-        if tilt > 3.0:
-            v *= 3.0 / tilt
-            w *= 3.0 / tilt
-        n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-        d = a - u * n_z
-        shallow = a - before[0] / math.sqrt(1.0 + before[1] ** 2 + before[2] ** 2)
-        limited = min(max(d, 0.3 * shallow, 1e-4 * a), 0.95 * a)
-        if limited != d:
-            u = (a - limited) / n_z
-        elif decrement <= tolerance * variance:
-            freedom = sums[16] - (4.0 if free else 3.0)
-            misfit = max(sums[14] - decrement, 0.0)
-            result[D] = d
-            result[N_X] = v * n_z
-            result[N_Y] = w * n_z
-            result[GAIN] = gain
-            result[CHI2] = misfit / (variance * max(freedom, 1.0))
-            result[CELLS] = sums[16]
-            result[ITERATIONS] = iteration + 1
-            result[RESIDUAL] = misfit - sums[15]
-            # A misfit beyond its own scatter widens the covariance.
-            excess = max(result[CHI2] - 3.0 * math.sqrt(2.0 / max(freedom, 1.0)), 1.0)
-            covariance_of(inverse, a, u, v, w, variance * excess, covariance)
-            if free:
-                # The more d is uncertain, the less straight it is in the gain.
-                wider = 1.0 + GAIN_CURVATURE * min(covariance[0] / (d * d), 1.0)
-                for k in range(16):
-                    covariance[k] *= wider
-            return bool(freedom > 0.0)
+        if _take_step(fit, a) and fit.decrement <= tolerance * variance:
+            return _finish(state, iteration + 1)
     return False

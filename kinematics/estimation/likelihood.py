@@ -13,19 +13,22 @@ from typing import TypeAlias
 
 import numpy as np
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inlined_kernel, inner_kernel
-from softfinger.kinematics.estimation.cut_cells import (
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inlined_kernel
+from softfinger.kinematics.compiled.simd import Pointer, address
+from softfinger.kinematics.estimation.state import (
     ALONG_X,
     ALONG_Y,
+    LAW_PIECES,
+    LAW_TERMS,
     PLAIN,
     READING,
     SHARE,
     VARIANCE,
     WEIGHT,
+    Law,
+    State,
 )
 from softfinger.kinematics.sensing.footprint import FloatArray
-
-SUMS = 17
 
 # What `press` makes of the first planes of the packed cells.
 STRESS, BY_U, BY_V, BY_W = SHARE, PLAIN, ALONG_X, ALONG_Y
@@ -38,22 +41,20 @@ Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
-LAW_PIECES = 128
-POLYNOMIAL = 8
 
 
-def fit_law(law: FloatArray) -> FloatArray:
-    """Any material's law in one of two forms, float64 [n, 4].
+def set_law(law: Law, coefficients: FloatArray) -> None:
+    """Any material's law [pieces, order] in one of two forms.
 
-    A law of one polynomial of at most POLYNOMIAL terms has n = 2: its coefficients in ε, the lowest
-    first. Any other becomes LAW_PIECES cubics by value and slope at the pieces' ends, within 1e-9
-    of a smooth law: row k holds the coefficients of t = ε·pieces − k.
+    A law of one polynomial of at most LAW_TERMS terms is kept; any other becomes LAW_PIECES cubics
+    by value and slope at the pieces' ends, within 1e-9 of a smooth law.
     """
-    pieces, order = law.shape
-    if pieces == 1 and order <= POLYNOMIAL:
-        polynomial = np.zeros(POLYNOMIAL)
-        polynomial[:order] = law[0]
-        return polynomial.reshape(2, 4)
+    pieces, order = coefficients.shape
+    law.is_polynomial = pieces == 1 and order <= LAW_TERMS
+    law.bent = not law.is_polynomial or bool(coefficients[0, 2:].any())
+    if law.is_polynomial:
+        law.polynomial[:order] = coefficients[0]
+        return
     strain = np.linspace(0.0, 1.0, LAW_PIECES + 1)
     index = np.minimum((strain * pieces).astype(int), pieces - 1)
     t = strain * pieces - index
@@ -61,36 +62,24 @@ def fit_law(law: FloatArray) -> FloatArray:
     slope = np.zeros_like(strain)
     for j in range(order - 1, -1, -1):
         slope = slope * t + value
-        value = value * t + law[index, j]
+        value = value * t + coefficients[index, j]
     slope *= pieces / LAW_PIECES
-    table = np.zeros((LAW_PIECES + 1, 4))
-    table[:, 0] = value
-    table[:, 1] = slope
+    law.cubics[:, 0] = value
+    law.cubics[:, 1] = slope
     rise = np.diff(value)
-    table[:-1, 2] = 3.0 * rise - 2.0 * slope[:-1] - slope[1:]
-    table[:-1, 3] = slope[:-1] + slope[1:] - 2.0 * rise
-    return table
-
-
-@inner_kernel
-def is_bent(law: FloatArray) -> bool:
-    """Whether a law as :func:`fit_law` gives it is curved, so that the strain's variance counts."""
-    if law.shape[0] != 2:
-        return True
-    bent = False
-    for k in range(2, POLYNOMIAL):
-        bent |= law[k // 4, k % 4] != 0.0
-    return bent
+    law.cubics[:-1, 2] = 3.0 * rise - 2.0 * slope[:-1] - slope[1:]
+    law.cubics[:-1, 3] = slope[:-1] + slope[1:] - 2.0 * rise
 
 
 @fast_inner_kernel
-def footprint_energy(packed: FloatArray, count: int) -> tuple[float, float]:
+def footprint_energy(state: State, packed: Pointer) -> tuple[float, float]:
     """Σ W p² [Pa²] and Σ W over the packed cells."""
+    size = state.model.rows * state.model.cols
     energy = 0.0
     number = 0.0
-    for k in range(count):
-        weight = packed[WEIGHT, k]
-        energy += weight * packed[READING, k] * packed[READING, k]
+    for k in range(state.fit.count):
+        weight = packed[WEIGHT * size + k]
+        energy += weight * packed[READING * size + k] * packed[READING * size + k]
         number += weight
     return energy, number
 
@@ -140,21 +129,27 @@ def _compared(
 
 
 @fast_inner_kernel
-def press(packed: FloatArray, count: int, u: float, v: float, w: float, law: FloatArray) -> None:
+def press(state: State, packed: Pointer) -> None:
     """Put the material into the packed cells, in place.
 
     STRESS takes the mean stress over each cell, BY_U, BY_V and BY_W its derivatives by −u, v and w:
     σ' times the means of g, x g and y g.
     """
+    u = state.fit.face.u
+    v = state.fit.face.v
+    w = state.fit.face.w
+    size = state.model.rows * state.model.cols
     # It doesn't change within the loop, of which the compiler makes two.
-    polynomial = law.shape[0] == 2
-    c = (law[0, 0], law[0, 1], law[0, 2], law[0, 3], law[1, 0], law[1, 1], law[1, 2], law[1, 3])
-    for k in range(count):
+    polynomial = state.law.is_polynomial
+    p = address(state.law.polynomial)
+    c = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+    cubics = address(state.law.cubics)
+    for k in range(state.fit.count):
         # Arrays are read here alone: a function that took one would keep the loop out of lanes.
-        share = packed[SHARE, k]
-        g = packed[PLAIN, k]
-        g_x = packed[ALONG_X, k]
-        g_y = packed[ALONG_Y, k]
+        share = packed[SHARE * size + k]
+        g = packed[PLAIN * size + k]
+        g_x = packed[ALONG_X * size + k]
+        g_y = packed[ALONG_Y * size + k]
         strain = min(max(1.0 - (u * g - v * g_x - w * g_y), 0.0), 1.0)
         if polynomial:
             stress, slope, half = _polynomial(c, strain)
@@ -162,55 +157,51 @@ def press(packed: FloatArray, count: int, u: float, v: float, w: float, law: Flo
             t = strain * LAW_PIECES
             piece = np.int32(t)
             t -= piece
-            c1 = law[piece, 1]
-            c2 = law[piece, 2]
-            c3 = law[piece, 3]
-            stress = law[piece, 0] + t * (c1 + t * (c2 + t * c3))
+            at = 4 * piece
+            c1 = cubics[at + 1]
+            c2 = cubics[at + 2]
+            c3 = cubics[at + 3]
+            stress = cubics[at] + t * (c1 + t * (c2 + t * c3))
             slope = (c1 + t * (2.0 * c2 + t * 3.0 * c3)) * LAW_PIECES
             half = (c2 + 3.0 * t * c3) * (LAW_PIECES * LAW_PIECES)
         # From a strain of 1 on the stress stays, and what varies there doesn't show.
         half = half if strain < 1.0 else 0.0
-        stress = share * (stress + half * packed[VARIANCE, k])
+        stress = share * (stress + half * packed[VARIANCE * size + k])
         slope *= share
-        packed[STRESS, k] = stress
-        packed[BY_U, k] = slope * g
-        packed[BY_V, k] = slope * g_x
-        packed[BY_W, k] = slope * g_y
+        packed[STRESS * size + k] = stress
+        packed[BY_U * size + k] = slope * g
+        packed[BY_V * size + k] = slope * g_x
+        packed[BY_W * size + k] = slope * g_y
 
 
 @fast_inner_kernel
-def accumulate(
-    packed: FloatArray,
-    count: int,
-    gain: float,
-    saturation: float,
-    floor: float,
-    clip: float,
-    sums: FloatArray,
-) -> None:
-    """Sums for one Gauss-Newton step over the pressed cells, into ``sums`` [17].
+def accumulate(state: State, packed: Pointer) -> None:
+    """Sums for one Gauss-Newton step over the pressed cells, into ``state.fit.sums``.
 
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
-    factor ∓gain, ∂/∂(u, v, w): sums[0:10] is the upper triangle of JᵀWJ by rows, sums[10:14] JᵀWr,
-    sums[14] rᵀWr, sums[15] yᵀWy, sums[16] ΣW. A full cell counts only while the model stays
-    below its end. No reading is less than ``floor`` [Pa], below which a board sends 0; −inf for
-    none. ``clip`` > 0 is the noise [Pa] of cells that end there; without it a cell that the model
-    puts below the floor doesn't count.
+    factor ∓gain, ∂/∂(u, v, w). A full cell counts only while the model stays below its end. No
+    reading is less than ``signal.floor``; with ``fit.clip`` > 0 cells end there, without it a cell
+    that the model puts below the floor doesn't count.
     """
+    gain = state.fit.gain
+    saturation = state.signal.saturation
+    floor = state.signal.floor
+    clip = state.fit.clip
+    size = state.model.rows * state.model.cols
     clipped = clip > 0.0
     s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
     r0 = r1 = r2 = r3 = rr = yy = ww = 0.0
-    for k in range(count):
-        stress = packed[STRESS, k]
-        a1 = packed[BY_U, k]
-        a2 = packed[BY_V, k]
-        a3 = packed[BY_W, k]
-        reading = packed[READING, k]
+    for k in range(state.fit.count):
+        stress = packed[STRESS * size + k]
+        a1 = packed[BY_U * size + k]
+        a2 = packed[BY_V * size + k]
+        a3 = packed[BY_W * size + k]
+        reading = packed[READING * size + k]
         residual, response, counts = _compared(
             stress, gain, reading, saturation, floor, clip, clipped
         )
-        squares = packed[WEIGHT, k] * reading * reading
-        weight = packed[WEIGHT, k] * counts
+        squares = packed[WEIGHT * size + k] * reading * reading
+        weight = packed[WEIGHT * size + k] * counts
         if clipped:
             stress *= response
             a1 *= response
@@ -237,20 +228,23 @@ def accumulate(
         rr += weight * residual * residual
         yy += squares
         ww += weight
-    sums[0] = s00
-    sums[1] = s01
-    sums[2] = s02
-    sums[3] = s03
-    sums[4] = s11
-    sums[5] = s12
-    sums[6] = s13
-    sums[7] = s22
-    sums[8] = s23
-    sums[9] = s33
-    sums[10] = r0
-    sums[11] = r1
-    sums[12] = r2
-    sums[13] = r3
-    sums[14] = rr
-    sums[15] = yy
-    sums[16] = ww
+    sums = state.fit.sums
+    normal = address(sums.normal)
+    normal[0] = s00
+    normal[1] = s01
+    normal[2] = s02
+    normal[3] = s03
+    normal[4] = s11
+    normal[5] = s12
+    normal[6] = s13
+    normal[7] = s22
+    normal[8] = s23
+    normal[9] = s33
+    right = address(sums.right)
+    right[0] = r0
+    right[1] = r1
+    right[2] = r2
+    right[3] = r3
+    sums.misfit = rr
+    sums.readings = yy
+    sums.weight = ww

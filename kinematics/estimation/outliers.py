@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer, address
-from softfinger.kinematics.estimation.cell_centres import HEIGHT, NUMBER
+from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.detection import activity
-from softfinger.kinematics.estimation.scratch import SPIKES, SPIKES_MAX
-from softfinger.kinematics.sensing.cell_integrals import LIVE
-from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
+from softfinger.kinematics.estimation.state import OUTLIERS_MAX, State
+from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
 
 _DEAD = 1e3  # m below: no face is ever there
 
 
 @inner_kernel
-def is_spike(
-    frame: Pointer,
-    height: Pointer,
-    rows: int,
-    cols: int,
-    i: int,
-    j: int,
-    noise: float,
-    confined: float,
-) -> bool:
-    """Whether the cell stands alone as no contact can: a hot cell.
+def _is_outlier(state: State, frame: Pointer, height: Pointer) -> bool:
+    """Whether the largest cell stands alone as no contact can.
 
-    ``confined`` is what a contact about as wide as a cell could press at most: a wider one never
-    has a cell that stands at twice its neighbours.
+    A contact about as wide as a cell could press ``signal.confined`` at most: a wider one never has
+    a cell that stands at twice its neighbours.
     """
+    rows = state.grid.rows
+    cols = state.grid.cols
+    i = state.signal.row
+    j = state.signal.col
     total = 0.0
     number = 0
     for k, m in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
@@ -36,55 +29,47 @@ def is_spike(
             total += frame[k * cols + m]
             number += 1
     reading = frame[i * cols + j]
+    noise = state.signal.noise
     return bool(
         number > 0
-        and reading > 10.0 * noise + confined
+        and reading > 10.0 * noise + state.signal.confined
         and reading > 2.0 * max(total, 0.0) / max(number, 1) + 12.0 * noise
     )
 
 
 @inner_kernel
-def without_spikes(
-    frame: FloatArray,
-    noise: float,
-    peak_level: float,
-    patch_level: float,
-    confined: float,
-    cells: FloatArray,
-    middles: FloatArray,
-    integers: IntArray,
-) -> tuple[int, tuple[bool, int, int, float, float, float, bool]]:
-    """The number of hot cells, and what :func:`activity` says without them.
+def without_outliers(state: State, frame: Pointer, cells: Pointer, height: Pointer) -> int:
+    """The number of outliers; ``state.signal`` is what :func:`activity` finds without them.
 
-    ``confined`` as for :func:`is_spike`. They are marked dead until :func:`revive`; their places
-    are left in ``integers``.
+    They are marked dead until :func:`restore_outliers`.
     """
-    rows, cols = frame.shape
+    signal = state.signal
+    cols = state.grid.cols
     rejected = 0
-    seen = activity(frame, middles, integers, noise, peak_level, patch_level)
+    activity(state, frame, height)
     while (
-        seen[3] > 10.0 * noise + confined
-        and seen[1] >= 0
-        and rejected < SPIKES_MAX
-        and is_spike(
-            address(frame), address(middles), rows, cols, seen[1], seen[2], noise, confined
-        )
+        signal.peak > 10.0 * signal.noise + signal.confined
+        and signal.row >= 0
+        and rejected < OUTLIERS_MAX
+        and _is_outlier(state, frame, height)
     ):
-        cells[seen[1], LIVE, seen[2]] = 0.0
-        middles[HEIGHT, seen[1] * cols + seen[2]] -= _DEAD
-        integers[NUMBER] -= 1
-        integers[SPIKES + rejected] = seen[1] * cols + seen[2]
+        cells[(signal.row * CELL_PLANES + LIVE) * cols + signal.col] = 0.0
+        at = signal.row * cols + signal.col
+        height[at] -= _DEAD
+        state.reach.number -= 1
+        state.outliers[rejected] = at
         rejected += 1
-        seen = activity(frame, middles, integers, noise, peak_level, patch_level)
-    return rejected, seen
+        activity(state, frame, height)
+    return rejected
 
 
 @inner_kernel
-def revive(rejected: int, cells: FloatArray, middles: FloatArray, integers: IntArray) -> None:
-    """Make the hot cells of :func:`without_spikes` live again."""
-    cols = cells.shape[2]
+def restore_outliers(state: State, rejected: int, cells: Pointer, height: Pointer) -> None:
+    """Make the outliers live again."""
+    cols = state.grid.cols
     for k in range(rejected):
-        at = integers[SPIKES + k]
-        cells[at // cols, LIVE, at % cols] = 1.0
-        middles[HEIGHT, at] += _DEAD
-        integers[NUMBER] += 1
+        at = state.outliers[k]
+        row = at // cols
+        cells[(row * CELL_PLANES + LIVE) * cols + at - row * cols] = 1.0
+        height[at] += _DEAD
+        state.reach.number += 1

@@ -1,7 +1,7 @@
 """The footprint's cells, gathered from the grid for the likelihood, as kernels.
 
-Cells that lie in the footprint take their means from the grid's planes (cells.py); those that the
-outline cuts are integrated (cut_cells.py). No material and no pressure model enters here.
+Cells that lie in the footprint take their means from the grid's planes (cell_integrals.py); those
+that the outline cuts are integrated (cut_cells.py). No material and no pressure model enters here.
 """
 
 from __future__ import annotations
@@ -9,28 +9,30 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.estimation.blurred_cells import PLACE_BITS
+from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
 from softfinger.kinematics.estimation.cut_cells import (
-    ALONG_X,
-    ALONG_Y,
     COARSE,
-    FILLED,
     FINE,
     FINEST,
+    STRIPS_A_CELL,
+    flush,
+    push_strips,
+)
+from softfinger.kinematics.estimation.state import (
+    ALONG_X,
+    ALONG_Y,
     LEVELS,
     OWNERS,
     PLAIN,
     READING,
     SHARE,
     STRIPS,
-    STRIPS_A_CELL,
     VARIANCE,
-    WAITING,
     WEIGHT,
-    flush,
-    push_strips,
+    State,
 )
 from softfinger.kinematics.sensing.cell_integrals import (
+    CELL_PLANES,
     LIVE,
     PLAIN_MEAN,
     PLAIN_VAR,
@@ -43,176 +45,136 @@ from softfinger.kinematics.sensing.cell_integrals import (
     Y_VAR,
 )
 from softfinger.kinematics.sensing.footprint import (
-    FloatArray,
-    Geometry,
-    IntArray,
     band_columns,
-    extremes,
+    cols_touched,
     line_spans,
+    rows_touched,
+    set_extremes,
 )
+
+PLACE_BITS = 16  # of the column in a place; the row is above
 
 
 @inner_kernel
 def pack(
-    u: float,
-    v: float,
-    w: float,
-    geometry: Geometry,
-    cells: FloatArray,
-    frame: FloatArray,
-    scale: float,
-    bent: bool,
-    columns: FloatArray,
-    lines: FloatArray,
-    strips: FloatArray,
-    queues: IntArray,
-    owners: IntArray,
-    packed: FloatArray,
-    places: IntArray,
-) -> int:
-    """Gather the footprint's cells into ``packed`` [PLANES, n]; returns n.
+    state: State, cells: Pointer, frame: Pointer, arena: Pointer, places: IntPointer | None
+) -> None:
+    """Gather the footprint's cells of the model's grid, their number into ``state.fit.count``.
 
-    ``cells`` [rows, CELL_PLANES, cols] is what :func:`estimation.cell_integrals.face_integrals`
-    gives. ``bent``: the strain's variance is wanted, too. ``places`` takes the cells' rows and
-    columns, see :func:`estimation.blurred_cells.spread`, unless it is empty. ``columns``
-    [2, cols + 1], ``lines`` [2, rows + 1], ``strips``, ``queues`` and ``owners`` are scratch.
+    ``cells`` are the planes of `sensing.cell_integrals`, ``frame`` the readings. ``places`` takes
+    the cells' rows and columns for :func:`estimation.blurred_cells.spread`.
     """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    rows, cols = frame.shape
-    ends = extremes(u, v, w, a)
-    if not ends[0] < ends[1]:
-        return 0
-    first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
-    last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), first_row), rows)
-    j0 = min(max(math.floor((ends[3] - x_first) / pitch_x), 0), cols)
-    j1 = min(max(math.ceil((ends[5] - x_first) / pitch_x), j0), cols)
-    line_spans(u, w, v, a, x_first, pitch_x, j0, j1, columns[0], columns[1])
-    line_spans(u, v, w, a, y_first, pitch_y, first_row, last_row, lines[0], lines[1])
-    # The outline's lowest point over the base plane: where it comes near to the rim.
-    cosine2 = 1.0 / (1.0 + v * v + w * w)
-    rho2 = max(a * a - u * u * cosine2, 0.0)
-    low = u * cosine2 - math.sqrt(rho2 * (1.0 - cosine2)) < 0.2 * a
-    placed = places.shape[0] > 0
+    fit = state.fit
+    face = fit.face
+    grid = state.model
+    a = grid.radius
+    cols = grid.cols
+    size = grid.rows * cols
+    fit.count = 0
+    set_extremes(face, a)
+    if not face.low < face.high:
+        return
+    first_row, last_row = rows_touched(face, grid)
+    j0, j1 = cols_touched(face, grid)
+    left = further(arena, state.at.columns)
+    right = further(left, cols + 1)
+    line_spans(face, grid, True, j0, j1, left, right)
+    low = further(arena, state.at.lines)
+    high = further(low, grid.rows + 1)
+    line_spans(face, grid, False, first_row, last_row, low, high)
+    packed = further(arena, state.at.packed)
+    scale = state.signal.scale
+    low_edge = _is_low(state)
     count = 0
     for i in range(first_row, last_row):
-        y0 = y_first + i * pitch_y
-        y1 = y0 + pitch_y
+        y0 = grid.y + i * grid.pitch_y
+        y1 = y0 + grid.pitch_y
         first, inner_first, inner_last, last = band_columns(
-            u,
-            v,
-            w,
-            a,
-            ends,
-            (lines[0, i], lines[1, i]),
-            (lines[0, i + 1], lines[1, i + 1]),
-            y0,
-            y1,
-            x_first,
-            pitch_x,
-            cols,
+            face, grid, (low[i], high[i]), (low[i + 1], high[i + 1]), y0, y1
         )
         first = max(first, j0)
         last = min(last, j1)
         y_far = max(-y0, y1)
+        row = further(cells, i * CELL_PLANES * cols)
+        readings = further(frame, i * cols)
         for side in range(2):
             begin = first if side == 0 else max(inner_last, first)
             stop = min(inner_first, last) if side == 0 else last
             for j in range(begin, stop):
-                x0 = x_first + j * pitch_x
-                x_far = max(-x0, x0 + pitch_x)
+                x0 = grid.x + j * grid.pitch_x
+                x_far = max(-x0, x0 + grid.pitch_x)
                 far2 = x_far * x_far + y_far * y_far
                 level = COARSE
                 if far2 > 0.81 * a * a:
-                    level = FINEST if low and far2 > 0.97 * a * a else FINE
-                crossings = (columns[0, j], columns[1, j], columns[0, j + 1], columns[1, j + 1])
-                filled = push_strips(
-                    strips[level], queues[level, FILLED], x0, y0, y1, ends[0], ends[1], crossings
-                )
-                queues[level, FILLED] = filled
-                live = cells[i, LIVE, j]
-                packed[READING, count] = frame[i, j] * scale if live > 0.0 else 0.0
-                packed[WEIGHT, count] = live
-                if placed:
+                    level = FINEST if low_edge and far2 > 0.97 * a * a else FINE
+                strips = state.strips[level]
+                crossings = (left[j], right[j], left[j + 1], right[j + 1])
+                push_strips(strips, x0, max(y0, face.low), min(y1, face.high), y1 - y0, crossings)
+                live = row[LIVE * cols + j]
+                packed[READING * size + count] = readings[j] * scale if live > 0.0 else 0.0
+                packed[WEIGHT * size + count] = live
+                if places is not None:
                     places[count] = (i << PLACE_BITS) | j
-                waiting = queues[level, WAITING]
-                owners[level, 0, waiting] = count
-                owners[level, 1, waiting] = filled
-                queues[level, WAITING] = waiting + 1
+                strips.places[strips.owners] = count
+                strips.ends[strips.owners] = strips.count
+                strips.owners += 1
                 count += 1
-                if filled > STRIPS - STRIPS_A_CELL - 8 or waiting + 1 == OWNERS:
-                    flush(
-                        strips[level],
-                        owners[level],
-                        queues[level],
-                        level,
-                        u,
-                        v,
-                        w,
-                        a,
-                        pitch_x,
-                        pitch_y,
-                        packed,
-                    )
+                if strips.count > STRIPS - STRIPS_A_CELL - 8 or strips.owners == OWNERS:
+                    flush(state, level, packed)
         n = inner_last - inner_first
         if n > 0:
-            if placed:
+            if places is not None:
                 for k in range(n):
                     places[count + k] = (i << PLACE_BITS) | (inner_first + k)
-            copy_whole(
-                cells[i, :, inner_first:inner_last],
-                frame[i, inner_first:inner_last],
-                scale,
-                bent,
-                u,
-                v,
-                w,
-                packed[:, count : count + n],
+            _copy_whole(
+                state,
+                further(row, inner_first),
+                further(readings, inner_first),
+                n,
+                further(packed, count),
             )
             count += n
     for level in range(LEVELS):
-        if queues[level, WAITING] > 0:
-            flush(
-                strips[level],
-                owners[level],
-                queues[level],
-                level,
-                u,
-                v,
-                w,
-                a,
-                pitch_x,
-                pitch_y,
-                packed,
-            )
-    return count
+        if state.strips[level].owners > 0:
+            flush(state, level, packed)
+    fit.count = count
+
+
+@inner_kernel
+def _is_low(state: State) -> bool:
+    """Whether the outline's lowest point over the base plane comes near to the rim."""
+    face = state.fit.face
+    a = state.model.radius
+    cosine2 = 1.0 / (1.0 + face.v * face.v + face.w * face.w)
+    rho2 = max(a * a - face.u * face.u * cosine2, 0.0)
+    return face.u * cosine2 - math.sqrt(rho2 * (1.0 - cosine2)) < 0.2 * a
 
 
 @fast_inner_kernel
-def copy_whole(
-    cells: FloatArray,
-    row: FloatArray,
-    scale: float,
-    bent: bool,
-    u: float,
-    v: float,
-    w: float,
-    out: FloatArray,
-) -> None:
-    """Whole cells of one row, planes ``cells`` and readings ``row``, into ``out`` [PLANES, n]."""
-    for k in range(row.shape[0]):
-        out[SHARE, k] = 1.0
-        out[PLAIN, k] = cells[PLAIN_MEAN, k]
-        out[ALONG_X, k] = cells[X_MEAN, k]
-        out[ALONG_Y, k] = cells[Y_MEAN, k]
+def _copy_whole(state: State, cells: Pointer, row: Pointer, n: int, out: Pointer) -> None:
+    """``n`` whole cells, planes from ``cells`` and readings from ``row`` on, into ``out``."""
+    cols = state.model.cols
+    size = state.model.rows * cols
+    scale = state.signal.scale
+    u = state.fit.face.u
+    v = state.fit.face.v
+    w = state.fit.face.w
+    for k in range(n):
+        out[SHARE * size + k] = 1.0
+        out[PLAIN * size + k] = cells[PLAIN_MEAN * cols + k]
+        out[ALONG_X * size + k] = cells[X_MEAN * cols + k]
+        out[ALONG_Y * size + k] = cells[Y_MEAN * cols + k]
         reading = row[k]
-        live = cells[LIVE, k]
-        out[READING, k] = reading * scale if live > 0.0 else 0.0
-        out[WEIGHT, k] = live
-    if bent:
-        for k in range(row.shape[0]):
-            plain = u * cells[PLAIN_VAR, k] - 2.0 * (v * cells[PLAIN_X, k] + w * cells[PLAIN_Y, k])
-            out[VARIANCE, k] = (
+        live = cells[LIVE * cols + k]
+        out[READING * size + k] = reading * scale if live > 0.0 else 0.0
+        out[WEIGHT * size + k] = live
+    if state.law.bent:
+        for k in range(n):
+            plain = u * cells[PLAIN_VAR * cols + k] - 2.0 * (
+                v * cells[PLAIN_X * cols + k] + w * cells[PLAIN_Y * cols + k]
+            )
+            out[VARIANCE * size + k] = (
                 u * plain
-                + v * (v * cells[X_VAR, k] + 2.0 * w * cells[X_Y, k])
-                + w * w * cells[Y_VAR, k]
+                + v * (v * cells[X_VAR * cols + k] + 2.0 * w * cells[X_Y * cols + k])
+                + w * w * cells[Y_VAR * cols + k]
             )

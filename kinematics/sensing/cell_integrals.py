@@ -9,15 +9,19 @@ Gauss-Legendre in both directions then converges exponentially. Towards the rim 
 from __future__ import annotations
 
 import math
+from typing import Annotated, TypeAlias
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel, kernel
+import numpy as np
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.layout import Record
 from softfinger.kinematics.contact.material import stress_at
 from softfinger.kinematics.sensing.footprint import (
     GAUSS_NODES,
     GAUSS_WEIGHTS,
-    Ends,
+    Face,
     FloatArray,
-    Geometry,
+    Grid,
     Span,
     beyond_limit,
     line_span,
@@ -27,11 +31,23 @@ from softfinger.kinematics.sensing.footprint import (
 # the face, the cell's own two ends.
 MAX_BREAKS = 12
 
-# Rows of the nodes.
-X, Y, WEIGHT, STRAIN, STRESS = range(5)
-NODE_ROWS = 5
 ANGLE_NODES = 10
 NODES_A_CELL = (MAX_BREAKS - 1) * ANGLE_NODES * 2 * ANGLE_NODES
+NODES = 512 + NODES_A_CELL
+
+Values: TypeAlias = Annotated[FloatArray, NODES]
+
+
+class Nodes(Record):
+    """Nodes of the integrals over cells, and what the springs there say."""
+
+    count: int
+    x: Values  # [m]
+    y: Values
+    weight: Values
+    strain: Values
+    stress: Values  # [Pa]
+    breaks: Annotated[FloatArray, MAX_BREAKS]  # scratch
 
 
 @inner_kernel
@@ -56,80 +72,84 @@ def nodes_needed(a: float, half: float, far: float) -> int:
 
 
 @inner_kernel
-def push_line(
-    nodes: FloatArray, count: int, a: float, y: float, left: float, right: float, n: int, w: float
-) -> int:
+def _push_line(
+    nodes: Nodes, a: float, y: float, left: float, right: float, n: int, w: float
+) -> None:
     """Add the nodes of ∫ dx on the line ``y`` from ``left`` to ``right``, times ``w``.
 
-    ``nodes`` has the rows X, Y and WEIGHT. With n = 0 the variable is the angle t of x = R sin t:
-    σ(ε)√(a² − x² − y²) dt stays smooth at the rim where σ(ε) dx does not.
+    With n = 0 the variable is the angle t of x = R sin t: σ(ε)√(a² − x² − y²) dt stays smooth at
+    the rim where σ(ε) dx does not.
     """
+    count = nodes.count
     if n > 0:
         width = right - left
         for k in range(n):
-            nodes[X, count] = left + width * GAUSS_NODES[n, k]
-            nodes[Y, count] = y
-            nodes[WEIGHT, count] = w * width * GAUSS_WEIGHTS[n, k]
+            nodes.x[count] = left + width * GAUSS_NODES[n, k]
+            nodes.y[count] = y
+            nodes.weight[count] = w * width * GAUSS_WEIGHTS[n, k]
             count += 1
-        return count
-    radius = math.sqrt(a * a - y * y)
-    start = math.asin(max(left / radius, -1.0))
-    width = math.asin(min(right / radius, 1.0)) - start
-    for k in range(ANGLE_NODES):
-        t = start + width * GAUSS_NODES[ANGLE_NODES, k]
-        nodes[X, count] = radius * math.sin(t)
-        nodes[Y, count] = y
-        nodes[WEIGHT, count] = w * width * GAUSS_WEIGHTS[ANGLE_NODES, k] * radius * math.cos(t)
-        count += 1
-    return count
+    else:
+        radius = math.sqrt(a * a - y * y)
+        start = math.asin(max(left / radius, -1.0))
+        width = math.asin(min(right / radius, 1.0)) - start
+        for k in range(ANGLE_NODES):
+            t = start + width * GAUSS_NODES[ANGLE_NODES, k]
+            nodes.x[count] = radius * math.sin(t)
+            nodes.y[count] = y
+            nodes.weight[count] = w * width * GAUSS_WEIGHTS[ANGLE_NODES, k] * radius * math.cos(t)
+            count += 1
+    nodes.count = count
 
 
 @inner_kernel
-def push_whole(
-    nodes: FloatArray, count: int, a: float, x0: float, x1: float, y0: float, y1: float
-) -> int:
+def push_whole(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
     """Add the nodes of the mean over a cell that lies in the footprint."""
+    a = grid.radius
+    x0 = grid.x + j * grid.pitch_x
+    x1 = grid.x + (j + 1) * grid.pitch_x
+    y0 = grid.y + i * grid.pitch_y
+    y1 = grid.y + (i + 1) * grid.pitch_y
     far = math.hypot(max(abs(x0), abs(x1)), max(abs(y0), abs(y1)))
     n = nodes_needed(a, 0.5 * max(x1 - x0, y1 - y0), far)
     m = n if n > 0 else ANGLE_NODES
     scale = 1.0 / (x1 - x0)
     for k in range(m):
         y = y0 + (y1 - y0) * GAUSS_NODES[m, k]
-        count = push_line(nodes, count, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
-    return count
+        _push_line(nodes, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
 
 
 @fast_inner_kernel
-def _strains(nodes: FloatArray, count: int, u: float, v: float, w: float, a: float) -> None:
-    for k in range(count):
-        x = nodes[X, k]
-        y = nodes[Y, k]
+def _strains(nodes: Nodes, face: Face, a: float) -> None:
+    u = face.u
+    v = face.v
+    w = face.w
+    for k in range(nodes.count):
+        x = nodes.x[k]
+        y = nodes.y[k]
         length2 = max(a * a - x * x - y * y, 1e-30)
-        nodes[STRAIN, k] = min(max(1.0 - (u - v * x - w * y) / math.sqrt(length2), 0.0), 1.0)
+        nodes.strain[k] = min(max(1.0 - (u - v * x - w * y) / math.sqrt(length2), 0.0), 1.0)
 
 
 @fast_inner_kernel
-def _polynomial(nodes: FloatArray, count: int, coefficients: FloatArray) -> None:
+def _polynomial(nodes: Nodes, coefficients: FloatArray) -> None:
     order = coefficients.shape[0]
-    for k in range(count):
-        nodes[STRESS, k] = coefficients[order - 1]
+    for k in range(nodes.count):
+        nodes.stress[k] = coefficients[order - 1]
     for j in range(order - 2, -1, -1):
         c = coefficients[j]
-        for k in range(count):
-            nodes[STRESS, k] = nodes[STRESS, k] * nodes[STRAIN, k] + c
+        for k in range(nodes.count):
+            nodes.stress[k] = nodes.stress[k] * nodes.strain[k] + c
 
 
 @inner_kernel
-def evaluate(
-    nodes: FloatArray, count: int, u: float, v: float, w: float, a: float, law: FloatArray
-) -> None:
-    """Fill the rows STRAIN, at most 1, and STRESS of the first ``count`` nodes, in SIMD lanes."""
-    _strains(nodes, count, u, v, w, a)
+def evaluate(nodes: Nodes, face: Face, a: float, law: FloatArray) -> None:
+    """Strain, at most 1, and stress at the nodes, in SIMD lanes."""
+    _strains(nodes, face, a)
     if law.shape[0] == 1:
-        _polynomial(nodes, count, law[0])
+        _polynomial(nodes, law[0])
     else:
-        for k in range(count):
-            nodes[STRESS, k] = stress_at(law, nodes[STRAIN, k])
+        for k in range(nodes.count):
+            nodes.stress[k] = stress_at(law, nodes.strain[k])
 
 
 @inner_kernel
@@ -147,37 +167,32 @@ def _insert(breaks: FloatArray, count: int, value: float, low: float, high: floa
 
 @inner_kernel
 def push_cut(
-    nodes: FloatArray,
-    count: int,
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    ends: Ends,
-    x0: float,
-    x1: float,
-    y0: float,
-    y1: float,
-    left_span: Span,
-    right_span: Span,
-    breaks: FloatArray,
-) -> int:
+    nodes: Nodes, face: Face, grid: Grid, i: int, j: int, left_span: Span, right_span: Span
+) -> None:
     """Add the nodes of the mean over a cell that the outline may cut.
 
-    ``ends`` are the footprint's :func:`extremes`, the spans its parts on the lines x0 and x1;
-    ``breaks`` [MAX_BREAKS] is scratch.
+    The spans are the footprint's parts on the lines of the cell's left and right side.
     """
-    low = max(y0, ends[0])
-    high = min(y1, ends[1])
+    a = grid.radius
+    u = face.u
+    v = face.v
+    w = face.w
+    x0 = grid.x + j * grid.pitch_x
+    x1 = grid.x + (j + 1) * grid.pitch_x
+    y0 = grid.y + i * grid.pitch_y
+    y1 = grid.y + (i + 1) * grid.pitch_y
+    breaks = nodes.breaks
+    low = max(y0, face.low)
+    high = min(y1, face.high)
     if not low < high:
-        return count
+        return
     breaks[0] = low
     breaks[1] = high
     number = 2
     for span in (left_span, right_span):
         number = _insert(breaks, number, span[0], low, high)
         number = _insert(breaks, number, span[1], low, high)
-    beyond = beyond_limit(u, v, w, a)
+    beyond = beyond_limit(face, a)
     if beyond and w != 0.0:
         number = _insert(breaks, number, (u - v * x0) / w, low, high)
         number = _insert(breaks, number, (u - v * x1) / w, low, high)
@@ -201,7 +216,7 @@ def push_cut(
         x_far = max(abs(max(left, x0)), abs(min(right, x1)))
         n = nodes_needed(a, 0.5 * max(x1 - x0, y1 - y0), math.hypot(x_far, y_far))
         # Near the outline's lowest and highest point, and the rim, lines end like a square root.
-        near = min(start - ends[0], ends[1] - start - length)
+        near = min(start - face.low, face.high - start - length)
         rounded = n == 0 or near < 0.5 * length
         m = ANGLE_NODES if n == 0 else max(n, 7) if rounded else max(n, 4)
         for k in range(m):
@@ -220,10 +235,9 @@ def push_cut(
             inner = max(n, 4) if n > 0 else 0
             kink = (u - w * y) / v if beyond and v != 0.0 else math.inf
             if left < kink < right:
-                count = push_line(nodes, count, a, y, left, kink, inner, weight)
+                _push_line(nodes, a, y, left, kink, inner, weight)
                 left = kink
-            count = push_line(nodes, count, a, y, left, right, inner, weight)
-    return count
+            _push_line(nodes, a, y, left, right, inner, weight)
 
 
 # Planes of a grid's cells, float64 [rows, CELL_PLANES, cols]: means over the whole cell of g, x g
@@ -233,46 +247,41 @@ CELL_PLANES = 10
 _MEAN_NODES = 8
 
 
-@kernel
-def face_integrals(geometry: Geometry, out: FloatArray) -> None:
-    """Fill the planes of ``out`` [rows, CELL_PLANES, cols] but LIVE.
+def cell_integrals(grid: Grid) -> FloatArray:
+    """The planes of a grid's cells, all but LIVE.
 
     The strain's mean over a whole cell in the footprint is exactly 1 − u ḡ + v (xg) + w (yg), and
     its variance the same form's in the covariances. A cell that the rim cuts never lies in the
     footprint and stays 0.
     """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    rows, _, cols = out.shape
-    n = _MEAN_NODES
-    for i in range(rows):
-        y0 = y_first + i * pitch_y
-        for j in range(cols):
-            x0 = x_first + j * pitch_x
-            x_far = max(abs(x0), abs(x0 + pitch_x))
-            if x_far * x_far + max(abs(y0), abs(y0 + pitch_y)) ** 2 >= a * a:
-                continue
-            for k in range(n):
-                y = y0 + pitch_y * GAUSS_NODES[n, k]
-                for m in range(n):
-                    x = x0 + pitch_x * GAUSS_NODES[n, m]
-                    weight = GAUSS_WEIGHTS[n, k] * GAUSS_WEIGHTS[n, m]
-                    g = 1.0 / math.sqrt(a * a - x * x - y * y)
-                    out[i, PLAIN_MEAN, j] += weight * g
-                    out[i, X_MEAN, j] += weight * g * x
-                    out[i, Y_MEAN, j] += weight * g * y
-                    weight *= g * g
-                    out[i, PLAIN_VAR, j] += weight
-                    out[i, PLAIN_X, j] += weight * x
-                    out[i, PLAIN_Y, j] += weight * y
-                    out[i, X_VAR, j] += weight * x * x
-                    out[i, X_Y, j] += weight * x * y
-                    out[i, Y_VAR, j] += weight * y * y
-            g = out[i, PLAIN_MEAN, j]
-            g_x = out[i, X_MEAN, j]
-            g_y = out[i, Y_MEAN, j]
-            out[i, PLAIN_VAR, j] -= g * g
-            out[i, PLAIN_X, j] -= g * g_x
-            out[i, PLAIN_Y, j] -= g * g_y
-            out[i, X_VAR, j] -= g_x * g_x
-            out[i, X_Y, j] -= g_x * g_y
-            out[i, Y_VAR, j] -= g_y * g_y
+    a = grid.radius
+    x0 = grid.x + np.arange(grid.cols) * grid.pitch_x
+    y0 = grid.y + np.arange(grid.rows) * grid.pitch_y
+    x_far = np.maximum(np.abs(x0), np.abs(x0 + grid.pitch_x))
+    y_far = np.maximum(np.abs(y0), np.abs(y0 + grid.pitch_y))
+    rows, cols = np.nonzero(x_far * x_far + (y_far**2)[:, None] < a * a)
+    x0, y0 = x0[cols], y0[rows]
+    out = np.zeros((CELL_PLANES, rows.size))
+    for k in range(_MEAN_NODES):
+        y = y0 + grid.pitch_y * GAUSS_NODES[_MEAN_NODES, k]
+        for m in range(_MEAN_NODES):
+            x = x0 + grid.pitch_x * GAUSS_NODES[_MEAN_NODES, m]
+            weight = GAUSS_WEIGHTS[_MEAN_NODES, k] * GAUSS_WEIGHTS[_MEAN_NODES, m]
+            g = 1.0 / np.sqrt(a * a - x * x - y * y)
+            once, twice = weight * g, weight * (g * g)
+            along_x, along_y = twice * x, twice * y
+            out[PLAIN_MEAN] += once
+            out[X_MEAN] += once * x
+            out[Y_MEAN] += once * y
+            out[PLAIN_VAR] += twice
+            out[PLAIN_X] += along_x
+            out[PLAIN_Y] += along_y
+            out[X_VAR] += along_x * x
+            out[X_Y] += along_x * y
+            out[Y_VAR] += along_y * y
+    g, g_x, g_y = out[[PLAIN_MEAN, X_MEAN, Y_MEAN]]
+    out[[PLAIN_VAR, PLAIN_X, PLAIN_Y]] -= g * g, g * g_x, g * g_y
+    out[[X_VAR, X_Y, Y_VAR]] -= g_x * g_x, g_x * g_y, g_y * g_y
+    planes = np.zeros((grid.rows, CELL_PLANES, grid.cols))
+    planes[rows, :, cols] = out.T
+    return planes

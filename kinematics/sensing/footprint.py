@@ -1,8 +1,8 @@
 """Where the pressed tip touches: the footprint's outline on a grid of cells, as kernels.
 
-Holds the geometry that the forward model and the estimator share, and no pressure. Lengths are m in
-the sensor's axes, counted from the tip's centre. The object's face is the plane ``n·(x, y, z) = h``
-with ``h = a − d``; over the base point (x, y) it stands at ``z = u − v x − w y`` where
+The geometry that the forward model and the estimator share; no pressure. Lengths are m in the
+sensor's axes, from the tip's centre. The object's face is the plane ``n·(x, y, z) = h`` with
+``h = a − d``; over the base point (x, y) it stands at ``z = u − v x − w y`` where
 
     u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
 
@@ -19,17 +19,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.layout import Record
+from softfinger.kinematics.compiled.simd import Pointer
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-# (a, x and y of the first cell's corner from the tip's centre, pitch x, pitch y) [m].
-Geometry = tuple[float, float, float, float, float]
 Span = tuple[float, float]
-Ends = tuple[float, float, float, float, float, float]
-Crossings = tuple[float, float, float, float]
 
 MAX_NODES = 12
+
+
+class Grid(Record):
+    """A tip on a grid of cells: lengths [m] in the sensor's axes, from the tip's centre."""
+
+    radius: float
+    x: float  # of the first cell's corner
+    y: float
+    pitch_x: float
+    pitch_y: float
+    rows: int
+    cols: int
+
+
+class Face(Record):
+    """The object's face over the base, z = u − v x − w y, and the footprint's extreme points.
+
+    Without a footprint ``low`` is inf and ``high`` −inf; beyond the limit both are the rim's.
+    """
+
+    u: float
+    v: float
+    w: float
+    low: float  # y of the lowest point
+    high: float
+    left: float  # x of the leftmost point, and its y
+    left_y: float
+    right: float
+    right_y: float
 
 
 def _gauss_table() -> tuple[FloatArray, FloatArray]:
@@ -47,10 +73,48 @@ GAUSS_NODES, GAUSS_WEIGHTS = _gauss_table()
 
 
 @inner_kernel
-def plane(a: float, d: float, n_x: float, n_y: float) -> tuple[float, float, float]:
-    """(u, v, w) of the object's face; the normal's z component must be positive."""
+def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
+    """The face pressed in by ``d``; the z component of its normal (n_x, n_y, …) is positive."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
-    return (a - d) / n_z, n_x / n_z, n_y / n_z
+    face.u = (a - d) / n_z
+    face.v = n_x / n_z
+    face.w = n_y / n_z
+
+
+@inner_kernel
+def beyond_limit(face: Face, a: float) -> bool:
+    """Whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
+    u = face.u
+    return u <= 0.0 or u * u < (face.v * face.v + face.w * face.w) * a * a
+
+
+@inner_kernel
+def set_extremes(face: Face, a: float) -> None:
+    """Find the footprint's extreme points."""
+    u = face.u
+    v = face.v
+    w = face.w
+    face.left_y = face.right_y = 0.0
+    s = 1.0 + v * v + w * w
+    if s * a * a <= u * u and u > 0.0:
+        face.low = face.left = math.inf
+        face.high = face.right = -math.inf
+    elif beyond_limit(face, a):
+        face.low = face.left = -a
+        face.high = face.right = a
+    else:
+        root = s * a * a - u * u
+        reach = math.sqrt((1.0 + v * v) * root)
+        face.low = (u * w - reach) / s
+        face.high = (u * w + reach) / s
+        reach = math.sqrt((1.0 + w * w) * root)
+        left = (u * v - reach) / s
+        right = (u * v + reach) / s
+        e = 1.0 + w * w
+        face.left = left
+        face.left_y = w * (u - v * left) / e
+        face.right = right
+        face.right_y = w * (u - v * right) / e
 
 
 @inner_kernel
@@ -83,18 +147,15 @@ def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
 
 @fast_inner_kernel
 def line_spans(
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    start: float,
-    pitch: float,
-    first: int,
-    last: int,
-    left: FloatArray,
-    right: FloatArray,
+    face: Face, grid: Grid, upright: bool, first: int, last: int, left: Pointer, right: Pointer
 ) -> None:
-    """:func:`line_span` on the lines y = start + k pitch, k = first..last, into left and right."""
+    """:func:`line_span` on the grid's lines first..last, those of x if ``upright``, else of y."""
+    a = grid.radius
+    u = face.u
+    v = face.w if upright else face.v
+    w = face.v if upright else face.w
+    start = grid.x if upright else grid.y
+    pitch = grid.pitch_x if upright else grid.pitch_y
     stretch = 1.0 + v * v
     e = 1.0 / stretch
     for k in range(first, last + 1):
@@ -114,70 +175,48 @@ def line_spans(
 
 
 @inner_kernel
-def beyond_limit(u: float, v: float, w: float, a: float) -> bool:
-    """Whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
-    return u <= 0.0 or u * u < (v * v + w * w) * a * a
+def rows_touched(face: Face, grid: Grid) -> tuple[int, int]:
+    """The range of the rows that the footprint touches."""
+    first = min(max(math.floor((face.low - grid.y) / grid.pitch_y), 0), grid.rows)
+    last = min(max(math.ceil((face.high - grid.y) / grid.pitch_y), first), grid.rows)
+    return first, last
 
 
 @inner_kernel
-def extremes(u: float, v: float, w: float, a: float) -> Ends:
-    """(y of the lowest, of the highest point, y and x of the leftmost, y and x of the rightmost).
-
-    Empty (inf, −inf, …) when the face is off the tip. Beyond the limit the two y are the rim's.
-    """
-    inf = math.inf
-    s = 1.0 + v * v + w * w
-    if s * a * a <= u * u and u > 0.0:
-        return inf, -inf, 0.0, inf, 0.0, -inf
-    if beyond_limit(u, v, w, a):
-        return -a, a, 0.0, -a, 0.0, a
-    root = s * a * a - u * u
-    reach = math.sqrt((1.0 + v * v) * root)
-    low = (u * w - reach) / s
-    high = (u * w + reach) / s
-    reach = math.sqrt((1.0 + w * w) * root)
-    left = (u * v - reach) / s
-    right = (u * v + reach) / s
-    e = 1.0 + w * w
-    return low, high, w * (u - v * left) / e, left, w * (u - v * right) / e, right
+def cols_touched(face: Face, grid: Grid) -> tuple[int, int]:
+    """The range of the columns that the footprint touches."""
+    first = min(max(math.floor((face.left - grid.x) / grid.pitch_x), 0), grid.cols)
+    last = min(max(math.ceil((face.right - grid.x) / grid.pitch_x), first), grid.cols)
+    return first, last
 
 
 @inner_kernel
 def band_columns(
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    ends: Ends,
-    below: Span,
-    above: Span,
-    y0: float,
-    y1: float,
-    x_first: float,
-    pitch_x: float,
-    cols: int,
+    face: Face, grid: Grid, below: Span, above: Span, y0: float, y1: float
 ) -> tuple[int, int, int, int]:
     """Columns (a, b, c, d) of the cells in the band y0..y1: a..d touch the footprint, b..c lie in.
 
-    ``ends`` is what :func:`extremes` gave, ``below`` and ``above`` the spans at y0 and y1. Cells
-    a..b and c..d may be cut by the outline, and beyond the limit some of them lie outside.
+    ``below`` and ``above`` are the spans at y0 and y1. Cells a..b and c..d may be cut by the
+    outline, and beyond the limit some of them lie outside.
     """
-    if beyond_limit(u, v, w, a):
+    a = grid.radius
+    if beyond_limit(face, a):
         nearest = 0.0 if y0 * y1 <= 0.0 else min(abs(y0), abs(y1))
         outer_right = math.sqrt(max(a * a - nearest * nearest, 0.0))
         outer_left = -outer_right
     else:
         outer_left = min(below[0], above[0])
         outer_right = max(below[1], above[1])
-        if y0 <= ends[2] <= y1:
-            outer_left = ends[3]
-        if y0 <= ends[4] <= y1:
-            outer_right = ends[5]
+        if y0 <= face.left_y <= y1:
+            outer_left = face.left
+        if y0 <= face.right_y <= y1:
+            outer_right = face.right
     if not outer_left < outer_right:
         return 0, 0, 0, 0
-    per_pitch = 1.0 / pitch_x
-    first = min(max(math.floor((outer_left - x_first) * per_pitch), 0), cols)
-    last = min(max(math.ceil((outer_right - x_first) * per_pitch), first), cols)
+    x_first = grid.x
+    per_pitch = 1.0 / grid.pitch_x
+    first = min(max(math.floor((outer_left - x_first) * per_pitch), 0), grid.cols)
+    last = min(max(math.ceil((outer_right - x_first) * per_pitch), first), grid.cols)
     inner_left = max(below[0], above[0])
     inner_right = min(below[1], above[1])
     if not inner_left < inner_right:

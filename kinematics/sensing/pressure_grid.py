@@ -8,136 +8,118 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.blur import average, parts, stencil
 from softfinger.kinematics.sensing.cell_integrals import (
-    MAX_BREAKS,
-    NODE_ROWS,
+    NODES,
     NODES_A_CELL,
-    STRESS,
-    WEIGHT,
+    Nodes,
     evaluate,
     push_cut,
     push_whole,
 )
 from softfinger.kinematics.sensing.footprint import (
+    Face,
     FloatArray,
-    Geometry,
+    Grid,
     IntArray,
     band_columns,
-    extremes,
     line_span,
-    plane,
+    rows_touched,
+    set_extremes,
+    set_face,
 )
 
-NODES = 512 + NODES_A_CELL
-OWNERS = 256
+OWNERS = 256  # cells whose nodes are evaluated at once
 
 
-def render_scratch(grid: SensorGrid) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Scratch arrays for :func:`render`, reusable from call to call."""
-    return (
-        np.empty((NODE_ROWS, NODES)),
-        np.empty((2, OWNERS), dtype=np.int64),
-        np.empty((grid.cols + 1, 2)),
-    )
+class Rendering(Record):
+    """A contact on a grid of cells, and scratch for its pressures."""
+
+    d: float  # [m]
+    n_x: float  # of the object's outward normal, in the sensor's axes
+    n_y: float
+    gain: float
+    grid: Grid
+    face: Face
+    nodes: Nodes
+    waiting: int
+    cells: Annotated[IntArray, OWNERS]
+    ends: Annotated[IntArray, OWNERS]  # of their nodes
 
 
 @inner_kernel
-def _flush(
-    nodes: FloatArray,
-    count: int,
-    owners: IntArray,
-    waiting: int,
-    u: float,
-    v: float,
-    w: float,
-    a: float,
-    law: FloatArray,
-    gain: float,
-    out: FloatArray,
-) -> None:
-    """Sum the nodes of the ``waiting`` cells into ``out``; owners are (cell, end of its nodes)."""
-    evaluate(nodes, count, u, v, w, a, law)
-    cols = out.shape[1]
+def _flush(work: Rendering, law: FloatArray, out: FloatArray) -> None:
+    """Sum the nodes of the waiting cells into ``out``."""
+    nodes = work.nodes
+    evaluate(nodes, work.face, work.grid.radius, law)
+    cols = work.grid.cols
     node = 0
-    for k in range(waiting):
+    for k in range(work.waiting):
         total = 0.0
-        while node < owners[1, k]:
-            total += nodes[WEIGHT, node] * nodes[STRESS, node]
+        while node < work.ends[k]:
+            total += nodes.weight[node] * nodes.stress[node]
             node += 1
-        cell = owners[0, k]
-        out[cell // cols, cell % cols] = gain * total
+        cell = work.cells[k]
+        out[cell // cols, cell % cols] = work.gain * total
+    nodes.count = 0
+    work.waiting = 0
 
 
 @kernel
-def render(
-    geometry: Geometry,
-    law: FloatArray,
-    gain: float,
-    d: float,
-    n_x: float,
-    n_y: float,
-    scratch: tuple[FloatArray, IntArray, FloatArray],
-    out: FloatArray,
-) -> None:
+def render(works: Records[Rendering], law: FloatArray, out: FloatArray) -> None:
     """Write the pressure [Pa] of a contact, averaged over each cell, into ``out`` [rows, cols].
 
-    ``geometry`` is :meth:`SensorGrid.geometry`, ``law`` the material's, (n_x, n_y) the first two
-    components of the object's outward normal in the sensor's axes, ``scratch`` as
-    :func:`render_scratch` gives it. d ≤ 0 gives zeros. Beyond the domain's limit the footprint ends
-    at the rim and the strain stays ≤ 1.
+    ``law`` is the material's. d ≤ 0 gives zeros. Beyond the domain's limit the footprint ends at
+    the rim and the strain stays ≤ 1.
     """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    nodes, owners, columns = scratch
-    rows, cols = out.shape
+    work = works[0]
+    grid = work.grid
+    face = work.face
+    nodes = work.nodes
+    a = grid.radius
     out[:] = 0.0
-    if not (d > 0.0 and n_x * n_x + n_y * n_y < 1.0):
+    if not (work.d > 0.0 and work.n_x * work.n_x + work.n_y * work.n_y < 1.0):
         return
-    u, v, w = plane(a, min(d, a), n_x, n_y)
-    ends = extremes(u, v, w, a)
-    if not ends[0] < ends[1]:
+    set_face(face, a, min(work.d, a), work.n_x, work.n_y)
+    set_extremes(face, a)
+    if not face.low < face.high:
         return
-    breaks = np.empty(MAX_BREAKS)
-    first_row = min(max(math.floor((ends[0] - y_first) / pitch_y), 0), rows)
-    last_row = min(max(math.ceil((ends[1] - y_first) / pitch_y), first_row), rows)
-    for j in range(cols + 1):
-        columns[j, 0], columns[j, 1] = line_span(u, w, v, a, x_first + j * pitch_x)
-    count = 0
-    waiting = 0
-    above = line_span(u, v, w, a, y_first + first_row * pitch_y)
-    for i in range(first_row, last_row):
-        y0 = y_first + i * pitch_y
-        y1 = y_first + (i + 1) * pitch_y
-        below = above
-        above = line_span(u, v, w, a, y1)
-        first, inner_first, inner_last, last = band_columns(
-            u, v, w, a, ends, below, above, y0, y1, x_first, pitch_x, cols
+    first_row, last_row = rows_touched(face, grid)
+    columns = np.empty((grid.cols + 1, 2))
+    for j in range(grid.cols + 1):
+        columns[j, 0], columns[j, 1] = line_span(
+            face.u, face.w, face.v, a, grid.x + j * grid.pitch_x
         )
+    nodes.count = 0
+    work.waiting = 0
+    above = line_span(face.u, face.v, face.w, a, grid.y + first_row * grid.pitch_y)
+    for i in range(first_row, last_row):
+        y0 = grid.y + i * grid.pitch_y
+        y1 = grid.y + (i + 1) * grid.pitch_y
+        below = above
+        above = line_span(face.u, face.v, face.w, a, y1)
+        first, inner_first, inner_last, last = band_columns(face, grid, below, above, y0, y1)
         for j in range(first, last):
-            x0 = x_first + j * pitch_x
-            x1 = x_first + (j + 1) * pitch_x
             if inner_first <= j < inner_last:
-                count = push_whole(nodes, count, a, x0, x1, y0, y1)
+                push_whole(nodes, grid, i, j)
             else:
                 left = (columns[j, 0], columns[j, 1])
                 right = (columns[j + 1, 0], columns[j + 1, 1])
-                count = push_cut(
-                    nodes, count, u, v, w, a, ends, x0, x1, y0, y1, left, right, breaks
-                )
-            owners[0, waiting] = i * cols + j
-            owners[1, waiting] = count
-            waiting += 1
-            if count > NODES - NODES_A_CELL or waiting == OWNERS:
-                _flush(nodes, count, owners, waiting, u, v, w, a, law, gain, out)
-                count = 0
-                waiting = 0
-    _flush(nodes, count, owners, waiting, u, v, w, a, law, gain, out)
+                push_cut(nodes, face, grid, i, j, left, right)
+            work.cells[work.waiting] = i * grid.cols + j
+            work.ends[work.waiting] = nodes.count
+            work.waiting += 1
+            if nodes.count > NODES - NODES_A_CELL or work.waiting == OWNERS:
+                _flush(work, law, out)
+    _flush(work, law, out)
 
 
 @dataclass(frozen=True)
@@ -184,16 +166,14 @@ class SensorGrid:
         """(rows, cols)."""
         return self.rows, self.cols
 
-    def geometry(self, tip: Fingertip) -> Geometry:
-        """(a, x and y of the first cell's corner from the tip's centre, pitch x, pitch y) [m]."""
+    def on(self, tip: Fingertip) -> Grid:
+        """The cells as kernels take them, counted from this tip's centre."""
         pitch_x, pitch_y = self.pitches
-        return (
-            float(tip.radius),
-            -0.5 * self.cols * pitch_x - self.centre[0],
-            -0.5 * self.rows * pitch_y - self.centre[1],
-            float(pitch_x),
-            float(pitch_y),
-        )
+        x = -0.5 * self.cols * pitch_x - self.centre[0]
+        y = -0.5 * self.rows * pitch_y - self.centre[1]
+        # In the order of the fields; at once, as setting each takes ten times as long.
+        fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
+        return Grid(np.array([fields], Grid.dtype))
 
     def to_sensor(self, n_x: float, n_y: float) -> tuple[float, float]:
         """A vector's components along the finger's axes → along the sensor's."""
@@ -225,17 +205,19 @@ class SensorGrid:
             out = np.empty(self.shape)
         elif out.shape != self.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
             raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
-        s_x, s_y = self.to_sensor(n_x, n_y)
-        contact = (float(gain), float(d), s_x, s_y)
+        work = Rendering(np.empty(1, Rendering.dtype))
+        work.d, work.gain = d, gain
+        work.n_x, work.n_y = self.to_sensor(n_x, n_y)
         if self.blur == 0.0:
-            scratch = render_scratch(self)
-            render(self.geometry(tip), material.law, *contact, scratch, out)
+            work.grid.assign(self.on(tip))
+            render(work.array, material.law, out)
             return out
         pitch_x, pitch_y = self.pitches
         n = parts(self.blur / pitch_x), parts(self.blur / pitch_y)
         stencils, finer = self.finer(n)
         fine = np.empty(finer.shape)
-        render(finer.geometry(tip), material.law, *contact, render_scratch(finer), fine)
+        work.grid.assign(finer.on(tip))
+        render(work.array, material.law, fine)
         out[:] = average(fine, *stencils, n)
         return out
 

@@ -16,16 +16,14 @@ from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, Sens
 from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.blurred_cells import PLACE_BITS, PLANES, spread, weights
-from softfinger.kinematics.estimation.cut_cells import READING, WEIGHT
+from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.packing import PLACE_BITS
+from softfinger.kinematics.estimation.state import READING, WEIGHT, State
 from softfinger.kinematics.sensing.blur import stencil
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from tests.harness.called import called
-
-# Inner kernels, made callable.
-spread = called(spread)
+from tests.harness.estimator_kernels import spread
 
 A = 0.020
 E = 0.304e6
@@ -117,7 +115,19 @@ def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
     cells = np.zeros((rows, CELL_PLANES, cols))
     cells[:, LIVE] = rng.random((rows, cols)) > 0.1
     padded = parts * (cols + 2 * LANES) + len(whole)
-    scratch = np.zeros((high + 1, padded)), np.zeros(padded)
+    state = State()
+    state.grid.rows, state.grid.cols = rows, cols
+    state.model.rows, state.model.cols = high, wide
+    state.signal.scale = 2.0
+    blur, at = state.blur, state.at
+    blur.parts_x = blur.parts_y = parts
+    blur.weights_x, blur.weights_y, blur.width = across.shape[1], len(whole), padded
+    at.cells, at.across = 7 * high * wide, 7 * high * wide + cells.size
+    at.along = at.across + across.size
+    at.fine = at.along + len(whole)
+    at.half = at.fine + (high + 1) * padded
+    arena = np.zeros(at.half + padded)
+    arena[at.cells : at.fine] = np.concatenate([cells.ravel(), across.ravel(), whole])
     for low, left, tall, broad in ((0, 0, high, wide), (3, 4, 5, 6), (high - 2, wide - 3, 2, 3)):
         i, j = (each.ravel() for each in np.mgrid[low : low + tall, left : left + broad])
         places = (i << PLACE_BITS) | j
@@ -133,9 +143,10 @@ def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
                     part = field[y : y + rows * parts, x : x + cols * parts]
                     blurred += one[y] * one[x] * part
             expected[plane] = blurred.reshape(rows, parts, cols, parts).mean(axis=(1, 3))
-        count = spread(
-            packed, len(i), places.copy(), frame, 2.0, cells, across, whole, parts, *scratch
-        )
+        state.fit.count = len(i)
+        arena[: packed.size] = packed.ravel()
+        spread(state.array, frame, arena, places.copy())
+        packed, count = arena[: packed.size].reshape(packed.shape), state.fit.count
         # Cells that take part are told by their readings, of which no two are equal.
         seen = 0
         for k in range(count):

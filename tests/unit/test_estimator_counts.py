@@ -9,17 +9,16 @@ import pytest
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.cut_cells import PLANES
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.gauss_newton import free_noise
-from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, accumulate, fit_law, press
+from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, set_law
+from softfinger.kinematics.estimation.state import PLANES
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.called import called
+from tests.harness.estimator_kernels import press_and_accumulate, state_for
 
-# Inner kernels, made callable.
+# An inner kernel, made callable.
 free_noise = called(free_noise)
-accumulate = called(accumulate)
-press = called(press)
 
 E = 0.304e6
 TIP = Fingertip(0.020)
@@ -44,26 +43,26 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
         packed[0], packed[1], packed[6] = 1.0, g, 1.0
         packed[5] = 3300.0
         u = (1.0 - model / gain / E) / g
-        sums = np.zeros(17)
-        law = fit_law(LINEAR.law)
-        pressed = packed.copy()
-        press(pressed, 1, u, 0.0, 0.0, law)
-        accumulate(pressed, 1, gain, math.inf, floor, noise, sums)
+        state = state_for(packed)
+        set_law(state.law, LINEAR.law)
+        state.signal.saturation, state.signal.floor = math.inf, floor
+        state.fit.face.u, state.fit.gain, state.fit.clip = u, gain, noise
+        press_and_accumulate(state.array, packed.copy())
+        sums = state.fit.sums
         mean, response = mean_of(np.array(model), floor, noise)
         residual = 3300.0 - mean
-        assert sums[14] == pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
+        assert sums.misfit == pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
         # The Jacobian's column by (u, …) is σ' g times the response.
-        assert math.sqrt(sums[4]) == pytest.approx(E * g * response, abs=5e-3 * E * g)
-        assert sums[16] == 1.0
+        assert math.sqrt(sums.normal[4]) == pytest.approx(E * g * response, abs=5e-3 * E * g)
+        assert sums.weight == 1.0
     far = np.array([[1.0], [g], [0.0], [0.0], [0.0], [0.0], [1.0]])
     packed[: len(far)] = far
     below = floor - (CLIP_BELOW + 0.1) * noise
     if below > 0.0:
         u = (1.0 - below / gain / E) / g
-        pressed = packed.copy()
-        press(pressed, 1, u, 0.0, 0.0, law)
-        accumulate(pressed, 1, gain, math.inf, floor, noise, sums)
-        assert sums[16] == 0.0
+        state.fit.face.u = u
+        press_and_accumulate(state.array, packed.copy())
+        assert sums.weight == 0.0
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0, 2.0, 2.8])

@@ -8,17 +8,10 @@ import numpy as np
 import pytest
 
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.cell_centres import cell_middles
-from softfinger.kinematics.estimation.cut_cells import PLANES
-from softfinger.kinematics.estimation.detection import activity
-from softfinger.kinematics.estimation.likelihood import SUMS, accumulate, fit_law, is_bent, press
-from tests.harness.called import called
-
-# Inner kernels, made callable.
-activity = called(activity)
-accumulate = called(accumulate)
-is_bent = called(is_bent)
-press = called(press)
+from softfinger.kinematics.estimation.cell_centres import cell_centres
+from softfinger.kinematics.estimation.likelihood import set_law
+from softfinger.kinematics.estimation.state import PLANES, Law, State
+from tests.harness.estimator_kernels import activity, press_and_accumulate, state_for
 
 LINEAR = Material.constant(0.304e6)
 MEASURED = Material.table_i()
@@ -31,8 +24,12 @@ def test_activity_matches_its_plain_twin():
     # Columns 2 … 21 are in reach, and rows 2 … 17.
     live = np.zeros((20, 24), bool)
     live[2:18, 2:22] = True
-    middles, bounds = cell_middles((1.0, 0.0, 0.0, 0.01, 0.01), live, 2.0)
-    assert bounds[2] == live.sum()
+    state = State()
+    grid = state.grid
+    grid.radius, grid.pitch_x, grid.pitch_y, grid.rows, grid.cols = 1.0, 0.01, 0.01, 20, 24
+    state.options.peak_level, state.signal.patch_level, state.signal.noise = 3.0, 4.0, 1.0
+    centres = cell_centres(grid, live, 2.0, state.reach)
+    assert state.reach.number == live.sum()
     seen = set()
     for k in range(200):
         frame = rng.normal(0.0, 1.0, (20, 24))
@@ -44,16 +41,16 @@ def test_activity_matches_its_plain_twin():
             w = weights * live[part]
             expected |= (w * frame[part]).sum() / math.sqrt((w**2).sum()) > 4.0
         frame[0, 5], frame[3, 0] = math.nan, 1e9
-        found = activity(frame, middles, bounds, 1.0, 3.0, 4.0)
-        contact, row, col, peak, mean, energy, finite = found
-        assert contact == expected
-        assert finite
+        activity(state.array, frame, centres)
+        found = state.signal
+        assert found.contact == expected
+        assert found.finite
         inner = frame[live]
-        assert mean == pytest.approx(inner.mean())
-        assert energy == pytest.approx((inner**2).sum())
-        assert peak == inner.max()
-        if peak > 3.0:
-            assert frame[row, col] == peak
+        assert found.mean == pytest.approx(inner.mean())
+        assert found.energy == pytest.approx((inner**2).sum())
+        assert found.peak == inner.max()
+        if found.peak > 3.0:
+            assert frame[found.row, found.col] == found.peak
         seen.add(expected)
     assert seen == {True, False}
 
@@ -69,12 +66,15 @@ def test_normal_equations_match_their_plain_twin():
     packed[4] = rng.uniform(0.0, 1e-3, n)
     packed[5] = rng.uniform(0.0, 5e4, n)
     packed[6] = rng.random(n) > 0.1
-    sums = np.zeros(SUMS)
     saturation = 2e4
     floor = 1.3e4
-    pressed = packed.copy()
-    press(pressed, n, u, v, w, fit_law(MEASURED.law))
-    accumulate(pressed, n, gain, saturation, floor, 0.0, sums)
+    state = state_for(packed)
+    face, state.fit.gain = state.fit.face, gain
+    face.u, face.v, face.w = u, v, w
+    state.signal.saturation, state.signal.floor = saturation, floor
+    set_law(state.law, MEASURED.law)
+    press_and_accumulate(state.array, packed.copy())
+    sums = state.fit.sums
     strain = 1.0 - (u * packed[1] - v * packed[2] - w * packed[3])
     step = 1e-4
     stress = MEASURED.stress(strain)
@@ -88,11 +88,11 @@ def test_normal_equations_match_their_plain_twin():
     jacobian = np.stack([mean, slope * packed[1], slope * packed[2], slope * packed[3]])
     residual = np.maximum(packed[5], floor) - gain * mean
     normal = (jacobian * weight) @ jacobian.T
-    np.testing.assert_allclose(sums[:10], normal[np.triu_indices(4)], rtol=1e-4)
-    np.testing.assert_allclose(sums[10:14], (jacobian * weight) @ residual, rtol=1e-3)
-    assert sums[14] == pytest.approx((weight * residual**2).sum(), rel=1e-5)
-    assert sums[15] == pytest.approx((packed[6] * packed[5] ** 2).sum(), rel=1e-12)
-    assert sums[16] == weight.sum()
+    np.testing.assert_allclose(sums.normal, normal[np.triu_indices(4)], rtol=1e-4)
+    np.testing.assert_allclose(sums.right, (jacobian * weight) @ residual, rtol=1e-3)
+    assert sums.misfit == pytest.approx((weight * residual**2).sum(), rel=1e-5)
+    assert sums.readings == pytest.approx((packed[6] * packed[5] ** 2).sum(), rel=1e-12)
+    assert sums.weight == weight.sum()
     assert 0 < (~free).sum() < n
     assert 0 < (gain * mean < floor).sum() < (~free).sum()
 
@@ -103,18 +103,19 @@ def test_the_estimators_law_follows_any_material():
         1e5 * np.linspace(0.0, 1.0, 12) ** 1.3 + 5e4 * np.linspace(0, 1, 12),
     )
     for material in (LINEAR, MEASURED, points):
-        law = fit_law(material.law)
+        law = Law()
+        set_law(law, material.law)
         strain = np.linspace(0.0, 0.999999, 3001)
-        if len(law) == 2:
-            value = np.polynomial.Polynomial(law.ravel())(strain)
+        if law.is_polynomial:
+            value = np.polynomial.Polynomial(law.polynomial)(strain)
         else:
-            t = strain * (len(law) - 1)
+            t = strain * (len(law.cubics) - 1)
             k = t.astype(int)
-            c = law[k].T
+            c = law.cubics[k].T
             t = t - k
             value = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
         np.testing.assert_allclose(
             value, material.stress(strain), atol=1e-7 * material.reference_modulus
         )
-        assert is_bent(law) == (material is not LINEAR)
-    assert [len(fit_law(each.law)) for each in (LINEAR, MEASURED, points)] == [2, 2, 129]
+        assert law.bent == (material is not LINEAR)
+        assert law.is_polynomial == (material is not points)

@@ -23,9 +23,11 @@ from softfinger.daemon.tactile.decoder import Decoder
 from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
 from softfinger.daemon.tactile.glove import GloveDecoder
 from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation import frame_pipeline
 from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
+from softfinger.kinematics.estimation.state import State
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks import accuracy_envelope
 from softfinger.tools.benchmarks.accuracy_trials import (
@@ -119,24 +121,20 @@ def _loop(
     repeat: int,
     frames: FloatArray,
     cold: bool,
-    plan: FloatArray,
-    cells: FloatArray,
-    tables: FloatArray,
-    state: FloatArray,
-    floats: FloatArray,
-    integers: NDArray[np.int64],
+    states: Records[State],
+    arena: FloatArray,
+    places: NDArray[np.int64] | None,
     out: FloatArray,
 ) -> None:
+    estimate = states[0].estimate
     for _ in range(repeat):
         for k in range(frames.shape[0]):
             if cold:
-                state[frame_pipeline.WARM] = 0.0
-            frame_pipeline.estimate_frame(
-                frames[k], 1.0, 0.0, plan, cells, tables, state, floats, integers
-            )
-            out[k, 0] = state[frame_pipeline.D]
-            out[k, 1] = state[frame_pipeline.TILT_X]
-            out[k, 2] = state[frame_pipeline.TILT_Y]
+                estimate.warm = False
+            estimate_frame(states, frames[k], 1.0, 0.0, arena, places)
+            out[k, 0] = estimate.d
+            out[k, 1] = estimate.tilt_x
+            out[k, 2] = estimate.tilt_y
 
 
 def _kernel(estimator: ContactEstimator, frames: FloatArray, cold: bool = False) -> _Case:
@@ -144,7 +142,7 @@ def _kernel(estimator: ContactEstimator, frames: FloatArray, cold: bool = False)
     out = np.zeros((len(frames), 3))
 
     def run(repeat: int) -> None:
-        _loop(repeat, frames, cold, *estimator.compiled_arguments(), out)
+        _loop(repeat, frames, cold, estimator.state.array, *estimator.arena, out)
 
     return _Case(Subject(run, len(frames)), lambda: out)
 

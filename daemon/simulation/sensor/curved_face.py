@@ -17,51 +17,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.material import stress_at
-from softfinger.kinematics.sensing.footprint import Geometry, extremes, plane
+from softfinger.kinematics.sensing.footprint import (
+    Face,
+    Grid,
+    cols_touched,
+    rows_touched,
+    set_extremes,
+    set_face,
+)
 
 FloatArray = NDArray[np.float64]
 
 _POINTS = 4  # of a cell's side: within 5e-4 of the modulus up to d = a/5, 2e-3 near the rim
 
 
+class CurvedContact(Record):
+    """A cylinder's face on a grid of cells."""
+
+    d: float  # how deep it is in the hemisphere along the normal [m]
+    n_x: float  # the normal leads from the tip's centre to the axis, a − d + R away
+    n_y: float
+    across_x: float  # unit vector at right angles to the axis in the base's plane
+    across_y: float
+    bend: float  # curvature 1/R [1/m]
+    grid: Grid
+    face: Face
+
+
 @kernel
-def render_curved(
-    geometry: Geometry,
-    law: FloatArray,
-    d: float,
-    n_x: float,
-    n_y: float,
-    across_x: float,
-    across_y: float,
-    bend: float,
-    out: FloatArray,
-) -> None:
+def render_curved(contacts: Records[CurvedContact], law: FloatArray, out: FloatArray) -> None:
     """Write the pressure [Pa] of a cylinder's face on each cell into ``out`` [rows, cols].
 
-    ``geometry`` and ``law`` as for :func:`sensing.pressure_grid.render`; ``bend`` > 0 [1/m] is the
-    cylinder's curvature 1/R, (across_x, across_y) the unit vector at right angles to its axis in
-    the base's plane. ``d`` [m] is how deep it is in the hemisphere along the normal (n_x, n_y, …),
-    which leads from the tip's centre to the axis, a − d + R away:
+    ``law`` is the material's. With p the way across the axis
 
         z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
-    with p the way across the axis. The mean over a cell is that of points spread evenly in it.
+    The mean over a cell is that of points spread evenly in it.
     """
-    a, x_first, y_first, pitch_x, pitch_y = geometry
-    rows, cols = out.shape
+    contact = contacts[0]
+    grid = contact.grid
+    face = contact.face
+    a = grid.radius
+    d = contact.d
+    n_x = contact.n_x
+    n_y = contact.n_y
+    bend = contact.bend
+    across_x = contact.across_x
+    across_y = contact.across_y
+    pitch_x = grid.pitch_x
+    pitch_y = grid.pitch_y
     out[:] = 0.0
     if not (d > 0.0 and bend > 0.0 and n_x * n_x + n_y * n_y < 1.0):
         return
     # The cylinder lies behind its tangent plane, so it presses on no more cells than that.
-    u, v, w = plane(a, min(d, a), n_x, n_y)
-    low, high, _, left, _, right = extremes(u, v, w, a)
-    if not low < high:
+    set_face(face, a, min(d, a), n_x, n_y)
+    set_extremes(face, a)
+    if not face.low < face.high:
         return
-    first_row = min(max(math.floor((low - y_first) / pitch_y), 0), rows)
-    last_row = min(max(math.ceil((high - y_first) / pitch_y), first_row), rows)
-    first_col = min(max(math.floor((left - x_first) / pitch_x), 0), cols)
-    last_col = min(max(math.ceil((right - x_first) / pitch_x), first_col), cols)
+    first_row, last_row = rows_touched(face, grid)
+    first_col, last_col = cols_touched(face, grid)
     roundness = 1.0 / bend
     away = a - d + roundness
     c_p = away * (n_x * across_x + n_y * across_y)
@@ -70,9 +86,9 @@ def render_curved(
     step_x = pitch_x / _POINTS
     step_y = pitch_y / _POINTS
     for i in range(first_row, last_row):
-        y_cell = y_first + i * pitch_y + 0.5 * step_y
+        y_cell = grid.y + i * pitch_y + 0.5 * step_y
         for j in range(first_col, last_col):
-            x_cell = x_first + j * pitch_x + 0.5 * step_x
+            x_cell = grid.x + j * pitch_x + 0.5 * step_x
             total = 0.0
             for k in range(_POINTS):
                 y = y_cell + k * step_y

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.sensing.footprint import Geometry
+from softfinger.kinematics.sensing.footprint import Grid
 
 FloatArray = NDArray[np.float64]
 
@@ -48,28 +48,26 @@ class Blur:
     """The finer grid that a blurred frame is rendered on, and its stencils.
 
     The elastomer over the cells spreads a point's pressure with the standard deviation ``width``
-    [m]. ``geometry`` is that of the cells; ``fine`` [rows, cols] and ``fine_geometry`` are to be
-    rendered, the stencils' reach beyond the sensor's edge included.
+    [m]. ``grid`` is that of the cells; ``fine`` [rows, cols] on ``fine_grid`` is to be rendered,
+    the stencils' reach beyond the sensor's edge included.
     """
 
-    def __init__(self, geometry: Geometry, shape: tuple[int, int], width: float) -> None:
-        a, x_first, y_first, pitch_x, pitch_y = geometry
+    def __init__(self, grid: Grid, width: float) -> None:
+        pitch_x, pitch_y = grid.pitch_x, grid.pitch_y
         parts_x, parts_y = parts_for(width, pitch_x), parts_for(width, pitch_y)
         self.parts = (parts_x, parts_y)
         self.across = stencil(width, pitch_x, parts_x)
         self.along = stencil(width, pitch_y, parts_y)
         margin_x, margin_y = len(self.across) // 2, len(self.along) // 2
-        rows, cols = shape
-        self.fine = np.zeros((rows * parts_y + 2 * margin_y, cols * parts_x + 2 * margin_x))
-        fine_x, fine_y = pitch_x / parts_x, pitch_y / parts_y
-        self.fine_geometry: Geometry = (
-            a,
-            x_first - margin_x * fine_x,
-            y_first - margin_y * fine_y,
-            fine_x,
-            fine_y,
-        )
-        self._half = np.zeros((self.fine.shape[0], cols))
+        fine = self.fine_grid = Grid()
+        fine.radius = grid.radius
+        fine.rows = grid.rows * parts_y + 2 * margin_y
+        fine.cols = grid.cols * parts_x + 2 * margin_x
+        fine.pitch_x, fine.pitch_y = pitch_x / parts_x, pitch_y / parts_y
+        fine.x = grid.x - margin_x * fine.pitch_x
+        fine.y = grid.y - margin_y * fine.pitch_y
+        self.fine = np.zeros((fine.rows, fine.cols))
+        self._half = np.zeros((fine.rows, grid.cols))
 
     def apply(self, out: FloatArray) -> None:
         """Write ``fine``, blurred and averaged over each cell, into ``out`` [rows, cols]."""

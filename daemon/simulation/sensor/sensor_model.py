@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import Simulation
 from softfinger.daemon.simulation.sensor import sensor_effects
-from softfinger.daemon.simulation.sensor.curved_face import render_curved
+from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, render_curved
 from softfinger.daemon.simulation.sensor.sensor_effects import PLAYS, Blur
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.pressure_grid import SensorGrid, render, render_scratch
+from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
 
 FloatArray = NDArray[np.float64]
 
@@ -111,11 +111,15 @@ class SensorModel:
         if flaws.dead > 0.0:
             sensitivity[self._generator.random(shape) < flaws.dead] = 0.0
         self._sensitivity = sensitivity
-        self._blur = Blur(grid.geometry(tip), shape, flaws.blur) if flaws.blur > 0.0 else None
+        cells = grid.on(tip)
+        self._blur = Blur(cells, flaws.blur) if flaws.blur > 0.0 else None
         self._pressure = np.zeros(shape)
         self._target = self._pressure if self._blur is None else self._blur.fine
-        self._geometry = grid.geometry(tip) if self._blur is None else self._blur.fine_geometry
-        self._scratch = render_scratch(SensorGrid(*self._target.shape, 1.0))
+        self._plane, self._curved = Rendering(), CurvedContact()
+        for contact in (self._plane, self._curved):
+            contact.grid.assign(cells if self._blur is None else self._blur.fine_grid)
+        self._plane.gain = 1.0
+        self._curved.across_x, self._curved.across_y = grid.to_sensor(1.0, 0.0)
         self._plays = np.zeros((PLAYS if flaws.hysteresis > 0.0 else 0, *shape))
         self._before = np.zeros(shape)
         self._crept = np.zeros(shape)
@@ -164,12 +168,13 @@ class SensorModel:
         flaws, pressure = self._flaws, self._pressure
         elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
         self._t = t
-        geometry, law, target = self._geometry, self._law, self._target
+        contact = self._curved if bend > 0.0 else self._plane
+        contact.d, contact.n_x, contact.n_y = d, n_x, n_y
         if bend > 0.0:
-            across = self.grid.to_sensor(1.0, 0.0)
-            render_curved(geometry, law, float(d), n_x, n_y, *across, float(bend), target)
+            self._curved.bend = bend
+            render_curved(self._curved.array, self._law, self._target)
         else:
-            render(geometry, law, 1.0, float(d), n_x, n_y, self._scratch, target)
+            render(self._plane.array, self._law, self._target)
         if self._blur is not None:
             self._blur.apply(pressure)
         if flaws.hysteresis > 0.0:

@@ -1,0 +1,216 @@
+"""The estimator's memory, with names: options, one frame, the estimate, a step of the fit, scratch.
+
+What depends on the grid's size stands in one array of floats, the arena; `Places` says where.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias
+
+from softfinger.kinematics.compiled.layout import Record, Records
+from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntArray
+
+# Planes of the packed cells of a footprint: the share of a cell that lies in it, over that share
+# the means of g, x g, y g (g = 1/√(a² − x² − y²)) and the strain's variance; reading and weight.
+SHARE, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
+PLANES = 7
+
+LEVELS = 3  # how near the rim a cut cell is
+STRIPS = 264  # of cut cells integrated at once, of each level
+OWNERS = 128  # cut cells at once, of each level
+OUTLIERS_MAX = 6  # left out of one frame
+RATIO_POINTS = 33
+LAW_PIECES = 128
+LAW_TERMS = 8  # of a law that is one polynomial
+
+Four: TypeAlias = Annotated[FloatArray, 4]
+Matrix: TypeAlias = Annotated[FloatArray, 4, 4]
+Strip: TypeAlias = Annotated[FloatArray, STRIPS]
+
+
+class Options(Record):
+    """What the estimator was made for; see `ContactEstimator`."""
+
+    noise: float  # of a cell [Pa]
+    saturation: float  # [counts]
+    floor: float  # least count sent, less a half
+    fixed_gain: float
+    tolerance: float
+    peak_level: float  # [noise]
+    patch_level: float
+    explained_min: float
+    modulus: float  # at no strain [Pa]
+    blur: float  # standard deviation [m]
+    rotation: float  # of the sensor [rad]
+    iterations: int
+    free_gain: bool
+    moments_only: bool
+
+
+class Law(Record):
+    """The material's σ(ε): a polynomial, lowest first, or cubics in t = ε · LAW_PIECES − k."""
+
+    cubics: Annotated[FloatArray, LAW_PIECES + 1, 4]
+    polynomial: Annotated[FloatArray, LAW_TERMS]
+    is_polynomial: bool
+    bent: bool  # curved, so that the strain's variance counts
+
+
+class Reach(Record):
+    """Cells that a contact can press: the flat range of their rows, and their number."""
+
+    first: int
+    last: int
+    number: int
+
+
+class Signal(Record):
+    """One frame: its unit, noise and limits, and what the activity test finds."""
+
+    scale: float  # Pa a count
+    variance: float  # of a cell [Pa²]
+    noise: float  # of a cell [counts]
+    confined: float  # most that a contact as wide as a cell presses [counts]
+    patch_level: float
+    saturation: float  # [Pa]
+    floor: float  # [Pa]; −inf for none
+    peak: float  # largest cell [counts], and its place, −1 for none above the level
+    row: int
+    col: int
+    mean: float  # [counts]
+    energy: float  # Σ p² [counts²]
+    clipped: bool  # no cell reads below the floor
+    contact: bool
+    finite: bool
+
+
+class Estimate(Record):
+    """What a frame leaves, and where the next one starts: in the sensor's axes, then published."""
+
+    d: float
+    gain: float
+    chi2: float
+    tilt_x: float
+    tilt_y: float
+    explained: float
+    peak: float  # [Pa]
+    cells: int
+    iterations: int
+    rejected: int
+    contact: bool
+    valid: bool
+    second: bool
+    warm: bool
+    n_x: float
+    n_y: float
+    residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
+    covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
+
+
+class Moments(Record):
+    """Sums over the footprint, and the contact that they make."""
+
+    total: float  # Σ p
+    x: float  # centroid
+    y: float
+    trace: float  # of the covariance
+    number: float  # cells
+    radius: float  # of the disc that the sums are over
+    d: float
+    n_x: float
+    n_y: float
+    gain: float
+    ratios: Annotated[FloatArray, RATIO_POINTS, 3]  # to a constant modulus, over d
+    face: Face
+
+
+class Sums(Record):
+    """Sums over the cells for one step, columns of the Jacobian by (gain, u, v, w)."""
+
+    normal: Annotated[FloatArray, 10]  # upper triangle of JᵀWJ by rows
+    right: Four  # JᵀWr
+    misfit: float  # rᵀWr
+    readings: float  # yᵀWy
+    weight: float  # ΣW
+
+
+class Fit(Record):
+    """Gauss-Newton at one face and gain."""
+
+    face: Face
+    gain: float
+    clip: float  # noise of cells that end at the floor [Pa]; 0 where none do
+    decrement: float  # fall of the sum of squares that the step promises
+    count: int  # packed cells
+    sums: Sums
+    step: Four  # in (gain, u, v, w), as the matrices
+    right: Four
+    scale: Four
+    matrix: Matrix
+    lower: Matrix
+    inverse: Matrix
+    covariance: Matrix  # of (d, n_x, n_y, gain)
+
+
+class Strips(Record):
+    """Strips of cut cells that wait to be integrated side by side."""
+
+    start: Strip  # lower end in y
+    length: Strip
+    cell_x: Strip  # the cell's left side
+    side: Strip  # 1 where the rim is on the cell's left, else 0
+    left: Strip  # of the line at work
+    width: Strip
+    area: Strip
+    sum_g: Strip
+    sum_x: Strip
+    sum_y: Strip
+    sum_square: Strip
+    count: int
+    owners: int  # cells that they belong to
+    places: Annotated[IntArray, OWNERS]  # of these among the packed cells
+    ends: Annotated[IntArray, OWNERS]  # of their strips
+
+
+class Blur(Record):
+    """How a blurred grid is modelled: on parts of cells, spread by weights."""
+
+    parts_x: int  # of a cell
+    parts_y: int
+    weights_x: int  # for each remainder of a part's column
+    weights_y: int
+    width: int  # of a row of scratch
+
+
+class Places(Record):
+    """Where in the arena each array starts."""
+
+    centres: int  # planes of cell_centres [3, cells]
+    cells: int  # planes of cell_integrals [rows, CELL_PLANES, cols]
+    columns: int  # spans on the lines between columns, [2, cols + 1]
+    lines: int  # and on those between rows
+    packed: int  # [PLANES, cells]
+    parts: int  # planes of the parts of cells; the rest is for a blur alone
+    across: int  # weights [parts, n]
+    along: int
+    fine: int  # [rows of parts + 1, width]
+    half: int  # [width]
+
+
+class State(Record):
+    """All of it."""
+
+    options: Options
+    law: Law
+    grid: Grid
+    model: Grid  # what is modelled: the grid, or its parts with a blur
+    reach: Reach
+    signal: Signal
+    estimate: Estimate
+    moments: Moments
+    fit: Fit
+    strips: Annotated[Records[Strips], LEVELS]
+    around: Face  # a little beyond the footprint
+    outliers: Annotated[IntArray, OUTLIERS_MAX]  # cells
+    blur: Blur
+    at: Places

@@ -1,0 +1,44 @@
+"""Steps of the estimator as tests call them: inner kernels behind a kernel that Python may call."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.simd import address
+from softfinger.kinematics.estimation import blurred_cells, detection, likelihood
+from softfinger.kinematics.estimation.state import PLANES, State
+
+FloatArray = NDArray[np.float64]
+
+
+def state_for(packed: FloatArray) -> State:
+    """A state whose model has as many cells as ``packed`` [PLANES, n], all of them packed."""
+    assert len(packed) == PLANES
+    state = State()
+    state.model.rows, state.model.cols = 1, packed.shape[1]
+    state.fit.count = packed.shape[1]
+    return state
+
+
+@kernel
+def activity(states: Records[State], frame: FloatArray, centres: FloatArray) -> None:
+    """:func:`detection.activity`."""
+    detection.activity(states[0], address(frame), address(centres))
+
+
+@kernel
+def press_and_accumulate(states: Records[State], packed: FloatArray) -> None:
+    """:func:`likelihood.press`, then :func:`likelihood.accumulate`."""
+    likelihood.press(states[0], address(packed))
+    likelihood.accumulate(states[0], address(packed))
+
+
+@kernel
+def spread(
+    states: Records[State], frame: FloatArray, arena: FloatArray, places: NDArray[np.int64]
+) -> None:
+    """:func:`blurred_cells.spread`."""
+    blurred_cells.spread(states[0], address(frame), address(arena), address(places))
