@@ -1,7 +1,7 @@
 """``softfinger calibrate``: one step of calibrating the sensor under one tip, and its file.
 
 Arguments, and the way from frames to a step's result. The mathematics is in
-`sensing.calibration`, the file in `perception.calibration_file`.
+`estimation.calibration`, the file in `perception.calibration_file`.
 """
 
 from __future__ import annotations

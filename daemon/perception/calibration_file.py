@@ -1,7 +1,7 @@
 """The calibration file of one sensor: reading, checking whose it is, writing, applying.
 
 One JSON file a sensor, written whole or not at all. A step that was not done yet is null, and the
-settings' value stands for it. What the numbers mean is in `sensing.calibration`.
+settings' value stands for it. What the numbers mean is in `estimation.calibration`.
 """
 
 from __future__ import annotations

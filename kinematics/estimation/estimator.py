@@ -147,6 +147,7 @@ class ContactEstimator:
         state = self._state = State()
         options = state.options
         options.noise = noise
+        options.saturation = math.inf
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
         options.floor = max(threshold - 0.5, 0.0)
         options.free_gain = free_gain
