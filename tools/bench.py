@@ -32,6 +32,7 @@ CAMPAIGNS = {
     "faults": "every fault on the emulated hand and what comes of it, an hour for 100 trials each",
 }
 PAGE = ("contact", "estimator", "tick", "servos", "hil", "wakeup", "startup")
+_PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤")
 _CAMPAIGN = "campaign"
 
 
@@ -95,10 +96,6 @@ def run(arguments: argparse.Namespace) -> int:
             page += _key_figures(tables, module.PAGE)
     if page:
         print(Table("", page))
-    if arguments.plot:
-        from softfinger.tools.benchmarks.picture import draw
-
-        draw(drawn, arguments.plot)
     if arguments.json:
         content = {
             "machine": platform.machine(),
@@ -108,6 +105,10 @@ def run(arguments: argparse.Namespace) -> int:
         }
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
+    if arguments.plot:
+        from softfinger.tools.benchmarks.picture import draw
+
+        draw(drawn, arguments.plot)
     if old:
         print(slower(old, rows))
     return 1 if failed else 0
@@ -150,7 +151,8 @@ def _read(path: Path) -> list[Row]:
 def _key_figures(tables: list[Table], chosen: dict[str, tuple[str, ...]]) -> list[Row]:
     """Rows of the page: those whose names begin as ``chosen`` has it, by the table's title."""
     return [
-        row | {"name": f"{table.title}: {row['name']}"}
+        {"name": f"{table.title}: {row['name']}"}
+        | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.error) if key}
         for table in tables
         for row in table.rows
         if str(row["name"]).startswith(chosen.get(table.title, ()))

@@ -29,14 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, Page]:
     """All figures by name."""
-    from softfinger.tools.paper import experiment_pages, material_page, model_pages, run_pages
+    from softfinger.tools.paper import experiment_pages, model_pages, run_pages
 
-    found = {
-        "fig3": material_page.PAGE,
-        **model_pages.PAGES,
-        **experiment_pages.PAGES,
-        **run_pages.PAGES,
-    }
+    found = {**model_pages.PAGES, **experiment_pages.PAGES, **run_pages.PAGES}
     return {name: found[name] for name in NAMES}
 
 
@@ -70,7 +65,6 @@ def write(chosen: dict[str, Page], folder: Path) -> None:
         with style.settings():
             for name, page in chosen.items():
                 figure = style.new_figure(*page.size)
-                figure.suptitle(page.title, fontsize=10)
                 page.draw(figure, numbers[name])
                 style.save(figure, folder / f"{name}.png")
                 print(folder / f"{name}.png")

@@ -36,13 +36,14 @@ TIP = Fingertip(radius=0.020)
 MODULUS = 0.304e6  # [Pa]
 CONSTANT, LAW = Material.constant(MODULUS), Material.table_i()
 ERROR = "largest relative error"
-# How a representation is called; times are ns a call or, in a batch, a point.
+# How a representation is called: calls that overlap; calls of which each waits for the last; with
+# floats; with arrays. Times are ns a call or, in a batch, a point.
 MODES = {
-    "loop": "contact, calls in a compiled loop, which overlap",
-    "chain": "contact, calls in a compiled loop, each waits for the last",
-    "kernel": "contact, the kernel called from Python with floats",
-    "python": "contact, Python API with floats",
-    "batch": "contact, Python API with arrays, a point",
+    "loop": "contact, compiled loop",
+    "chain": "contact, compiled chain",
+    "kernel": "contact, kernel from Python",
+    "python": "contact, Python API",
+    "batch": "contact, Python API, batch",
 }
 _CLOSED = "closed form, constant E, "
 PAGE = {

@@ -47,7 +47,7 @@ from softfinger.tools.benchmarks.report import Table, figure
 FloatArray = NDArray[np.float64]
 Truth: TypeAlias = tuple[float, float, float]  # d [m], tilt_x, tilt_y [rad]
 
-TITLE = "estimator, 44 × 44 cells, d = 4 mm, 12°, 0.2 % noise"
+TITLE = "estimator, 44 × 44 cells, 4 mm, 12°"
 D_ERROR, TILT_ERROR = "d RMS µm", "tilt RMS °"
 PAGE = {
     TITLE: (

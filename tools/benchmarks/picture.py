@@ -14,6 +14,7 @@ def draw(tables: list[Table], path: Path) -> None:
     drawn = [table for table in tables if table.error]
     columns = min(len(drawn), 3)
     rows = math.ceil(len(drawn) / columns)
+    looks: dict[str, int] = {}  # of each kind, the same in all panels
     with style.settings():
         figure = style.new_figure(3.6 * columns + 0.8, 3.4 * rows + 0.6)
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -22,9 +23,12 @@ def draw(tables: list[Table], path: Path) -> None:
         for axes, table in zip(panels, drawn, strict=False):
             kinds: dict[str, list[Row]] = {}
             for row in table.rows:
-                if row.get(table.error, math.nan) > 0.0:  # no NaN
+                if "median" not in row:  # a bound
+                    axes.axvline(row[table.error], color=style.GREY, linestyle="--", linewidth=1.0)
+                elif row.get(table.error, math.nan) > 0.0:  # no NaN
                     kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
-            for k, (kind, chosen) in enumerate(kinds.items()):
+            for kind, chosen in kinds.items():
+                k = looks.setdefault(kind, len(looks))
                 axes.plot(
                     [row[table.error] for row in chosen],
                     [row["median"] for row in chosen],

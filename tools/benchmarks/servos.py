@@ -26,7 +26,7 @@ from softfinger.tools.benchmarks.interleaved import timed
 from softfinger.tools.benchmarks.report import Row, Table, figure
 from softfinger.tools.benchmarks.rigs import emulator
 
-TITLE = "read + write of two servos over a pty"
+TITLE = "read + write of two servos"
 PAGE = {TITLE: ("unpaced", "2 Mbaud: cycle")}
 PROFILE = """\
 tactile.backend = "none"

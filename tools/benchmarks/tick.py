@@ -10,7 +10,7 @@ from softfinger.tools.benchmarks.interleaved import timed
 from softfinger.tools.benchmarks.report import Row, Table, figure
 from softfinger.tools.benchmarks.rigs import can, hold, virtual_daemon
 
-TITLE = "tick, two fingers holding, back to back"
+TITLE = "tick, back to back"
 PAGE = {TITLE: ("pipeline alone, nobody subscribed", "one second")}
 _SUBSCRIBERS: dict[tuple[bytes, ...], str] = {
     (): "nobody subscribed",

@@ -6,7 +6,8 @@ The measured points are printed in the paper as pictures only and are not reprod
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,12 +16,12 @@ from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
-from softfinger.tools.paper.sheets import Erratum, FloatArray, Page, Sheet, sheet
-from softfinger.tools.paper.style import GREY, INK, KINDS, caption, label_ends, ordered
+from softfinger.tools.paper.model_pages import CIRCLE, DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
+from softfinger.tools.paper.sheets import Curve, Erratum, FloatArray, Page, Panel, Sheet, sheet
+from softfinger.tools.paper.style import GREY, INK, KINDS, ordered
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
 
 PITCH = 0.058 / 44  # [m]
 GRID = SensorGrid(rows=44, cols=44, pitch=PITCH)
@@ -58,44 +59,32 @@ def compression() -> tuple[Sheet, ...]:
     return (sheet("fig7", *columns),)
 
 
-def draw_compression(figure: Figure, sheets: Sequence[Sheet]) -> None:
-    """Panels (a) to (g), one an angle, and (h) with all of them."""
-    (numbers,) = sheets
-    panels = figure.subplots(2, 4, sharex=True, sharey=True).ravel()
+def _one_tilt(tilt: int, numbers: Sheet) -> Iterator[Curve]:
     d = numbers["d"]
-    styles = ordered(len(TILTS))
-    for letter, axes, tilt in zip("abcdefg", panels, TILTS, strict=False):
-        axes.plot(d, numbers[f"F at {tilt} deg"], color=KINDS[0], label="E = 0.304 MPa")
-        axes.plot(
-            d[::8],
-            numbers[f"F through the sensor at {tilt} deg"][::8],
-            "o",
-            ms=4,
-            mfc="none",
-            mec=INK,
-            label="through 44 × 44 cells",
+    yield Curve(d, numbers[f"F at {tilt} deg"], {"color": KINDS[0]}, "E = 0.304 MPa")
+    sensed = numbers[f"F through the sensor at {tilt} deg"]
+    yield Curve(d[::8], sensed[::8], CIRCLE | {"ms": 4, "mec": INK}, "through 44 × 44 cells")
+    law = numbers[f"F of Table I's law at {tilt} deg"]
+    yield Curve(d, law, {"linestyle": "--", "color": KINDS[1]}, "Table I's law")
+
+
+def _all_tilts(numbers: Sheet) -> Iterator[Curve]:
+    for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
+        yield Curve(numbers["d"], numbers[f"F at {tilt} deg"], style, end=f"{tilt}°")
+
+
+def _compression_panels() -> Iterator[Panel]:
+    """Panels (a) to (g), one an angle, and (h) with all of them."""
+    for k, (letter, tilt) in enumerate(zip("abcdefg", TILTS, strict=True)):
+        yield Panel(
+            partial(_one_tilt, tilt),
+            "displacement d [mm]" if k >= 4 else "",
+            "" if k % 4 else "total elastic force F [N]",
+            f"({letter}) {tilt}°",
+            legend=None if k else {"loc": "upper left"},
         )
-        axes.plot(
-            d,
-            numbers[f"F of Table I's law at {tilt} deg"],
-            "--",
-            color=KINDS[1],
-            label="Table I's law",
-        )
-        axes.set_title(f"({letter}) {tilt}°")
-    last = panels[-1]
-    ends = []
-    for tilt, style in zip(TILTS, styles, strict=True):
-        last.plot(d, numbers[f"F at {tilt} deg"], **style)
-        ends.append(float(numbers[f"F at {tilt} deg"][-1]))
-    last.set(title="(h) all", xlim=(0, 8.3), ylim=(0, 82), xticks=range(0, 9, 2))
-    label_ends(last, 8.0, ends, [f"{tilt}°" for tilt in TILTS], gap=0.07)
-    for axes in panels[4:]:
-        axes.set_xlabel("displacement d [mm]")
-    for axes in panels[::4]:
-        axes.set_ylabel("total elastic force F [N]")
-    panels[0].legend(loc="upper left")
-    _caption(figure, "fig7")
+    more = {"xlim": (0, 8.3), "ylim": (0, 82), "xticks": range(0, 9, 2)}
+    yield Panel(_all_tilts, "displacement d [mm]", "", "(h) all", more, gap=0.07)
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
@@ -129,52 +118,37 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
     return sheet("fig10a", *first), sheet("fig10b", *second)
 
 
-def draw_tilt_and_roll(figure: Figure, sheets: Sequence[Sheet]) -> None:
-    """(a) the rotation, in newton; (b) the rolling, over the force at 0°."""
-    rotation, rolling = sheets
-    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
-    theta = rotation["theta"]
-    ends = []
+def _rotation(rotation: Sheet, _: Sheet) -> Iterator[Curve]:
+    thin = {"color": GREY, "linewidth": 0.7}
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
-        force = rotation[f"F, d up to {d} mm"]
-        left.plot(theta, force, **style)
-        left.plot(theta, rotation[f"F at d = {d} mm"], color=GREY, linewidth=0.7)
-        ends.append(float(force[-1]))
-    left.invert_xaxis()
-    left.set(
-        xlabel="relative angle θ [deg]",
-        ylabel="total elastic force F [N]",
-        title="(a) the finger rotates",
-        xlim=(0, TILTED),
-        ylim=(0, 76),
-    )
-    label_ends(left, TILTED, ends, [f"to {d} mm" for d in DEPTHS], gap=0.06)
-    left.plot([], [], "-", color=INK, label="d rises from first touch")
-    left.plot([], [], "-", color=GREY, linewidth=0.7, label="d held at its last value")
-    left.legend(loc="upper left")
+        yield Curve(rotation["theta"], rotation[f"F, d up to {d} mm"], style, end=f"to {d} mm")
+        yield Curve(rotation["theta"], rotation[f"F at d = {d} mm"], thin)
+    yield Curve([], [], {"color": INK}, "d rises from first touch")
+    yield Curve([], [], thin, "d held at its last value")
 
+
+def _rolling(_: Sheet, rolling: Sheet) -> Iterator[Curve]:
     theta = rolling["theta"]
-    ratio = rolling["F/F(0) at d = 4 mm"]
-    right.plot(theta, ratio, color=INK, label="constant E, every d: 1/cos θ")
-    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
-        law = rolling[f"F/F(0) of Table I's law at d = {d} mm"]
-        if d in (DEPTHS[0], DEPTHS[-1]):
-            right.plot(
-                theta, law, **(style | {"linewidth": 1.1}), label=f"Table I's law, d = {d} mm"
-            )
-    radial = rolling["F of radial springs at d = 4 mm"]
-    right.plot(
-        theta,
-        radial / radial[theta == 0.0],
-        color=KINDS[1],
-        linestyle=":",
-        label="radial springs: flat",
+    yield Curve(
+        theta, rolling["F/F(0) at d = 4 mm"], {"color": INK}, "constant E, every d: 1/cos θ"
     )
-    right.plot(0.0, 1.0, "v", ms=7, color=INK, label="minimum at 0°")
+    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+        if d in (DEPTHS[0], DEPTHS[-1]):
+            law = rolling[f"F/F(0) of Table I's law at d = {d} mm"]
+            yield Curve(theta, law, style | {"linewidth": 1.1}, f"Table I's law, d = {d} mm")
+    radial = rolling["F of radial springs at d = 4 mm"]
+    dotted = {"color": KINDS[1], "linestyle": ":"}
+    yield Curve(theta, radial / radial[theta == 0.0], dotted, "radial springs: flat")
+    least = {"marker": "v", "ms": 7, "color": INK, "linestyle": "none"}
+    yield Curve(0.0, 1.0, least, "minimum at 0°")
+
+
+def _path(axes: Axes, _: Sheet, rolling: Sheet) -> None:
+    theta, ratio = rolling["theta"], rolling["F/F(0) at d = 4 mm"]
     for x, side in ((TILTED, "right"), (ROLLED, "left")):
         value = float(ratio[np.argmin(np.abs(theta - x))])
-        right.plot(x, value, "o", ms=4.5, color=INK)
-        right.annotate(
+        axes.plot(x, value, "o", ms=4.5, color=INK)
+        axes.annotate(
             f"{x:g}°: {value:.4f}".replace("-", "−"),
             (x, value),
             (6 if side == "left" else -6, -3),
@@ -182,33 +156,19 @@ def draw_tilt_and_roll(figure: Figure, sheets: Sequence[Sheet]) -> None:
             ha=side,
             fontsize=7.5,
         )
-    right.annotate(
-        "", (4.2, 1.0135), (-4.8, 1.0135), arrowprops={"arrowstyle": "->", "lw": 0.8, "color": GREY}
-    )
-    right.text(-0.3, 1.0140, "the object rolls", ha="center", fontsize=7.5, color=GREY)
-    right.set(
-        xlabel="relative angle θ [deg]",
-        ylabel="F(θ)/F(0) at equal d",
-        title="(b) then the object rolls by 20.7°",
-        xlim=(-24, 18),
-        ylim=(0.9975, 1.038),
-    )
-    right.legend(loc="upper center", ncols=2, columnspacing=1.0)
-    _caption(figure, "fig10")
-
-
-def _caption(figure: Figure, name: str) -> None:
-    page = PAGES[name]
-    lines = [f"Erratum, {each.place}: {each.holds}" for each in page.errata]
-    caption(figure, [*lines, *page.notes])
+    arrow = {"arrowstyle": "->", "lw": 0.8, "color": GREY}
+    axes.annotate("", (4.2, 1.0135), (-4.8, 1.0135), arrowprops=arrow)
+    axes.text(-0.3, 1.0140, "the object rolls", ha="center", fontsize=7.5, color=GREY)
 
 
 PAGES = {
     "fig7": Page(
-        title="Fig. 7: translational contact, force over the displacement at each angle",
-        size=(7.6, 5.2),
-        sheets=compression,
-        draw=draw_compression,
+        "Fig. 7: translational contact, force over the displacement at each angle",
+        (7.6, 5.2),
+        compression,
+        tuple(_compression_panels()),
+        rows=2,
+        layout={"sharex": True, "sharey": True},
         errata=(
             Erratum(
                 "IV-A",
@@ -224,10 +184,30 @@ PAGES = {
         ),
     ),
     "fig10": Page(
-        title="Fig. 10: rotational and rolling contact",
-        size=(7.6, 4.3),
-        sheets=tilt_and_roll,
-        draw=draw_tilt_and_roll,
+        "Fig. 10: rotational and rolling contact",
+        (7.6, 4.3),
+        tilt_and_roll,
+        (
+            Panel(
+                _rotation,
+                "relative angle θ [deg]",
+                "total elastic force F [N]",
+                "(a) the finger rotates",
+                more={"xlim": (0, TILTED), "ylim": (0, 76)},
+                legend={"loc": "upper left"},
+                gap=0.06,
+            ),
+            Panel(
+                _rolling,
+                "relative angle θ [deg]",
+                "F(θ)/F(0) at equal d",
+                "(b) then the object rolls by 20.7°",
+                more={"xlim": (-24, 18), "ylim": (0.9975, 1.038)},
+                legend={"loc": "upper center", "ncols": 2, "columnspacing": 1.0},
+                annotate=_path,
+            ),
+        ),
+        layout={"width_ratios": (1.0, 1.25)},
         notes=(
             "Negative angles are those that the finger's rotation makes. The paper gives neither d "
             "nor the distance of the finger's root: four depths are shown, and in (a) d grows from "

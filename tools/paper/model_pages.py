@@ -1,35 +1,113 @@
-"""Figs. 4 and 5: force and energy over the tilt and over the displacement, for the paper's tip.
+"""Figs. 3 to 5 and Table I: the material's law; force and energy over tilt and displacement.
 
-Lines are the closed forms; markers are the paper's double integrals, evaluated numerically.
+In Figs. 4 and 5 lines are the closed forms; markers are the paper's double integrals, evaluated
+numerically.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softfinger.kinematics.contact.closed_form import Fingertip, closed_forms
-from softfinger.kinematics.contact.material import TABLE_I_MAXIMUM
+from softfinger.kinematics.contact.material import (
+    TABLE_I_MAXIMUM,
+    TABLE_I_MODULUS,
+    TABLE_I_STRAIN,
+    Material,
+)
 from softfinger.tools.paper.integrals import double_integrals
-from softfinger.tools.paper.sheets import Erratum, FloatArray, Page, Sheet, sheet
-from softfinger.tools.paper.style import GREY, INK, caption, label_ends, ordered
+from softfinger.tools.paper.sheets import (
+    Curve,
+    Erratum,
+    FloatArray,
+    Page,
+    Panel,
+    Sheet,
+    sheet,
+    summary,
+)
+from softfinger.tools.paper.style import GREY, INK, KINDS, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 TIP = Fingertip(radius=0.020)
 MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
 MILLI = 1e-3
+MPA = 1e-6
+DEPTHS = (2, 4, 6, 8)  # mm
+TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
+CIRCLE: dict[str, Any] = {"marker": "o", "linestyle": "none", "mfc": "none"}
 
 Numbers = FloatArray | np.float64
 
-DEPTHS = (2, 4, 6, 8)  # mm
-TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
+
+# Fig. 3 and Table I
+
+
+def _tangent(material: Material, strain: FloatArray) -> FloatArray:
+    """Tangent modulus dσ/dε [Pa]."""
+    slope = [j * float(value) for j, value in enumerate(material.coefficients, 1)]
+    return np.asarray(np.polynomial.polynomial.polyval(strain, slope), dtype=np.float64)
+
+
+def law() -> tuple[Sheet, ...]:
+    """The law over strain, and Table I with the law at its strains."""
+    material = Material.table_i()
+    strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
+    curve = sheet(
+        "fig3",
+        ("strain", "%", np.arange(101.0)),
+        ("stress", "MPa", material.stress(strain) * MPA),
+        ("modulus", "MPa", _tangent(material, strain) * MPA),
+        ("stress at constant 0.304 MPa", "MPa", TABLE_I_MAXIMUM * strain * MPA),
+    )
+    table = sheet(
+        "table_i",
+        ("entry", "", ["Min", *(f"{100.0 * each:g} %" for each in nodes[1:]), "Max"]),
+        ("strain", "%", [*(100.0 * nodes), np.nan]),
+        ("modulus in the paper", "MPa", np.array([*TABLE_I_MODULUS, TABLE_I_MAXIMUM]) * MPA),
+        ("modulus of the law", "MPa", [*(_tangent(material, nodes) * MPA), np.nan]),
+    )
+    return curve, table
+
+
+def _stress(curve: Sheet, _: Sheet) -> Iterator[Curve]:
+    blue, orange = {"color": KINDS[0]}, {"color": KINDS[1], "linestyle": "--"}
+    yield Curve(curve["strain"], curve["stress"], blue, "law through Table I")
+    constant = curve["stress at constant 0.304 MPa"]
+    yield Curve(curve["strain"], constant, orange, "constant modulus, 0.304 MPa")
+
+
+def _slope(curve: Sheet, table: Sheet) -> Iterator[Curve]:
+    yield Curve(curve["strain"], curve["modulus"], {"color": KINDS[0]}, "slope of the law")
+    look = {"marker": "o", "linestyle": "none", "color": "white", "mec": KINDS[0], "mew": 1.4}
+    yield Curve(table["strain"], table["modulus in the paper"], look, "Table I")
+
+
+def _entries(axes: Axes, curve: Sheet, table: Sheet) -> None:
+    measured = table["modulus in the paper"]
+    axes.axhline(measured[-1], color=KINDS[1], linestyle="--", linewidth=1.2)
+    axes.text(1, measured[-1] - 0.004, "Max, beyond 100 %: the paper's E", va="top", fontsize=7.5)
+    for name, x, y in zip(table["entry"], table["strain"], measured, strict=True):
+        if np.isfinite(x):
+            axes.annotate(
+                f"{y:.3f}" + (" (Min)" if name == "Min" else ""),
+                (x, y),
+                (-2, -16) if name == "Min" else (-7, 2) if x == 100.0 else (4, -11),
+                textcoords="offset points",
+                ha="right" if x == 100.0 else "left",
+                fontsize=7.5,
+                color=GREY,
+            )
+
+
+# Figs. 4 and 5
 
 
 @dataclass(frozen=True)
@@ -49,8 +127,7 @@ class Quantity:
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
         """Closed form in the figure's unit; d in mm, θ in degrees."""
-        forms = closed_forms(MODULUS, d * MILLI, np.radians(theta))
-        return (forms.force, forms.energy)[self.row] * self.scale
+        return closed_forms(MODULUS, d * MILLI, np.radians(theta))[self.row] * self.scale
 
     def integral(self, d: Numbers, theta: Numbers) -> FloatArray:
         """The paper's double integral in the figure's unit; d in mm, θ in degrees."""
@@ -60,6 +137,23 @@ class Quantity:
     def at_zero_tilt(self, d: Numbers) -> FloatArray:
         """The paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
         return self.straight * MODULUS * np.asarray(d * MILLI) ** self.exponent * self.scale
+
+    def most(self, tilt: float) -> float:
+        """At 8 mm and this tilt [degrees], in the figure's unit."""
+        cosine = np.cos(np.radians(tilt)) ** (self.exponent - 1)
+        return float(self.at_zero_tilt(np.float64(8.0)) / cosine)
+
+    @property
+    def axis(self) -> str:
+        """The axis's label."""
+        return f"{self.label} {self.symbol} [{self.unit}]"
+
+    def columns(self, d: Numbers, theta: Numbers, at: str) -> list[tuple[str, str, FloatArray]]:
+        """Columns of the closed form and of the double integral."""
+        return [
+            (f"{self.symbol} {at}", self.unit, self.closed(d, theta)),
+            (f"{self.symbol} by eq. {self.equation} {at}", self.unit, self.integral(d, theta)),
+        ]
 
 
 FORCE = Quantity("F", "total elastic force", "N", 1.0, 0, 2, 3, "πEd²", "1/cos θ", np.pi)
@@ -73,13 +167,7 @@ def over_tilt(name: str, quantity: Quantity) -> tuple[Sheet, ...]:
     theta = np.arange(-50, 51) / 2.0
     columns: list[tuple[str, str, FloatArray]] = [("theta", "deg", theta)]
     for d in DEPTHS:
-        at = f"at d = {d} mm"
-        closed = quantity.closed(np.float64(d), theta)
-        columns.append((f"{quantity.symbol} {at}", quantity.unit, closed))
-        integral = quantity.integral(np.float64(d), theta)
-        columns.append(
-            (f"{quantity.symbol} by eq. {quantity.equation} {at}", quantity.unit, integral)
-        )
+        columns += quantity.columns(np.float64(d), theta, f"at d = {d} mm")
     return (sheet(name, *columns),)
 
 
@@ -93,126 +181,103 @@ def over_depth(name: str, quantity: Quantity) -> tuple[Sheet, ...]:
     columns: list[tuple[str, str, FloatArray]] = [("d", "mm", d)]
     rows = []
     for tilt in TILTS:
-        theta = np.float64(tilt)
-        closed, integral = quantity.closed(d, theta), quantity.integral(d, theta)
+        theta, at = np.float64(tilt), f"at {tilt} deg"
+        pair = quantity.columns(d, theta, at)
+        integral = pair[1][2]
         factor = np.divide(integral, power, out=np.full_like(d, np.nan), where=d > 0)
-        at = f"at {tilt} deg"
-        columns.append((f"{quantity.symbol} {at}", quantity.unit, closed))
-        columns.append(
-            (f"{quantity.symbol} by eq. {quantity.equation} {at}", quantity.unit, integral)
-        )
-        columns.append((f"factor {at}", "1", factor))
+        columns += [*pair, (f"factor {at}", "1", factor)]
         exponent = np.polyfit(np.log(d[1:]), np.log(integral[1:]), 1)[0]
         cosine = np.cos(np.radians(theta)) ** (1 - quantity.exponent)
         rows.append((tilt, exponent, factor[-1], cosine))
-    exponents = np.array(rows, dtype=np.float64)
-    return (
-        sheet(name, *columns),
-        sheet(
-            f"{name}_exponents",
-            ("theta", "deg", exponents[:, 0]),
-            ("fitted exponent of d", "1", exponents[:, 1]),
-            ("fitted factor", "1", exponents[:, 2]),
-            (f"factor {quantity.prefactor}", "1", exponents[:, 3]),
-        ),
-    )
+    heads = [("theta", "deg"), ("fitted exponent of d", "1"), ("fitted factor", "1")]
+    heads.append((f"factor {quantity.prefactor}", "1"))
+    return sheet(name, *columns), summary(f"{name}_exponents", heads, rows)
 
 
-def draw_over_tilt(quantity: Quantity, figure: Figure, sheets: Sequence[Sheet]) -> None:
-    """One panel: curves over θ, integrals as markers, the minimum marked."""
-    (numbers,) = sheets
-    axes = figure.subplots()
+def _key(quantity: Quantity) -> Iterator[Curve]:
+    yield Curve([], [], {"color": INK}, "closed form")
+    yield Curve([], [], CIRCLE | {"ms": 4, "mec": INK}, f"eq. {quantity.equation}")
+
+
+def _tilt_curves(quantity: Quantity, numbers: Sheet) -> Iterator[Curve]:
     theta = numbers["theta"]
-    ends = []
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         closed = numbers[f"{quantity.symbol} at d = {d} mm"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at d = {d} mm"]
-        axes.plot(theta, closed, **style)
-        axes.plot(
-            theta[::10], integral[::10], "o", ms=4, mfc="none", mec=style["color"], clip_on=False
-        )
-        axes.plot(0.0, closed[theta == 0.0], "v", ms=6, color=style["color"])
-        ends.append(float(closed[-1]))
-    axes.set(xlabel="θ [deg]", ylabel=f"{quantity.label} {quantity.symbol} [{quantity.unit}]")
-    axes.set_xlim(-25, 25)
-    axes.set_ylim(0, 1.16 * max(ends))
-    label_ends(axes, 25.0, ends, [f"d = {d} mm" for d in DEPTHS])
-    _key(axes, quantity, minimum=True)
-    _caption(figure, quantity, "a")
+        yield Curve(theta, closed, style, end=f"d = {d} mm")
+        look = CIRCLE | {"ms": 4, "mec": style["color"], "clip_on": False}
+        yield Curve(theta[::10], integral[::10], look)
+        least = {"marker": "v", "ms": 6, "color": style["color"]}
+        yield Curve(0.0, closed[theta == 0.0], least)
+    yield from _key(quantity)
+    look = {"marker": "v", "ms": 6, "color": INK, "linestyle": "none"}
+    yield Curve([], [], look, "minimum")
 
 
-def draw_over_depth(quantity: Quantity, figure: Figure, sheets: Sequence[Sheet]) -> None:
-    """Two panels: curves over d as in the paper, and their factor to the power, which is flat."""
-    numbers, exponents = sheets
-    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
+def _depth_curves(quantity: Quantity, numbers: Sheet, _: Sheet) -> Iterator[Curve]:
     d = numbers["d"]
-    ends, factors = [], []
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
-        closed = numbers[f"{quantity.symbol} at {tilt} deg"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at {tilt} deg"]
-        factor = numbers[f"factor at {tilt} deg"]
-        left.plot(d, closed, **style)
-        left.plot(
-            d[10::10], integral[10::10], "o", ms=3.5, mfc="none", mec=style["color"], clip_on=False
-        )
-        right.plot(d[1:], factor[1:], **style)
-        ends.append(float(closed[-1]))
-        factors.append(float(factor[-1]))
-    left.set(
-        xlabel="displacement d [mm]",
-        ylabel=f"{quantity.label} {quantity.symbol} [{quantity.unit}]",
-        xlim=(0, 8),
-    )
-    left.set_ylim(0, 1.12 * max(ends))
-    label_ends(left, 8.0, ends, [f"{tilt}°" for tilt in TILTS])
-    left.annotate(
+        yield Curve(d, numbers[f"{quantity.symbol} at {tilt} deg"], style, end=f"{tilt}°")
+        look = CIRCLE | {"ms": 3.5, "mec": style["color"], "clip_on": False}
+        yield Curve(d[10::10], integral[10::10], look)
+    yield from _key(quantity)
+
+
+def _straight(quantity: Quantity, axes: Axes, numbers: Sheet, _: Sheet) -> None:
+    axes.annotate(
         f"continuous line:\n{quantity.symbol}(d, 0) = {quantity.power}",
         (6.0, float(numbers[f"{quantity.symbol} at 0 deg"][60])),
-        (5.4, 0.1 * max(ends)),
+        (5.4, 0.1 * quantity.most(30.0)),
         fontsize=7.5,
         color=INK,
         arrowprops={"arrowstyle": "->", "lw": 0.6, "color": GREY},
     )
-    _key(left, quantity, minimum=False)
-    right.set(
-        xlabel="displacement d [mm]",
-        ylabel=f"{quantity.symbol} by eq. {quantity.equation} over {quantity.power}",
-        title=f"flat: the exponent is exactly {quantity.exponent}",
-        xlim=(0, 8),
-    )
-    label_ends(
-        right,
-        8.0,
-        factors,
-        [f"{t}°: {f:.3f}" for t, f in zip(TILTS, factors, strict=True)],
-    )
-    fitted = exponents["fitted exponent of d"]
-    right.text(
-        0.03,
-        0.94,
-        f"exponents fitted to the integrals:\n{quantity.exponent} ± "
-        f"{np.max(np.abs(fitted - quantity.exponent)):.0e}",
-        transform=right.transAxes,
-        va="top",
-        fontsize=7.5,
-    )
-    _caption(figure, quantity, "b")
 
 
-def _key(axes: Axes, quantity: Quantity, minimum: bool) -> None:
-    axes.plot([], [], "-", color=INK, label="closed form")
-    axes.plot(
-        [], [], "o", ms=4, mfc="none", mec=INK, linestyle="none", label=f"eq. {quantity.equation}"
+def _factors(numbers: Sheet, _: Sheet) -> Iterator[Curve]:
+    for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
+        factor = numbers[f"factor at {tilt} deg"]
+        yield Curve(numbers["d"][1:], factor[1:], style, end=f"{tilt}°: {factor[-1]:.3f}")
+
+
+def _fitted(quantity: Quantity, axes: Axes, _: Sheet, exponents: Sheet) -> None:
+    off = np.max(np.abs(exponents["fitted exponent of d"] - quantity.exponent))
+    text = f"exponents fitted to the integrals:\n{quantity.exponent} ± {off:.0e}"
+    axes.text(0.03, 0.94, text, transform=axes.transAxes, va="top", fontsize=7.5)
+
+
+def _tilt_page(name: str, title: str, height: float, quantity: Quantity, **more: Any) -> Page:
+    panel = Panel(
+        partial(_tilt_curves, quantity),
+        "θ [deg]",
+        quantity.axis,
+        more={"xlim": (-25, 25), "ylim": (0, 1.16 * quantity.most(25.0))},
+        legend={"loc": "upper center", "ncols": 3},
     )
-    if minimum:
-        axes.plot([], [], "v", ms=6, color=INK, linestyle="none", label="minimum")
-    axes.legend(loc="upper center" if minimum else "upper left", ncols=3 if minimum else 1)
+    return Page(title, (5.2, height), partial(over_tilt, name, quantity), (panel,), **more)
 
 
-def _caption(figure: Figure, quantity: Quantity, part: str) -> None:
-    page = PAGES[f"fig{4 if quantity is FORCE else 5}{part}"]
-    lines = [f"Erratum, {each.place}: {each.holds}" for each in page.errata]
-    caption(figure, [*lines, *page.notes])
+def _depth_page(name: str, title: str, quantity: Quantity, **more: Any) -> Page:
+    left = Panel(
+        partial(_depth_curves, quantity),
+        "displacement d [mm]",
+        quantity.axis,
+        more={"xlim": (0, 8), "ylim": (0, 1.12 * quantity.most(30.0))},
+        legend={"loc": "upper left"},
+        annotate=partial(_straight, quantity),
+    )
+    right = Panel(
+        _factors,
+        "displacement d [mm]",
+        f"{quantity.symbol} by eq. {quantity.equation} over {quantity.power}",
+        f"flat: the exponent is exactly {quantity.exponent}",
+        more={"xlim": (0, 8)},
+        annotate=partial(_fitted, quantity),
+    )
+    sheets = partial(over_depth, name, quantity)
+    layout = {"width_ratios": (1.15, 1.0)}
+    return Page(title, (7.4, 4.1), sheets, (left, right), layout=layout, **more)
 
 
 _CLOSED = Erratum(
@@ -224,19 +289,53 @@ _CLOSED = Erratum(
 _TIP = "Tip of radius 20 mm, E = 0.304 MPa, as in the paper."
 
 PAGES = {
-    "fig4a": Page(
-        title="Fig. 4a: total elastic force over the object's angle",
-        size=(5.2, 4.2),
-        sheets=partial(over_tilt, "fig4a", FORCE),
-        draw=partial(draw_over_tilt, FORCE),
+    "fig3": Page(
+        "Fig. 3 and Table I: stress-strain law of the tip's material",
+        (7.0, 3.6),
+        law,
+        (
+            Panel(
+                _stress,
+                "strain [%]",
+                "stress [MPa]",
+                "(b) stress-strain diagram",
+                legend={"loc": "upper left"},
+            ),
+            Panel(
+                _slope,
+                "strain [%]",
+                "modulus, slope of the curve [MPa]",
+                "Table I",
+                more={"ylim": (0.0, 0.33)},
+                legend={"loc": "lower right"},
+                annotate=_entries,
+            ),
+        ),
+        errata=(
+            Erratum(
+                "III-A",
+                "Young's modulus is comparatively large when the fingertip deforms a little, and "
+                "comparatively small unless it deforms largely",
+                "Table I's modulus rises with strain, from 0.135 to 0.304 MPa, so the text has it "
+                "both ways; E is a number to calibrate in compression, 0.304 MPa by default.",
+            ),
+        ),
+        notes=(
+            "The paper prints Table I's numbers alone; its plotted specimens are not reproduced.",
+        ),
+    ),
+    "fig4a": _tilt_page(
+        "fig4a",
+        "Fig. 4a: total elastic force over the object's angle",
+        4.2,
+        FORCE,
         errata=(_CLOSED,),
         notes=(_TIP,),
     ),
-    "fig4b": Page(
-        title="Fig. 4b: total elastic force over the displacement",
-        size=(7.4, 4.1),
-        sheets=partial(over_depth, "fig4b", FORCE),
-        draw=partial(draw_over_depth, FORCE),
+    "fig4b": _depth_page(
+        "fig4b",
+        "Fig. 4b: total elastic force over the displacement",
+        FORCE,
         errata=(
             Erratum(
                 "III-B",
@@ -248,11 +347,11 @@ PAGES = {
         ),
         notes=(_TIP,),
     ),
-    "fig5a": Page(
-        title="Fig. 5a: elastic potential energy over the object's angle",
-        size=(5.2, 4.4),
-        sheets=partial(over_tilt, "fig5a", ENERGY),
-        draw=partial(draw_over_tilt, ENERGY),
+    "fig5a": _tilt_page(
+        "fig5a",
+        "Fig. 5a: elastic potential energy over the object's angle",
+        4.4,
+        ENERGY,
         errata=(
             _CLOSED,
             Erratum(
@@ -266,11 +365,10 @@ PAGES = {
             "U − N d that has it.",
         ),
     ),
-    "fig5b": Page(
-        title="Fig. 5b: elastic potential energy over the displacement",
-        size=(7.4, 4.1),
-        sheets=partial(over_depth, "fig5b", ENERGY),
-        draw=partial(draw_over_depth, ENERGY),
+    "fig5b": _depth_page(
+        "fig5b",
+        "Fig. 5b: elastic potential energy over the displacement",
+        ENERGY,
         errata=(
             Erratum(
                 "III-B",

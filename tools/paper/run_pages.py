@@ -1,44 +1,28 @@
-"""Figs. 7, 8 and 10 run in simulation: the model, what was estimated, and the error.
-
-The runs are in `paper.runs`; this module makes their sheets and draws them.
-"""
+"""Figs. 7, 8 and 10 run in simulation (`paper.runs`): the model, what was estimated, the error."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Iterator
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softfinger.tools.paper import runs
-from softfinger.tools.paper.model_pages import DEPTHS, MILLI, TILTS
+from softfinger.tools.paper.model_pages import CIRCLE, DEPTHS, MILLI, TILTS
 from softfinger.tools.paper.runs import Run
-from softfinger.tools.paper.sheets import FloatArray, Page, Sheet, sheet
-from softfinger.tools.paper.style import GREY, INK, KINDS, caption, label_ends, ordered
+from softfinger.tools.paper.sheets import Curve, FloatArray, Page, Panel, Sheet, sheet, summary
+from softfinger.tools.paper.style import GREY, INK, KINDS, label_ends, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-_SURE = 1.0  # mm of displacement from which on relative errors are told
+_SURE = 1.0  # mm of displacement from which on relative errors are shown
 _DEEPEST_FORCE = 1e-6 * np.pi * runs.MODULUS * 8.0**2  # N at 8 mm, upright
 _ROLLED_AT = 4  # mm, where rotation ends and the path goes on
-
-
-@cache
-def _compression(tilt: int) -> Run:
-    return runs.compression(float(np.radians(tilt)))
-
-
-@cache
-def _rotation() -> Run:
-    return runs.rotation()
-
-
-@cache
-def _rolling(depth: int) -> Run:
-    return runs.rolling(depth * MILLI)
+_DOT: dict[str, Any] = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
+_PATH = {"xlim": (-12.5, 10.5)}
+_ANGLE = "relative angle θ [deg]"
 
 
 def _columns(run: Run, suffix: str, sign: float = 1.0) -> list[tuple[str, str, FloatArray]]:
@@ -59,26 +43,28 @@ def _rms(off: FloatArray) -> float:
     return float(np.sqrt(np.mean(off**2)))
 
 
+@cache
 def compression() -> tuple[Sheet, ...]:
     """One sheet an angle, and one with the errors beyond 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
-        run = _compression(tilt)
+        run = runs.compression(float(np.radians(tilt)))
         sheets.append(sheet(f"fig7_run_{tilt}deg", *_columns(run, "")))
         deep = run.d > _SURE * MILLI
-        seen = run.d[run.d_found > 0.0]
+        force = (run.force_found / np.maximum(run.force, 1e-9) - 1.0)[deep]
+        energy = (run.energy_found / np.maximum(run.energy, 1e-12) - 1.0)[deep]
         rows.append(
             (
                 tilt,
-                1e3 * float(seen[0]),
+                1e3 * float(run.d[run.d_found > 0.0][0]),
                 1e6 * _rms((run.d_found - run.d)[deep]),
                 _rms(np.degrees(run.theta_found - run.theta)[deep]),
-                100.0 * float((run.force_found / np.maximum(run.force, 1e-9) - 1.0)[deep].mean()),
-                100.0 * _rms((run.force_found / np.maximum(run.force, 1e-9) - 1.0)[deep]),
-                100.0 * _rms((run.energy_found / np.maximum(run.energy, 1e-12) - 1.0)[deep]),
+                100.0 * float(force.mean()),
+                100.0 * _rms(force),
+                100.0 * _rms(energy),
             )
         )
-    names = (
+    heads = (
         ("tilt", "deg"),
         ("d at the first estimate", "mm"),
         ("RMS error of d", "um"),
@@ -87,60 +73,49 @@ def compression() -> tuple[Sheet, ...]:
         ("RMS error of F", "%"),
         ("RMS error of U", "%"),
     )
-    errors = [
-        (name, unit, values)
-        for (name, unit), values in zip(names, zip(*rows, strict=True), strict=True)
-    ]
-    return (*sheets, sheet("fig7_run_errors", *errors))
+    return (*sheets, summary("fig7_run_errors", heads, rows))
 
 
-def draw_compression(figure: Figure, sheets: Sequence[Sheet]) -> None:
-    """Force over d at each angle, then the errors over d: of force, d and θ."""
-    panels = figure.subplots(2, 2).ravel()
-    styles = ordered(len(TILTS))
+def _forces(*sheets: Sheet) -> Iterator[Curve]:
+    for style, run in zip(ordered(len(TILTS)), sheets, strict=False):
+        yield Curve(run["d"], run["F"], style)
+        yield Curve(run["d estimated"][::6], run["F estimated"][::6], _DOT)
+    yield Curve([], [], {"color": INK}, "model")
+    yield Curve([], [], CIRCLE | {"ms": 3, "mec": INK}, "estimated from the frames")
+
+
+def _angles(axes: Axes, *_: Sheet) -> None:
     ends = [_DEEPEST_FORCE / float(np.cos(np.radians(tilt))) for tilt in TILTS]
-    for style, run in zip(styles, sheets, strict=False):
-        d, deep = run["d"], run["d"] > _SURE
-        panels[0].plot(d, run["F"], **style)
-        panels[0].plot(
-            run["d estimated"][::6],
-            run["F estimated"][::6],
-            "o",
-            ms=3,
-            mfc="none",
-            mec=INK,
-            mew=0.6,
-        )
-        line = style | {"linewidth": 0.9}
-        panels[1].plot(d[deep], 100.0 * (run["F estimated"][deep] / run["F"][deep] - 1.0), **line)
-        panels[2].plot(d[deep], 1e3 * (run["d estimated"] - run["d"])[deep], **line)
-        panels[3].plot(d[deep], (run["theta estimated"] - run["theta"])[deep], **line)
-    panels[0].plot([], [], "-", color=INK, label="model")
-    panels[0].plot([], [], "o", ms=3, mfc="none", mec=INK, label="estimated from the frames")
-    panels[0].set(
-        xlim=(0, 8.6), ylim=(0, 78), ylabel="total elastic force F [N]", title="(a) force"
-    )
-    label_ends(panels[0], 8.0, ends, [f"{tilt}°" for tilt in TILTS], gap=0.07)
-    panels[0].legend(loc="upper left")
-    for axes, title, label in (
-        (panels[1], "(b) error of the force", "estimate over model − 1 [%]"),
-        (panels[2], "(c) error of the displacement", "estimate − truth [µm]"),
-        (panels[3], "(d) error of the angle", "estimate − truth [deg]"),
-    ):
-        axes.axhline(0.0, color=GREY, linewidth=0.7)
-        axes.set(xlim=(0, 8), ylabel=label, title=title)
-    for axes in panels:
-        axes.set_xlabel("displacement d [mm]")
-    _caption(figure, "fig7_run")
+    label_ends(axes, 8.0, ends, [f"{tilt}°" for tilt in TILTS], gap=0.07)
 
 
+def _errors(symbol: str, *sheets: Sheet) -> Iterator[Curve]:
+    """Of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
+    for style, run in zip(ordered(len(TILTS)), sheets, strict=False):
+        deep = run["d"] > _SURE
+        truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
+        if symbol == "F":
+            off = 100.0 * (found / truth - 1.0)
+        else:
+            off = (found - truth) * (1e3 if symbol == "d" else 1.0)
+        yield Curve(run["d"][deep], off, style | {"linewidth": 0.9})
+
+
+def _zero(axes: Axes, *_: Sheet) -> None:
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
+
+
+def _error_panel(symbol: str, title: str, label: str) -> Panel:
+    curves = partial(_errors, symbol)
+    return Panel(curves, "displacement d [mm]", label, title, {"xlim": (0, 8)}, annotate=_zero)
+
+
+@cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
     """The rotation, the rolling at each displacement, and where force and energy are least."""
-    first = sheet("fig10_run_rotation", *_columns(_rotation(), "", -1.0))
-    columns = []
-    least = []
+    columns, least = [], []
     for depth in DEPTHS:
-        run = _rolling(depth)
+        run = runs.rolling(depth * MILLI)
         columns += _columns(run, f" at {depth} mm", -1.0)
         theta = -np.degrees(run.theta)
         least.append(
@@ -153,7 +128,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
                 _rms(np.degrees(run.theta_found - run.theta)),
             )
         )
-    names = (
+    heads = (
         ("d", "mm"),
         ("angle of the least F estimated", "deg"),
         ("angle of the least U estimated", "deg"),
@@ -161,11 +136,11 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
         ("RMS error of U", "%"),
         ("RMS error of theta", "deg"),
     )
-    summary = [
-        (name, unit, values)
-        for (name, unit), values in zip(names, zip(*least, strict=True), strict=True)
-    ]
-    return first, sheet("fig10_run_rolling", *columns), sheet("fig10_run_minimum", *summary)
+    return (
+        sheet("fig10_run_rotation", *_columns(runs.rotation(), "", -1.0)),
+        sheet("fig10_run_rolling", *columns),
+        summary("fig10_run_minimum", heads, least),
+    )
 
 
 def _minimum(theta: FloatArray, values: FloatArray) -> float:
@@ -174,81 +149,60 @@ def _minimum(theta: FloatArray, values: FloatArray) -> float:
     return float(-0.5 * curve.coef[1] / curve.coef[2])
 
 
-def draw_tilt_and_roll(figure: Figure, sheets: Sequence[Sheet]) -> None:
-    """(a) the force, (b) the energy along the path at 4 mm, (c, d) rolling at every depth."""
-    rotation, rolling, least = sheets
-    panels = figure.subplots(2, 2).ravel()
-    suffix = f" at {_ROLLED_AT} mm"
-    for axes, symbol, label in (
-        (panels[0], "F", "total elastic force F [N]"),
-        (panels[1], "U", "elastic energy U [mJ]"),
+def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[Curve]:
+    """Along the path: the rotation, then the rolling at 4 mm."""
+    for part, at, color, name in (
+        (rotation, "", KINDS[1], "the finger rotates"),
+        (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),
     ):
-        for part, end, color, name in (
-            (rotation, "", KINDS[1], "the finger rotates"),
-            (rolling, suffix, KINDS[0], "then the object rolls"),
-        ):
-            axes.plot(part[f"theta{end}"], part[f"{symbol}{end}"], color=color, label=name)
-            axes.plot(
-                part[f"theta estimated{end}"][::4],
-                part[f"{symbol} estimated{end}"][::4],
-                "o",
-                ms=3,
-                mfc="none",
-                mec=INK,
-                mew=0.6,
-                label="estimated" if end else None,
-            )
-        axes.set(ylabel=label, xlim=(-12.5, 10.5))
-    panels[0].set_title("(a) force along the path")
-    panels[1].set_title("(b) energy along the path")
-    panels[1].legend(loc="lower right")
+        yield Curve(part[f"theta{at}"], part[f"{symbol}{at}"], {"color": color}, name)
+        theta, found = part[f"theta estimated{at}"], part[f"{symbol} estimated{at}"]
+        yield Curve(theta[::4], found[::4], _DOT, "estimated" if at else "")
+
+
+def _over_upright(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[Curve]:
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
-        end = f" at {depth} mm"
-        theta = rolling[f"theta{end}"]
-        _relative(panels[2], theta, rolling[f"U{end}"], rolling[f"U estimated{end}"], style)
-        off = rolling[f"theta estimated{end}"] - theta
-        panels[3].plot(theta, off, **(style | {"linewidth": 0.9}), label=f"d = {depth} mm")
-    panels[2].plot(0.0, 1.0, "v", ms=7, color=INK)
+        theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
+        level = float(np.interp(0.0, theta, model))
+        found = rolling[f"U estimated at {depth} mm"]
+        yield Curve(theta, found / level, style | {"linewidth": 0.9})
+        yield Curve(theta, model / level, {"color": GREY, "linewidth": 0.7})
+    yield Curve(0.0, 1.0, {"marker": "v", "ms": 7, "color": INK})
+
+
+def _least(axes: Axes, _: Sheet, rolling: Sheet, least: Sheet) -> None:
     angles = ", ".join(f"{each:.2f}°" for each in least["angle of the least U estimated"])
-    panels[2].set(
-        title="(c) energy while rolling, over U(0)",
-        ylabel="U(θ)/U(0)",
-        xlim=(-12.5, 10.5),
-        ylim=(0.955, 1.095),
-    )
-    panels[2].text(
-        -1.0, 1.084, f"least at {angles}".replace("-", "−"), ha="center", fontsize=7.5, color=INK
-    )
-    panels[3].axhline(0.0, color=GREY, linewidth=0.7)
-    panels[3].set(
-        title="(d) error of the angle while rolling",
-        ylabel="estimate − truth [deg]",
-        xlim=(-12.5, 10.5),
-    )
-    panels[3].legend(loc="lower right", ncols=2)
-    for axes in panels:
-        axes.set_xlabel("relative angle θ [deg]")
-    _caption(figure, "fig10_run")
+    text = f"least at {angles}".replace("-", "−")
+    axes.text(-1.0, 1.084, text, ha="center", fontsize=7.5, color=INK)
 
 
-def _relative(
-    axes: Axes, theta: FloatArray, model: FloatArray, found: FloatArray, style: dict[str, Any]
-) -> None:
-    level = float(np.interp(0.0, theta, model))
-    axes.plot(theta, found / level, **(style | {"linewidth": 0.9}))
-    axes.plot(theta, model / level, color=GREY, linewidth=0.7)
-
-
-def _caption(figure: Figure, name: str) -> None:
-    caption(figure, PAGES[name].notes)
+def _angle_errors(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[Curve]:
+    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+        theta = rolling[f"theta at {depth} mm"]
+        off = rolling[f"theta estimated at {depth} mm"] - theta
+        yield Curve(theta, off, style | {"linewidth": 0.9}, f"d = {depth} mm")
 
 
 PAGES = {
     "fig7_run": Page(
-        title="Fig. 7 run in simulation: compression to 8 mm, through sensor and estimator",
-        size=(7.6, 6.2),
-        sheets=compression,
-        draw=draw_compression,
+        "Fig. 7 run in simulation: compression to 8 mm, through sensor and estimator",
+        (7.6, 6.2),
+        compression,
+        (
+            Panel(
+                _forces,
+                "displacement d [mm]",
+                "total elastic force F [N]",
+                "(a) force",
+                more={"xlim": (0, 8.6), "ylim": (0, 78)},
+                legend={"loc": "upper left"},
+                annotate=_angles,
+            ),
+            _error_panel("F", "(b) error of the force", "estimate over model − 1 [%]"),
+            _error_panel("d", "(c) error of the displacement", "estimate − truth [µm]"),
+            _error_panel("theta", "(d) error of the angle", "estimate − truth [deg]"),
+        ),
+        rows=2,
         notes=(
             "The plant presses the object on the tip at 2 mm/s; 44 × 44 cells on 58 mm, 25 frames "
             "a second, noise of 0.5 % of E in each cell. Errors are shown from 1 mm on, each point "
@@ -257,10 +211,44 @@ PAGES = {
         ),
     ),
     "fig10_run": Page(
-        title="Figs. 8 to 10 run in simulation: the finger rotates 11.5°, the object rolls 20.7°",
-        size=(7.6, 6.2),
-        sheets=tilt_and_roll,
-        draw=draw_tilt_and_roll,
+        "Figs. 8 to 10 run in simulation: the finger rotates 11.5°, the object rolls 20.7°",
+        (7.6, 6.2),
+        tilt_and_roll,
+        (
+            Panel(
+                partial(_along, "F"),
+                _ANGLE,
+                "total elastic force F [N]",
+                "(a) force along the path",
+                _PATH,
+            ),
+            Panel(
+                partial(_along, "U"),
+                _ANGLE,
+                "elastic energy U [mJ]",
+                "(b) energy along the path",
+                _PATH,
+                legend={"loc": "lower right"},
+            ),
+            Panel(
+                _over_upright,
+                _ANGLE,
+                "U(θ)/U(0)",
+                "(c) energy while rolling, over U(0)",
+                _PATH | {"ylim": (0.955, 1.095)},
+                annotate=_least,
+            ),
+            Panel(
+                _angle_errors,
+                _ANGLE,
+                "estimate − truth [deg]",
+                "(d) error of the angle while rolling",
+                _PATH,
+                legend={"loc": "lower right", "ncols": 2},
+                annotate=_zero,
+            ),
+        ),
+        rows=2,
         notes=(
             "Angles with the paper's sign. Rotation: the servo turns the finger about a root 20.1 "
             "mm from the tip's centre, so that d goes from 0 to 4 mm; estimates are the daemon's, "

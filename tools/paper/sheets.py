@@ -1,10 +1,10 @@
-"""Sheets of numbers, each of which becomes one CSV file, and what a page of figures is."""
+"""What a figure is: sheets of numbers, each a CSV file, and the panels drawn from them."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.wire.own_files import write_text
+from softfinger.tools.paper.style import caption, label_ends
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
@@ -63,6 +65,12 @@ def sheet(name: str, *columns: tuple[str, str, ArrayLike]) -> Sheet:
     return Sheet(name, tuple(Column(title, unit, np.asarray(v)) for title, unit, v in columns))
 
 
+def summary(name: str, columns: Sequence[tuple[str, str]], rows: ArrayLike) -> Sheet:
+    """A sheet of numbers from (name, unit) of each column and its rows."""
+    values = np.asarray(rows, dtype=np.float64).T
+    return sheet(name, *((*column, each) for column, each in zip(columns, values, strict=True)))
+
+
 def _cell(value: Any) -> str:
     if isinstance(value, str):
         return value
@@ -79,15 +87,68 @@ class Erratum:
 
 
 @dataclass(frozen=True)
+class Curve:
+    """A line or a row of markers; ``end`` is written beside its last point."""
+
+    x: ArrayLike
+    y: ArrayLike
+    look: dict[str, Any]  # of matplotlib's plot
+    label: str = ""
+    end: str = ""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes of a figure: the curves by the page's sheets, and the words around them."""
+
+    curves: Callable[..., Iterable[Curve]]
+    xlabel: str
+    ylabel: str
+    title: str = ""
+    more: dict[str, Any] = field(default_factory=dict)  # of matplotlib's Axes.set
+    legend: dict[str, Any] | None = None
+    gap: float = 0.05  # between the curves' ends, of the axis
+    annotate: Callable[..., None] | None = None  # axes and sheets
+
+    def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
+        """Draw it."""
+        ended: list[tuple[float, float, str]] = []
+        for curve in self.curves(*sheets):
+            axes.plot(curve.x, curve.y, **curve.look, label=curve.label or None)
+            if curve.end:
+                ended.append((np.ravel(curve.x)[-1], float(np.ravel(curve.y)[-1]), curve.end))
+        axes.set(xlabel=self.xlabel, ylabel=self.ylabel, title=self.title, **self.more)
+        if ended:
+            right, ends, words = zip(*ended, strict=True)
+            label_ends(axes, right[0], ends, words, self.gap)
+        if self.annotate is not None:
+            self.annotate(axes, *sheets)
+        if self.legend is not None:
+            axes.legend(**self.legend)
+
+
+@dataclass(frozen=True)
 class Page:
-    """One figure: its numbers, how they are drawn, and what in the paper's version is mistaken."""
+    """One figure: its numbers, its panels, and what in the paper's version is mistaken."""
 
     title: str
     size: tuple[float, float]  # [inch]
     sheets: Callable[[], tuple[Sheet, ...]]
-    draw: Callable[[Figure, Sequence[Sheet]], None]
+    panels: tuple[Panel, ...]
+    rows: int = 1
+    layout: dict[str, Any] = field(default_factory=dict)  # of matplotlib's subplots
     errata: tuple[Erratum, ...] = ()
     notes: tuple[str, ...] = ()
+
+    def draw(self, figure: Figure, sheets: Sequence[Sheet]) -> None:
+        """Draw title, panels, errata and notes."""
+        figure.suptitle(self.title, fontsize=10)
+        columns = len(self.panels) // self.rows
+        every = figure.subplots(self.rows, columns, squeeze=False, **self.layout).ravel()
+        for axes, panel in zip(every, self.panels, strict=True):
+            panel.draw(axes, sheets)
+        lines = [f"Erratum, {each.place}: {each.holds}" for each in self.errata]
+        caption(figure, [*lines, *self.notes])
 
 
 def errata_sheet(pages: dict[str, Page]) -> Sheet:
