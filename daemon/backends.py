@@ -37,13 +37,23 @@ SERVOS = {
     "none": NONE,
 }
 TACTILE = {
-    "simulated": Backend("tactile.simulated:SimulatedTactile", metal=False, hand=True),
+    "simulated": Backend("simulation.sensor.simulated_tactile:SimulatedTactile", False, hand=True),
     "flexitac": Backend("tactile.flexitac:FlexiTac"),
     "glove": Backend("tactile.glove:Glove"),
     "cobs": Backend("tactile.cobs:Cobs"),
     "replay": Backend("tactile.replay:ReplayTactile", metal=False),
     "none": NONE,
 }
+
+
+def known_servo_models(name: str) -> str:
+    """Empty for a servo model that has a control table, else the names of those that have."""
+    table = import_module("softfinger.daemon.servos.control_table")
+    try:
+        table.by_name(name)
+    except KeyError:
+        return ", ".join(table.MODELS)
+    return ""
 
 
 def make_servos(settings: Settings, clock: Clock, hand: SimulatedHand | None) -> Servos | None:

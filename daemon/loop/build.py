@@ -11,7 +11,6 @@ import logging
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from softfinger.daemon.backends import SERVOS, TACTILE, make_sensor, make_servos
@@ -24,7 +23,6 @@ from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, HandFacts
 from softfinger.daemon.wire.command_server import CommandServer
@@ -37,10 +35,10 @@ if TYPE_CHECKING:
 
 
 class Daemon:
-    """A hand that is ready to run: ``with Daemon(settings) as daemon: loop.loop.run()``.
+    """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
     Raises SettingsError, AddressError (keys included), ServoError or TactileError when it can't be
-    made ready; whatever was opened until then is closed again.
+    made ready, with everything closed again that was opened until then.
     """
 
     def __init__(
@@ -56,12 +54,12 @@ class Daemon:
         self._closers: list[Callable[[], None]] = []
         self.gateway: Gateway | None = None  # the process that serves clients
         try:
-            self._assemble(on_event, wire, table_cache)
+            self._build(on_event, wire, table_cache)
         except BaseException:
             self.close()
             raise
 
-    def _assemble(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
+    def _build(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
         self.publisher = publisher
@@ -74,20 +72,13 @@ class Daemon:
         if self.gateway is not None:
             self.gateway.wait()  # a second daemon touches no hardware
         if self.servos is not None:
-            self._connect(self.servos)
+            self._closers.append(self.servos.close)
+            self.servos.connect()
         for each in perception.fingers:
             self._closers.append(each.sensor.close)
             each.sensor.open()
-        self.loop = Loop(
-            settings,
-            self.clock,
-            self.servos,
-            perception,
-            publisher,
-            server,
-            on_event,
-        )
-        self.loop.tell_truth(self.hand)
+        self.loop = Loop(settings, self.clock, self.servos, perception, publisher, server, on_event)
+        self.loop.publish_truth(self.hand)
         if publisher is not None:
             publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
 
@@ -139,10 +130,6 @@ class Daemon:
         """The contact tables of both tips; one and the same where their material is."""
         return self.models[0].table, self.models[1].table
 
-    def _connect(self, servos: Servos) -> None:
-        self._closers.append(servos.close)
-        servos.connect()
-
     def close(self) -> None:
         """Torque off, then everything closed, last opened first. Never raises."""
         while self._closers:
@@ -155,12 +142,7 @@ class Daemon:
     def __enter__(self) -> Daemon:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -22,7 +22,7 @@ from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.supervisor import BUS, Safety
+from softfinger.daemon.safety.supervisor import BUS, Finding, Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import State, Truth
@@ -31,8 +31,7 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-# Both in the machine's time, whose clients sent the commands.
-_STALL = 0.2  # s without a tick after which waiting commands are too old to act upon
+_STALL = 0.2  # s of the machine without a tick after which waiting commands are too old
 
 
 class Commands(Protocol):
@@ -82,15 +81,9 @@ class Loop:
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
         self._requests = Requests(
-            settings,
-            self.state,
-            self._control,
-            self._safety,
-            self._torque,
-            perception,
-            self.emit,
+            settings, self.state, self._control, self._safety, self._torque, perception, self.emit
         )
-        self._fault_after_opening = ("", "")  # name and reason
+        self._after_opening: Finding | None = None  # a fault for when the hand is open
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing)
         self._publishing = None
@@ -105,14 +98,14 @@ class Loop:
 
     @property
     def servos(self) -> Servos | None:
-        """What is read and driven."""
+        """The servo backend, None in a scene without."""
         return self._torque.servos
 
     @servos.setter
     def servos(self, servos: Servos | None) -> None:
         self._torque.servos = servos
 
-    # What may be asked from outside the tick, a signal handler included
+    # From outside the tick, a signal handler included
 
     def end(self) -> None:
         """Leave `run` after this tick, with torque off."""
@@ -126,8 +119,8 @@ class Loop:
         """Emit an event at the next tick; any thread may call it."""
         self._reports.append((level, kind, text))
 
-    def tell_truth(self, truth: Truth | None) -> None:
-        """Publish what a simulated hand knows, too, to those who ask."""
+    def publish_truth(self, truth: Truth | None) -> None:
+        """Publish what a simulated hand knows of itself, where somebody subscribes to it."""
         if self._publishing is not None:
             self._publishing.truth = truth
 
@@ -212,10 +205,12 @@ class Loop:
         record(
             statistics.counts,
             statistics.largest,
-            state.timing.wake_late_s,
-            done - began,
-            (read - began) + (written - decided),
-            done - written,
+            (
+                state.timing.wake_late_s,
+                done - began,
+                (read - began) + (written - decided),
+                done - written,
+            ),
         )
         return done
 
@@ -250,10 +245,10 @@ class Loop:
             control.coast(state.goal)
         else:
             control.step(self.period, state.goal)
-        self._tell_events()
+        self._emit_events()
         state.mode = control.mode
 
-    def _tell_events(self) -> None:
+    def _emit_events(self) -> None:
         for events in (self.perception.events, self._control.events):
             for event in events:
                 self.emit(*event)
@@ -268,19 +263,18 @@ class Loop:
             self.emit("warning", *warning)
         safety.warnings.clear()
         if not control.torque:
-            self._fault_after_opening = ("", "")
+            self._after_opening = None
             return
         if finding is not None:
             finding = finding._replace(text=self._with_cause(*finding))
-        if finding is not None and safety.opens_first(finding, state.mode):
-            self.emit("error", *finding)
-            self._fault_after_opening = finding
-            control.release()
-        elif finding is not None:
-            self._fail(finding.text, finding.name)
-        elif self._fault_after_opening[0] and state.mode != Mode.RELEASING:
-            name, reason = self._fault_after_opening
-            self._fail(reason, name)
+            if safety.opens_first(finding, state.mode):
+                self.emit("error", *finding)
+                self._after_opening = finding
+                control.release()
+            else:
+                self._fail(finding.text, finding.name)
+        elif self._after_opening is not None and state.mode != Mode.RELEASING:
+            self._fail(self._after_opening.text, self._after_opening.name)
 
     # Commands, events and faults
 
@@ -346,7 +340,7 @@ class Loop:
                 reason = self._with_cause(name, reason)
             self._latch(reason, name)
             self._control.fail(reason, name)
-            self._tell_events()
+            self._emit_events()
             self.state.mode = self._control.mode
 
     def _latch(self, reason: str, name: str) -> None:

@@ -15,7 +15,6 @@ import sys
 import threading
 from collections.abc import Callable
 from functools import partial
-from types import TracebackType
 from typing import NamedTuple
 
 from softfinger.daemon.profile.settings import Realtime, Settings
@@ -132,12 +131,7 @@ class RealTime:
     def __enter__(self) -> RealTime:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

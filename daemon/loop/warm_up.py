@@ -140,7 +140,7 @@ def _hand(scene: Scene) -> None:
 
 
 def _sensor(scene: Scene) -> None:
-    from softfinger.daemon.tactile.simulated import make_sensor_model
+    from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 
     if not scene.sensing:
         return

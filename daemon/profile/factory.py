@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -48,7 +49,7 @@ def make_table(
     """
     tip = make_tip(settings)
     tolerance = settings.table.tolerance
-    warn = None if on_event is None else partial(on_event, "warning", "table")
+    warn = warnings.warn if on_event is None else partial(on_event, "warning", "table")
     try:
         if cache is None:
             return ContactTable.build(tip, material, tolerance=tolerance)

@@ -45,14 +45,16 @@ def load(
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}
     changed = {_change(data, change) for change in changes}
-    wrong: set[str] = set()
+    wrong: list[str] = []
     found: list[str] = []
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
         settings, wrong = _sound_sections(data)
         found = [_line(details) for details in error.errors()]
-    found += problems(settings, directory, wrong)
+    if directory is not None:
+        settings = _with_directory(settings, directory)
+    found += problems(settings, wrong)
     if found:
         raise SettingsError(
             "\n".join(
@@ -60,7 +62,7 @@ def load(
                 for problem in found
             )
         )
-    return settings if directory is None else _with_directory(settings, directory)
+    return settings
 
 
 def names() -> list[str]:
@@ -125,15 +127,15 @@ def _tuples(value: Any, depth: int = 0) -> Any:
     return value
 
 
-def _sound_sections(data: dict[str, Any]) -> tuple[Settings, set[str]]:
-    """Settings of those sections that hold good, and the names of the others."""
+def _sound_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
+    """Settings of the sections without errors, and the names of the others."""
     sound: dict[str, Any] = {}
-    wrong = set()
+    wrong = []
     for name, field in Settings.model_fields.items():
         try:
             sound[name] = type(field.default).model_validate(data.get(name, {}))
         except ValidationError:
-            wrong.add(name)
+            wrong.append(name)
     return Settings(**sound), wrong
 
 
@@ -163,10 +165,10 @@ def _known_keys(location: list[str]) -> list[str]:
 
 
 def _with_directory(settings: Settings, directory: Path) -> Settings:
-    def filled(port: str) -> str:
-        return port.replace("{dir}", str(directory))
-
-    left, right = settings.tactile.port
-    servos = settings.servos.model_copy(update={"port": filled(settings.servos.port)})
-    tactile = settings.tactile.model_copy(update={"port": (filled(left), filled(right))})
+    servo, left, right = (
+        port.replace("{dir}", str(directory))
+        for port in (settings.servos.port, *settings.tactile.port)
+    )
+    servos = settings.servos.model_copy(update={"port": servo})
+    tactile = settings.tactile.model_copy(update={"port": (left, right)})
     return settings.model_copy(update={"servos": servos, "tactile": tactile})

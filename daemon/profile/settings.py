@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from softfinger.daemon.backends import SERVOS, TACTILE
+from softfinger.daemon.backends import SERVOS, TACTILE, known_servo_models
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
 # Every number has an end on both sides: implausible values are typing errors, and must not reach
@@ -51,18 +51,13 @@ def _one_of(names: Collection[str]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _known(name: str) -> str:
-    from softfinger.daemon.servos.control_table import MODELS, by_name
-
-    try:
-        by_name(name)
-    except KeyError:
-        known = ", ".join(MODELS)
-        raise PydanticCustomError("servo_model", "one of {known}", {"known": known}) from None
+def _servo_model(name: str) -> str:
+    if known := known_servo_models(name):
+        raise PydanticCustomError("servo_model", "one of {known}", {"known": known})
     return name
 
 
-Model = Annotated[str, AfterValidator(_known)]  # of a servo
+Model = Annotated[str, AfterValidator(_servo_model)]
 
 
 class Section(BaseModel):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -51,15 +50,13 @@ def load_or_build(
     tip: Fingertip,
     material: Material,
     tolerance: float,
-    warn: Callable[[str], None] | None = None,
+    warn: Callable[[str], None],
 ) -> ContactTable:
     """The table kept in ``folder``, or built and kept there.
 
-    What is wrong with a file or the folder goes to ``warn``, or becomes a RuntimeWarning. Raises
-    TableError when the tolerance can't be met.
+    ``warn`` takes what is wrong with a file or the folder. Raises TableError when the tolerance
+    can't be met.
     """
-    if warn is None:
-        warn = _warn
     file = table_file(folder, tip, material, tolerance)
     try:
         return load_table(file, tip, material, tolerance)
@@ -73,7 +70,3 @@ def load_or_build(
     except OSError as error:
         warn(f"the contact table can't be kept, each start builds it again: {error}")
     return table
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, RuntimeWarning, stacklevel=3)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 from softfinger.daemon.backends import SERVOS, TACTILE
@@ -21,15 +20,14 @@ _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
 
-def problems(settings: Settings, directory: Path | None, wrong: set[str]) -> list[str]:
+def problems(settings: Settings, wrong: Collection[str] = ()) -> list[str]:
     """What does not fit together. ``wrong``: sections that must not be looked at."""
-    found: list[str] = []
-    for sections, check in _CHECKS:
-        if not wrong.intersection(sections):
-            found += check(settings)
-    if directory is None and not wrong.intersection(("servos", "tactile")):
-        found += _folder(settings)
-    return found
+    return [
+        problem
+        for sections, check in _CHECKS
+        if not set(sections).intersection(wrong)
+        for problem in check(settings)
+    ]
 
 
 def shown(value: Any) -> str:
@@ -223,4 +221,5 @@ _CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...]
     (("safety",), _limits),
     (("control", "safety", "task"), _forces),
     (("stream", "commands", "access"), _addresses),
+    (("servos", "tactile"), _folder),
 )

@@ -7,14 +7,14 @@ that nobody subscribes to are not packed.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.gateway.config import Topics
 from softfinger.daemon.gateway.link import Link
-from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State, Truth
 from softfinger.daemon.wire.packer import packer
 from softfinger.daemon.wire.schema import (
@@ -42,6 +42,17 @@ def bit(topic: bytes) -> int:
 
 
 _COMMANDS = bit(COMMAND)
+
+
+class TickStatistics(Protocol):
+    """Histograms of the loop's times: `loop.timing.Statistics`."""
+
+    @property
+    def ticks(self) -> int:
+        """How many were counted."""
+
+    def spreads(self) -> Mapping[str, Any]:
+        """Median, tail and largest value [s] by the time's name."""
 
 
 class Publisher:
@@ -91,7 +102,7 @@ class Publisher:
         self._send(TACTILE, frame, data, finger, facts, wall, step, number)
 
     def stats(
-        self, state: State, period: float, rates: Rates, statistics: Statistics, step: int = 1
+        self, state: State, period: float, rates: Rates, statistics: TickStatistics, step: int = 1
     ) -> None:
         """Publish ``hand/stats``, every ``step`` ticks."""
         self._send(STATS, state, period, rates, statistics, step)

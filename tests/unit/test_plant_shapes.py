@@ -11,7 +11,7 @@ from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings, Simulation
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.tactile.simulated import SimulatedTactile
+from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from tests.harness.plant import (
     BOUNDED,
     CONSTANT,
@@ -367,7 +367,7 @@ def test_a_long_wedge_whose_faces_meet_is_refused():
 
     def found(**simulation):
         settings = Settings.model_validate({"simulation": {"object_shape": "wedge", **simulation}})
-        return problems(settings, None, set())
+        return problems(settings)
 
     assert found(object_taper=1.1) == []
     assert "object_taper" in found(object_taper=1.2)[0]

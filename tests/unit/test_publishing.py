@@ -121,7 +121,7 @@ def test_the_statistics_message_has_every_field_as_documented(
     until(lambda: [served.settle(), publisher.wanted & bit(STATS)][1])
     assert not publisher.wanted & bit(STATE)
     statistics = Statistics()
-    record(statistics.counts, statistics.largest, 1e-6, 2e-5, 1e-5, 2e-6)
+    record(statistics.counts, statistics.largest, (1e-6, 2e-5, 1e-5, 2e-6))
     rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
     publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
     until(lambda: [served.settle(), socket.poll(0)][1])

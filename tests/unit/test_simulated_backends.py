@@ -15,7 +15,7 @@ from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.tactile.simulated import SimulatedTactile
+from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.types import Goal, Reading
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material

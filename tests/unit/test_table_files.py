@@ -95,8 +95,6 @@ def test_without_a_place_the_table_is_built_all_the_same(tmp_path: Path, said: l
     blocked.write_text("not a folder")
     assert kept(blocked / "cache", said).form.name == "closed"
     assert "can't be kept" in said[-1]
-    with pytest.warns(RuntimeWarning, match="can't be kept"):
-        load_or_build(blocked, TIP, CONSTANT, 1e-9)
 
 
 def test_the_daemon_keeps_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from softfinger.daemon.loop.timing import QUANTILES, TIMES, Statistics, record
 def fed(rows: np.ndarray) -> Statistics:
     statistics = Statistics()
     for wake, compute, bus, publish in rows.tolist():
-        record(statistics.counts, statistics.largest, wake, compute, bus, publish)
+        record(statistics.counts, statistics.largest, (wake, compute, bus, publish))
     return statistics
 
 
@@ -59,7 +59,7 @@ def test_nothing_counted_is_all_zero_and_reset_forgets() -> None:
     statistics = Statistics()
     assert statistics.ticks == 0
     assert all(spread == (0.0, 0.0, 0.0, 0.0) for spread in statistics.spreads().values())
-    record(statistics.counts, statistics.largest, 1e-3, 1e-3, 1e-3, 1e-3)
+    record(statistics.counts, statistics.largest, (1e-3, 1e-3, 1e-3, 1e-3))
     assert statistics.ticks == 1
     statistics.reset()
     assert statistics.ticks == 0
@@ -70,12 +70,12 @@ def test_keeping_them_allocates_nothing() -> None:
     statistics = Statistics()
     counts, largest = statistics.counts, statistics.largest
     values = (1e-6, 2e-5, 1e-5, 3e-6)
-    record(counts, largest, *values)
+    record(counts, largest, values)
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
         for _ in range(1000):
-            record(counts, largest, *values)
+            record(counts, largest, values)
         grown = tracemalloc.get_traced_memory()[0] - before
     finally:
         tracemalloc.stop()

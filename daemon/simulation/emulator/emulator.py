@@ -28,9 +28,9 @@ from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkF
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.simulation.servo_model.bus_faults import FaultError, LineFaults
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from softfinger.daemon.tactile.simulated import SimulatedTactile
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, longest that the physics lags behind

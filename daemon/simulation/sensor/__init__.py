@@ -1,1 +1,1 @@
-"""The simulated pressure sensor: what it reads of a contact, its flaws, when its frames arrive."""
+"""The simulated pressure sensor: what it reads, its flaws, when its frames arrive."""
