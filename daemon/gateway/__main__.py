@@ -10,29 +10,24 @@ import resource
 import signal
 import socket
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from softfinger.daemon.errors import AddressError, KeyFileError
-from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway import bounds, loop_link
 from softfinger.daemon.gateway.config import Config
-from softfinger.daemon.gateway.service import StartAnew, open_service
+from softfinger.daemon.gateway.endpoints import CommandEndpoint, StartAnew, StreamEndpoint
+from softfinger.daemon.gateway.server import Server
+from softfinger.daemon.wire.sockets import Listener
 
-_MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
-_DESCRIPTORS = 64  # that are not clients'
-_CLIENTS = 1024
-# With keys libzmq has the connections, and ends when it is out of memory: there is room for all.
-_MOST_WITH_KEYS = 256
-_FOR_KEYS = 48 << 20  # bytes for …
-_CONNECTION = 100_000  # bytes of each, and for each message that waits for it …
-_WAITING = 128  # … two of libzmq's records
-_HUNG = 3.0  # s without a step after which the process is ended
 _STEPS = 0.5  # s between two words that it lives
 
 
 def main(words: list[str]) -> int:
     """Serve; 0 when the loop has ended, 1 when the sockets could not be bound.
 
-    `link.ANEW` when all clients are to come in again.
+    `loop_link.ANEW` when all clients are to come in again.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the loop, whose last words it sends
@@ -44,24 +39,54 @@ def main(words: list[str]) -> int:
 
 def _serve(end: socket.socket, config: Config) -> int:
     try:
-        service = open_service(end, config, _be_bounded(config))
+        server = open_server(end, config, _be_bounded(config))
     except (AddressError, KeyFileError) as error:
-        end.send(link.FAILED + str(error).encode()[: link.LARGEST // 2])
+        end.send(loop_link.FAILED + str(error).encode()[: loop_link.LARGEST // 2])
         return 1
-    end.send(link.READY)
+    end.send(loop_link.READY)
     lived = 0.0
     try:
-        while not service.over:
-            service.step()
-            if service.now - lived > _STEPS:
-                lived = service.now
-                signal.setitimer(signal.ITIMER_REAL, _HUNG)  # SIGALRM is not handled: it ends
+        while not server.over:
+            server.step()
+            if server.now - lived > _STEPS:
+                lived = server.now
+                signal.setitimer(
+                    signal.ITIMER_REAL, bounds.STALLED
+                )  # SIGALRM is not handled: it ends
     except StartAnew as reason:
-        end.send(link.NOTICE + str(reason).encode())
-        return link.ANEW
+        end.send(loop_link.NOTICE + str(reason).encode())
+        return loop_link.ANEW
     signal.setitimer(signal.ITIMER_REAL, 0.0)
-    service.close()
+    server.close()
     return 0
+
+
+def open_server(
+    end: socket.socket,
+    config: Config,
+    places: int,
+    clock: Callable[[], float] = time.monotonic,
+) -> Server:
+    """Bind what ``config`` names, for ``places`` clients.
+
+    Raises AddressError, and KeyFileError where there are keys.
+    """
+    server = Server(end, config, clock)
+    if config.keys:
+        from softfinger.daemon.gateway.curve import open_endpoints  # which alone needs libzmq
+
+        open_endpoints(server, config)
+        return server
+    poller, requests, late = server.poller, server.requests, server.repeated.late
+    if config.stream:
+        listener = Listener(config.stream, config.stream_key, config.ipc_mode)
+        stream = StreamEndpoint(listener, poller, places // 4, config.queue, config.topics, late)
+        server.add(stream, stream)
+    if config.commands:
+        listener = Listener(config.commands, "commands.address", config.ipc_mode)
+        limit = bounds.FRAMES * config.max_bytes
+        server.add(CommandEndpoint(listener, poller, limit, places, requests))
+    return server
 
 
 def _be_bounded(config: Config) -> int:
@@ -69,12 +94,15 @@ def _be_bounded(config: Config) -> int:
 
     Returns how many clients there is room for.
     """
-    resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY, _MEMORY))
+    resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY, bounds.MEMORY))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    clients = _CLIENTS + _CLIENTS // 4
+    clients = bounds.CLIENTS + bounds.CLIENTS // 4
     if config.keys:
-        clients = min(_FOR_KEYS // (_CONNECTION + _WAITING * config.queue), _MOST_WITH_KEYS)
-    wanted = clients + _DESCRIPTORS
+        clients = min(
+            bounds.KEYED_MEMORY // (bounds.KEYED_CONNECTION + bounds.KEYED_WAITING * config.queue),
+            bounds.KEYED_CLIENTS,
+        )
+    wanted = clients + bounds.DESCRIPTORS
     if most != resource.RLIM_INFINITY:
         wanted = min(wanted, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
@@ -83,7 +111,7 @@ def _be_bounded(config: Config) -> int:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     except OSError:
         pass  # not worth doing without the hand
-    return (wanted - _DESCRIPTORS) * 4 // 5
+    return (wanted - bounds.DESCRIPTORS) * 4 // 5
 
 
 if __name__ == "__main__":

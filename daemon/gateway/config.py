@@ -1,4 +1,4 @@
-"""What a gateway is told when it is started."""
+"""What a gateway is given when it is started."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from dataclasses import asdict, dataclass
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """The stream's topics, and which of them late subscribers are told."""
+    """The stream's topics, and which of them late subscribers get again."""
 
     names: tuple[str, ...]
-    settings: int  # index of the one of which the last message is told
-    events: int  # and of which the last few are
+    settings: int  # index of the one of which they get the last message
+    events: int  # and of which the last few
+
+    def matching(self, *prefixes: bytes) -> int:
+        """The topics that begin with any of these, as bits."""
+        names = enumerate(self.names)
+        return sum(1 << k for k, name in names if name.encode().startswith(prefixes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,23 +19,17 @@ import zmq.utils.z85
 from zmq.auth.thread import ThreadAuthenticator
 
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
-from softfinger.daemon.gateway.admission import Pace
+from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.config import Config
-from softfinger.daemon.gateway.service import Service, StartAnew
+from softfinger.daemon.gateway.endpoints import Endpoint, StartAnew
+from softfinger.daemon.gateway.request_queue import Pace
+from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.wire.keys import DOMAIN, ServerKeys, load_server
 from softfinger.daemon.wire.sockets import IpcFile, bind_error
 
 _NOW = int(zmq.NOBLOCK)
-_READ = 64  # subscriptions at a look
-_READING = 0.004  # s of reading requests before all else is looked at again
-_PARTS = 3  # of a request: its client, REQ's empty one, the request
-_QUEUE = 64  # requests of one client in its socket
-_CLIENTS = 256  # who are remembered
-_PURGE = 0.02  # s after a stop in which all requests are refused, …
-_PURGE_LONGEST = 0.25  # … and while there are any
-_LOOK = 0.5  # s between looks at the folder of keys
-_LINGER = 200  # ms for last words
-_SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
+_READ = 64  # subscriptions read at a time
+_PARTS = bounds.PARTS + 1  # and the client's number
 
 
 class Keys(ThreadAuthenticator):
@@ -61,7 +55,7 @@ class Keys(ThreadAuthenticator):
         """Let in who was added to the folder. Raises StartAnew when somebody was taken away."""
         if now < self._at:
             return
-        self._at = now + _LOOK
+        self._at = now + bounds.KEYS_CHECKED
         try:
             try:
                 found = load_server(self._folder)
@@ -80,39 +74,37 @@ class _Client:
 
     alive = True
 
-    def __init__(self, door: KeyedCommands, route: bytes, name: str, pace: Pace) -> None:
-        self._door = door
+    def __init__(self, endpoint: KeyedCommands, route: bytes, name: str, pace: Pace) -> None:
+        self._endpoint = endpoint
         self._route = route
         self.name = name
         self.pace = pace
 
     @property
     def epoch(self) -> int:
-        return self._door.epoch
+        return self._endpoint.begun
 
     def answer(self, envelope: list[bytes], reply: bytes) -> None:
-        self._door.answer([self._route, *envelope, reply])
+        self._endpoint.answer([self._route, *envelope, reply])
 
 
-class _Door:
+class _KeyedEndpoint(Endpoint):
     """A bound socket in the poll. libzmq tells of a change once, so all of it is read."""
 
     def __init__(
-        self, service: Service, keys: Keys, config: Config, kind: int, queue: int, limit: int
+        self, server: Server, keys: Keys, config: Config, kind: int, queue: int, limit: int
     ) -> None:
         """``queue`` messages of ``limit`` bytes wait for one client. Raises AddressError."""
         self._keys = keys
-        self._poll = service.poll
+        self._poller = server.poller
         self._file: IpcFile | None = None
-        self.now = 0.0
-        self.epoch = 0
         key, address = config.stream_key, config.stream
         if kind == zmq.ROUTER:
             key, address = "commands.address", config.commands
         if address.startswith("ipc://"):
             self._file = IpcFile(address, key, config.ipc_mode)
         self._socket: zmq.Socket[Any] = keys.context.socket(kind)
-        self._socket.setsockopt(zmq.LINGER, _LINGER)
+        self._socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LAST_WORDS))
         # These bounds hold only for connections made after they were set, so before bind.
         self._socket.setsockopt(zmq.MAXMSGSIZE, limit)
         self._socket.setsockopt(zmq.SNDHWM, queue)
@@ -125,7 +117,7 @@ class _Door:
             self._socket.close()
             raise bind_error(address, key, error.errno, str(error)) from None
         self._fd = cast(int, self._socket.getsockopt(zmq.FD))
-        self._poll.watch(self._fd, select.EPOLLIN, lambda _: self.tend())
+        self._poller.watch(self._fd, select.EPOLLIN, lambda _: self.tend())
 
     def _parts(self) -> list[zmq.Frame] | None:
         """The next message's first few parts; None when there is none."""
@@ -138,52 +130,39 @@ class _Door:
             return None
         return found
 
-    @property
-    def begun(self) -> int:
-        """The epoch of who comes in from now on."""
-        return self.epoch
-
-    def tend(self) -> None:
-        """Take in what has come."""
-        raise NotImplementedError
-
-    def begin_epoch(self, epoch: int) -> None:
-        """Nothing waits here that matters."""
-        self.epoch = epoch
-
     def close(self) -> None:
         """Hang up on all."""
-        self._poll.forget(self._fd)
+        self._poller.forget(self._fd)
         self._socket.close()
         if self._file is not None:
             self._file.close()
 
 
-class KeyedCommands(_Door):
+class KeyedCommands(_KeyedEndpoint):
     """Where requests come in."""
 
-    def __init__(self, service: Service, keys: Keys, config: Config) -> None:
+    def __init__(self, server: Server, keys: Keys, config: Config) -> None:
         """Raises AddressError."""
-        self._requests = service.requests
+        self._requests = server.requests
         self._clients: OrderedDict[bytes, _Client] = OrderedDict()
-        self._coming = 0  # the epoch that begins when all of before has been refused
         self._passed_at = 0.0  # when the last one did
         self._empty = True  # at the last look
         self._replies: list[list[bytes]] = []  # held back since …
         self._held_since = 0.0
-        super().__init__(service, keys, config, zmq.ROUTER, _QUEUE, 4 * config.max_bytes)
+        limit = bounds.FRAMES * config.max_bytes
+        super().__init__(server, keys, config, zmq.ROUTER, bounds.KEYED_QUEUE, limit)
 
     def tend(self) -> None:
         self._keys.look(self.now)
-        if self.epoch != self._coming:
+        if self.begun != self.epoch:
             if self._is_purged():
-                self.epoch = self._coming
+                self.begun = self.epoch
                 self._answer_held()
-            elif self._replies and time.monotonic() - self._held_since > _PURGE_LONGEST:
+            elif self._replies and time.monotonic() - self._held_since > bounds.LONGEST_PURGE:
                 self._answer_held()  # others stop without pause: what comes next is refused, too
         self._empty = False
         heard = set()
-        until = time.monotonic() + _READING
+        until = time.monotonic() + bounds.TURN
         while time.monotonic() < until:
             parts = self._parts()
             if parts is None:
@@ -200,7 +179,7 @@ class KeyedCommands(_Door):
 
     def _is_purged(self) -> bool:
         past = time.monotonic() - self._passed_at
-        return past > _PURGE and (self._empty or past > _PURGE_LONGEST)
+        return past > bounds.PURGE and (self._empty or past > bounds.LONGEST_PURGE)
 
     def _answer_held(self) -> None:
         replies, self._replies = self._replies, []
@@ -212,13 +191,13 @@ class KeyedCommands(_Door):
         if client is None:
             client = _Client(self, route, name, self._requests.new_pace(self.now))
             self._clients[route] = client
-            if len(self._clients) > _CLIENTS:
+            if len(self._clients) > bounds.KEYED_CLIENTS:
                 self._clients.popitem(last=False)
         return client
 
     def answer(self, message: list[bytes]) -> None:
         """Send a reply, once what came before a stop has been refused."""
-        if self.epoch == self._coming:
+        if self.begun == self.epoch:
             self._send(message)
             return
         if not self._replies:
@@ -233,21 +212,22 @@ class KeyedCommands(_Door):
 
     def begin_epoch(self, epoch: int) -> None:
         """It begins in a moment."""
-        self._coming = epoch
+        self.epoch = epoch
         self._passed_at = time.monotonic()
 
 
-class KeyedStream(_Door):
+class KeyedStream(_KeyedEndpoint):
     """Where subscribers come in."""
 
-    def __init__(self, service: Service, keys: Keys, config: Config) -> None:
+    def __init__(self, server: Server, keys: Keys, config: Config) -> None:
         """Raises AddressError."""
-        self._topics = tuple(name.encode() for name in config.topics.names)
-        self._late = service.kept.late
+        self._names = tuple(name.encode() for name in config.topics.names)
+        self._matching = config.topics.matching
+        self._late = server.repeated.late
         self._prefixes: set[bytes] = set()
         self.wanted = 0
         self.backlog = 0
-        super().__init__(service, keys, config, zmq.XPUB, config.queue, _SUBSCRIPTION)
+        super().__init__(server, keys, config, zmq.XPUB, config.queue, bounds.KEYED_SUBSCRIPTION)
         self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
 
     def tend(self) -> None:
@@ -264,29 +244,27 @@ class KeyedStream(_Door):
                 late |= matching
             elif change[:1] == b"\0":
                 self._prefixes.discard(change[1:])
-        self.wanted = 0
-        for prefix in self._prefixes:
-            self.wanted |= self._matching(prefix)
+        self.wanted = self._matching(*self._prefixes)
         for topic, message in self._late(late) if late else ():
             self.publish(topic, message)
 
-    def _matching(self, prefix: bytes) -> int:
-        return sum(1 << k for k, topic in enumerate(self._topics) if topic.startswith(prefix))
+    def begin_epoch(self, epoch: int) -> None:
+        self.epoch = self.begun = epoch
 
     def publish(self, topic: int, message: bytes) -> None:
         """One message to all who want its topic; a slow one's is dropped."""
-        self._socket.send(self._topics[topic], _NOW | zmq.SNDMORE)
+        self._socket.send(self._names[topic], _NOW | zmq.SNDMORE)
         self._socket.send(message, _NOW)
 
 
-def open_doors(service: Service, config: Config) -> None:
+def open_endpoints(server: Server, config: Config) -> None:
     """Bind what ``config`` names, for the clients whose keys are in its folder.
 
     Raises AddressError and KeyFileError.
     """
     keys = Keys(zmq.Context(), Path(config.keys))
     if config.stream:
-        stream = KeyedStream(service, keys, config)
-        service.add(stream, stream)
+        stream = KeyedStream(server, keys, config)
+        server.add(stream, stream)
     if config.commands:
-        service.add(KeyedCommands(service, keys, config))
+        server.add(KeyedCommands(server, keys, config))

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway import loop_link
 from softfinger.daemon.gateway.config import Config
 
 _ROOT = Path(__file__).parents[3]  # where the package is found
@@ -27,7 +27,7 @@ class Gateway:
 
     def __init__(self, config: Config) -> None:
         """It starts beside whatever is done until `wait`."""
-        self.link = link.Link()
+        self.link = loop_link.Link()
         self._config = config
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -46,7 +46,7 @@ class Gateway:
         return self._process.pid
 
     def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
-        ours, theirs = link.pair()
+        ours, theirs = loop_link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
             process = subprocess.Popen(
@@ -70,13 +70,13 @@ class Gateway:
         said = b""
         if select.select([ours], [], [], _PATIENCE)[0]:
             with contextlib.suppress(OSError):
-                said = ours.recv(link.LARGEST)
-        if said[:1] == link.FAILED:
+                said = ours.recv(loop_link.LARGEST)
+        if said[:1] == loop_link.FAILED:
             raise AddressError(said[1:].decode())
-        if said[:1] != link.READY:
+        if said[:1] != loop_link.READY:
             raise AddressError("the process that serves clients could not be started")
         try:
-            link.send_all(ours, self.link.lasting)
+            loop_link.send_all(ours, self.link.lasting)
         except OSError as error:
             raise AddressError(f"the process that serves clients: {error}") from None
         self.link.offer(ours)
@@ -88,7 +88,7 @@ class Gateway:
             status = self._process.wait()
             if self._closing.is_set():
                 return
-            if status != link.ANEW:
+            if status != loop_link.ANEW:
                 self.link.notices.append(
                     f"the process that serves clients ended ({_cause(status)})"
                 )

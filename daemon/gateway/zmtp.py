@@ -16,7 +16,7 @@ _LONG_HEAD = 9
 
 
 class Broken(SoftfingerError):
-    """The peer does not keep to the protocol, or to our bounds: it is hung up on."""
+    """The peer does not keep to the protocol, or to our bounds: it is disconnected."""
 
 
 def frame(body: bytes, more: bool = False) -> bytes:

@@ -1,6 +1,6 @@
 """Requests to a running hand: the one place that checks what a request asks, and carries it out.
 
-The gateway has seen to a request's size, pace and form (`gateway.admission`). Which command is
+The gateway has seen to a request's size, pace and form (`gateway.request_queue`). Which command is
 heard in which mode stands in `control.modes`; what it makes the hand do, in
 `control.state_machine`.
 """

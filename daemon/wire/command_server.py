@@ -2,7 +2,7 @@
 
 It lives in the loop's own thread: it is asked once a tick, costs one look when nobody speaks, and
 needs no lock. A ``stop`` goes first; what came before one is refused, wherever it waits (see
-`gateway.admission`).
+`gateway.request_queue`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.gateway.link import Ask, Link
+from softfinger.daemon.gateway.loop_link import Ask, Link
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 

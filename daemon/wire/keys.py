@@ -3,8 +3,8 @@
 CurveZMQ: each side has a key pair; a client knows the server's public key, and the server the
 public keys of its clients. Whoever has no key among them gets nothing. A folder of `make_keys`:
 
-``server/server.key_secret``
-    the daemon's own pair
+``server/server.key_secret``, ``server/server.key``
+    the daemon's own pair, and its public key
 ``server/clients/NAME.key``
     whom it lets in; a file taken away is a client shut out at once
 ``NAME/server.key``, ``NAME/client.key_secret``
@@ -20,12 +20,15 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 import stat
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import zmq
+import zmq.auth
 import zmq.utils.z85
 
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
@@ -35,9 +38,7 @@ DOMAIN = b"softfinger"
 HANDSHAKE = 2000  # ms in which a client has to have shown who it is
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_KEY = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"]*)"\s*$', re.MULTILINE)
-_LENGTH = 40  # characters of a key in Z85
-_LARGEST = 65_536  # bytes of a key file
+_LENGTH = 32  # bytes of a key
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,33 +119,22 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
 
 
 def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list[Path]:
-    for path in (folder, server, server / "clients"):
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if new:
-        public, secret = zmq.curve_keypair()
-        _write(server / "server.key_secret", public, secret)
-    else:
-        public, _ = _pair(server / "server.key_secret")
-    made = [server] if new else []
-    for name in names:
-        client = folder / name
-        client.mkdir(mode=0o700)
-        own_public, own_secret = zmq.curve_keypair()
-        _write(client / "server.key", public)
-        _write(client / "client.key_secret", own_public, own_secret)
-        # Last, so that nobody is let in whose own keys could not be written.
-        _write(server / "clients" / f"{name}.key", own_public)
-        made.append(client)
-    return made
-
-
-def _write(path: Path, public: bytes, secret: bytes = b"") -> None:
-    lines = ["metadata", "curve", f'    public-key = "{public.decode()}"']
-    if secret:
-        lines.append(f'    secret-key = "{secret.decode()}"')
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write("\n".join(lines) + "\n")
+    before = os.umask(0o077)
+    try:
+        (server / "clients").mkdir(parents=True, exist_ok=True)
+        _check_above(server / "clients" / "any")
+        if new:
+            zmq.auth.create_certificates(server, "server")
+        for name in names:
+            client = folder / name
+            client.mkdir()
+            zmq.auth.create_certificates(client, "client")
+            shutil.copyfile(server / "server.key", client / "server.key")
+            # Last, so that nobody is let in whose own keys could not be written.
+            (client / "client.key").rename(server / "clients" / f"{name}.key")
+    finally:
+        os.umask(before)
+    return [*([server] if new else []), *(folder / name for name in names)]
 
 
 def load_server(folder: Path) -> ServerKeys:
@@ -157,7 +147,7 @@ def load_server(folder: Path) -> ServerKeys:
         files = sorted((place / "clients").glob("*.key"))
     except OSError as error:
         raise _unreadable(place / "clients", error) from None
-    clients = {_keys(path)["public"]: path.stem for path in files}
+    clients = {_keys(path)[0]: path.stem for path in files}
     if not clients:
         raise KeyFileError(f"{place / 'clients'}: no client's key; `softfinger keys` makes them")
     return ServerKeys(public, secret, clients)
@@ -168,7 +158,7 @@ def load_client(folder: Path) -> ClientKeys:
     check_curve()
     place = folder if (folder / "client.key_secret").exists() else folder / LOCAL
     public, secret = _pair(place / "client.key_secret")
-    return ClientKeys(_keys(place / "server.key")["public"], public, secret)
+    return ClientKeys(_keys(place / "server.key")[0], public, secret)
 
 
 def _place(folder: Path) -> Path:
@@ -183,25 +173,24 @@ def _unreadable(path: Path, error: OSError) -> KeyFileError:
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
     _check_above(path)
-    found = _keys(path, secret=True)
-    if "secret" not in found:
+    public, secret = _keys(path, secret=True)
+    if secret is None:
         raise KeyFileError(f"{path}: holds no secret key")
-    return found["public"], found["secret"]
+    return public, secret
 
 
-def _keys(path: Path, secret: bool = False) -> dict[str, bytes]:
+def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
     try:
-        with path.open(encoding="ascii") as file:
-            _check(path, os.fstat(file.fileno()), secret)
-            text = file.read(_LARGEST)
+        _check(path, path.stat(), secret)
+        keys = zmq.auth.load_certificate(path)
+        for key in filter(None, keys):
+            if len(zmq.utils.z85.decode(key)) != _LENGTH:
+                raise ValueError("a key of another length")
     except OSError as error:
         raise _unreadable(path, error) from None
-    except UnicodeDecodeError:
+    except (ValueError, LookupError, struct.error):  # the last of a key beyond Z85's range
         raise KeyFileError(f"{path}: no key file") from None
-    found = {name: value.encode() for name, value in _KEY.findall(text)}
-    if "public" not in found or not all(_sound(key) for key in found.values()):
-        raise KeyFileError(f"{path}: no key file")
-    return found
+    return keys
 
 
 def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
@@ -224,13 +213,3 @@ def _check_above(path: Path) -> None:
         except OSError as error:
             raise _unreadable(folder, error) from None
         _check(folder, status)
-
-
-def _sound(key: bytes) -> bool:
-    if len(key) != _LENGTH:
-        return False
-    try:
-        zmq.utils.z85.decode(key)
-    except (KeyError, ValueError, OverflowError, zmq.ZMQError):
-        return False
-    return True

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway import loop_link
+from softfinger.daemon.gateway.__main__ import open_server
 from softfinger.daemon.gateway.config import Config
-from softfinger.daemon.gateway.service import open_service
 from softfinger.daemon.wire.command_server import CommandServer, Handler
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 
@@ -31,13 +31,13 @@ class Served:
         places: int = 256,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.link = link.Link()
-        ours, theirs = link.pair()
+        self.link = loop_link.Link()
+        ours, theirs = loop_link.pair()
         config = Config(
             stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
         )
         try:
-            self.service = open_service(theirs, config, places, now)
+            self.service = open_server(theirs, config, places, now)
         except BaseException:
             ours.close()
             theirs.close()

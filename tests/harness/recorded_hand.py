@@ -10,7 +10,7 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.gateway.link import Link
+from softfinger.daemon.gateway.loop_link import Link
 from softfinger.daemon.loop.build import Daemon, facts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire.command_server import Handler

@@ -17,7 +17,7 @@ import pytest
 from softfinger.daemon.client import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.gateway import link
+from softfinger.daemon.gateway import loop_link
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
@@ -279,7 +279,7 @@ def is_zombie(process: int) -> bool:
 
 
 def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses: tuple[str, str]) -> None:
-    ours, theirs = link.pair()
+    ours, theirs = loop_link.pair()
     config = Config(*addresses, GATEWAY_TOPICS, 10, 200, 10.0, 0o600, "")
     with ours, theirs:
         process = subprocess.Popen(

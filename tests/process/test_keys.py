@@ -18,7 +18,7 @@ from softfinger.daemon.client import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.daemon.gateway.curve import Keys
-from softfinger.daemon.gateway.service import StartAnew
+from softfinger.daemon.gateway.endpoints import StartAnew
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import until
 from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_file_is_its_owners_alone_and_zeromq_reads_it(folder: Path) -> None:
     files = [path for path in folder.rglob("*") if path.is_file()]
-    assert len(files) == 7
+    assert len(files) == 8
     for path in files:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600, path
         public, secret = zmq.auth.load_certificate(path)
@@ -76,9 +76,16 @@ def test_damaged_missing_and_open_files_are_told(folder: Path) -> None:
     with pytest.raises(KeyFileError, match=r"may be read by others \(0640\): chmod 600"):
         load_server(folder)
     secret.chmod(0o600)
-    (folder / "alice" / "server.key").write_text('public-key = "short"\n', encoding="ascii")
-    with pytest.raises(KeyFileError, match="no key file"):
-        load_client(folder / "alice")
+    for line in (
+        'public-key = "short"',
+        f'public-key = "{"#" * 40}"',
+        "public-key",
+        "",
+        "\N{BULLET}",
+    ):
+        (folder / "alice" / "server.key").write_text(line + "\n", encoding="utf-8")
+        with pytest.raises(KeyFileError, match="no key file"):
+            load_client(folder / "alice")
     for path in (folder / "server" / "clients").iterdir():
         path.unlink()
     with pytest.raises(KeyFileError, match="no client's key"):
@@ -118,13 +125,13 @@ def test_keys_that_somebody_else_may_write_or_owns_are_refused(
 def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
     folder: Path, context: zmq.Context[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_descriptor_left(path: Path, *_: object, **__: object) -> NoReturn:
+    def no_descriptor_left(path: Path) -> NoReturn:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
 
     keys = Keys(context, folder)
     clients = folder / "server" / "clients"
     try:
-        monkeypatch.setattr(Path, "open", no_descriptor_left)
+        monkeypatch.setattr(zmq.auth, "load_certificate", no_descriptor_left)
         with pytest.raises(NoDescriptor):
             load_server(folder)
         keys.look(1.0)
@@ -147,7 +154,7 @@ class Guarded:
     def __init__(self, addresses: tuple[str, str], folder: Path) -> None:
         self.served = Served(*addresses, keys=str(folder))
         self.heard: list[dict[str, Any]] = []
-        until(lambda: [self.step(), self.served.service._doors[-1].epoch == 1][1])
+        until(lambda: [self.step(), self.served.service._endpoints[-1].begun == 1][1])
 
     def step(self) -> None:
         self.served.publisher.event(0.0, 0.0, "info", "test", "told")

@@ -18,8 +18,8 @@ import pytest
 import zmq
 
 from softfinger.daemon.client.command_client import send
-from softfinger.daemon.gateway.curve import KeyedStream
-from softfinger.daemon.gateway.peers import Stream
+from softfinger.daemon.gateway.config import Topics
+from softfinger.daemon.gateway.endpoints import StreamEndpoint
 from softfinger.daemon.wire.keys import load_client, make_keys
 from tests.conftest import own_addresses, until
 from tests.harness.gateway import Served
@@ -136,8 +136,10 @@ def test_a_web_page_is_not_heard(
     guarded: bool,
 ) -> None:
     heard: list[Any] = []
-    monkeypatch.setattr(Stream, "subscribed", lambda *subscription: heard.append(subscription))
-    monkeypatch.setattr(KeyedStream, "_matching", lambda _, prefix: heard.append(prefix))
+    monkeypatch.setattr(
+        StreamEndpoint, "subscribed", lambda *subscription: heard.append(subscription)
+    )
+    monkeypatch.setattr(Topics, "matching", lambda _, *prefixes: heard.extend(prefixes) or 0)
     folder = tmp_path / "keys"
     if guarded:
         make_keys(folder, ["alice"])

@@ -59,7 +59,7 @@ def is_served(served: Served, address: str) -> bool:
         GREETING + ready(b"DEALER") + b"\x02" + (1 << 40).to_bytes(8, "big"),  # a frame likewise
         GREETING + ready(b"DEALER") + b"\x02" + (801).to_bytes(8, "big"),
         GREETING + ready(b"DEALER") + b"\x08\x00",
-        GREETING + ready(b"DEALER") + (bytes((4, 7)) + b"\x04PING\x00\x0a") * 20,
+        GREETING + ready(b"DEALER") + (bytes((4, 7)) + b"\x04PING\x00\x0a") * 80,
     ],
 )
 def test_what_breaks_the_protocol_is_hung_up_on(
@@ -124,7 +124,7 @@ def test_whoever_does_not_shake_hands_leaves_after_a_while_or_when_others_come(
     served: Served, addresses: tuple[str, str], clock: VirtualClock
 ) -> None:
     silent = [RawClient(addresses[1], b"", b"") for _ in range(40)]
-    until(lambda: served.serve(echo) or len(served.service._doors[1]._peers) == 40)
+    until(lambda: served.serve(echo) or len(served.service._endpoints[1]._connections) == 40)
     assert is_served(served, addresses[1])
     assert silent[0].hung_up(), "the oldest of them made room"
     assert not silent[-1].hung_up()
@@ -136,7 +136,7 @@ def test_a_client_finds_a_place_when_all_are_taken(
     served: Served, addresses: tuple[str, str]
 ) -> None:
     idle = [RawClient(addresses[1], b"DEALER") for _ in range(40)]
-    until(lambda: served.serve(echo) or len(served.service._doors[1]._peers) == 40)
+    until(lambda: served.serve(echo) or len(served.service._endpoints[1]._connections) == 40)
     idle[0].ask(command="status")  # it was heard of last
     until(lambda: served.serve(echo) or idle[0].replies())
     assert is_served(served, addresses[1])
@@ -164,19 +164,19 @@ def test_a_reader_that_reads_nothing_does_not_fill_the_memory(
 def test_answers_that_are_not_read_end_the_connection(addresses: tuple[str, str]) -> None:
     with Served(commands=addresses[1]) as served:
         client = RawClient(addresses[1], b"DEALER")
-        door: Any = served.service._doors[0]
+        door: Any = served.service._endpoints[0]
         long = {"told": "x" * 20_000}
 
         def gone() -> bool:
-            if door._peers or not door.begun:
+            if door._connections or not door.begun:
                 try:
                     client.ask(command="status")
                 except OSError:
                     return True
             served.serve(lambda _: long)
-            return not door._peers
+            return not door._connections
 
-        until(lambda: served.serve(echo) or door._peers)
+        until(lambda: served.serve(echo) or door._connections)
         until(gone)
 
 
@@ -184,7 +184,7 @@ def test_who_comes_after_a_stop_is_heard_while_others_still_wait_to_be_let_in(
     addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A flood of connections never lets the queue of them be seen empty."""
-    monkeypatch.setattr("softfinger.daemon.gateway.peers._ACCEPTED", 1)
+    monkeypatch.setattr("softfinger.daemon.gateway.bounds.ACCEPTED", 1)
     with Served(commands=addresses[1]) as served:
         before = [RawClient(addresses[1], b"DEALER") for _ in range(3)]
         for client in before:

@@ -11,7 +11,6 @@ import softfinger
 
 ROOT = Path(softfinger.__file__).parents[1]
 KNOWN = {  # within functions
-    "daemon.gateway.service": {"daemon.gateway.curve"},
     "daemon.profile.settings": {"daemon.backends", "daemon.servos.control_table"},
 }
 ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it

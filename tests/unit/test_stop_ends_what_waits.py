@@ -14,7 +14,7 @@ from unittest.mock import patch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.gateway import peers
+from softfinger.daemon.gateway import bounds
 from tests.conftest import until
 from tests.harness.gateway import Served
 from tests.harness.zmtp_client import RawClient
@@ -107,8 +107,8 @@ def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[s
     with (
         TemporaryDirectory() as folder,
         # Little at a time, so that much waits.
-        patch.object(peers, "_ACCEPTED", 1),
-        patch.object(peers, "_READ", len(arm(0))),
+        patch.object(bounds, "ACCEPTED", 1),
+        patch.object(bounds, "READ", len(arm(0))),
     ):
         scene = Scene(folder)
         try:

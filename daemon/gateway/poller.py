@@ -10,7 +10,7 @@ from collections.abc import Callable
 _READY = 64  # descriptors asked for at once
 
 
-class Poll:
+class Poller:
     """Waits for descriptors and calls what each was given."""
 
     def __init__(self) -> None:

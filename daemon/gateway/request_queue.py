@@ -19,17 +19,10 @@ from typing import Any, NamedTuple, Protocol
 import msgpack
 
 from softfinger.daemon.errors import Refused
+from softfinger.daemon.gateway import bounds
 from softfinger.daemon.wire.command_server import PASSED, decode
 
-_UNDER_WAY = 4  # requests that the loop has and hasn't answered; a stop goes beside them
-_WAITING_EACH = 64  # requests of one client that wait here …
-_WAITING = 2048  # … and of all, beyond one of each
-_ALL = 2000.0  # requests a second of all clients together …
-_FEWEST = 2.0  # … but each may send so many
-_OLDEST = 1.0  # s after which a request that waits is too old to act upon
-_LOST = 2.0  # s after which an answer of the loop is given up
-_NUMBERS = 1 << 30  # that requests are told apart by
-_REFUSALS = 1  # that are answered at one read from a client that floods
+_NUMBERS = 1 << 30  # that requests are distinguished by
 _FULL = "too many commands wait already"
 _OLD = "waited too long for its turn; send it again"
 
@@ -52,14 +45,30 @@ class Client(Protocol):
         """Send the reply to one of its requests, unless it has gone."""
 
 
-class Pace:
+class Allowance:
+    """So many a second, and a burst at once."""
+
+    __slots__ = ("_left", "_then")
+
+    def __init__(self, burst: float, now: float = 0.0) -> None:
+        self._left = burst
+        self._then = now
+
+    def take(self, per_second: float, burst: float, now: float) -> bool:
+        """Count one more; False when it is too many."""
+        left = min(self._left + (now - self._then) * per_second, burst) - 1.0
+        self._left = max(left, 0.0)
+        self._then = now
+        return left >= 0.0
+
+
+class Pace(Allowance):
     """What a client may still send: so many a second, of which one second's worth at once."""
 
-    __slots__ = ("_left", "_then", "behind", "refusals", "stopped")
+    __slots__ = ("behind", "refusals", "stopped")
 
     def __init__(self, per_second: float, now: float) -> None:
-        self._left = per_second
-        self._then = now
+        super().__init__(per_second, now)
         self.behind = False  # it sent too much, and has not paused since
         self.begin_read()
 
@@ -71,17 +80,7 @@ class Pace:
     def begin_read(self) -> None:
         """Some more of what it sent is going to be taken."""
         self.refusals = 0  # at this read
-        self.stopped = False  # a stop was heard in a flood
-
-    def take(self, per_second: float, now: float) -> bool:
-        """Count one more request; False when it is too many."""
-        left = self._left + (now - self._then) * per_second
-        self._left = min(left, per_second) - 1.0
-        self._then = now
-        if self._left < 0.0:
-            self._left = 0.0
-            self.behind = True
-        return not self.behind
+        self.stopped = False  # it sent a stop in a flood
 
 
 class _Request(NamedTuple):
@@ -91,7 +90,7 @@ class _Request(NamedTuple):
     packed: bytes
 
 
-class Requests:
+class RequestQueue:
     """The requests of all clients on their way to the loop, and the replies on their way back."""
 
     def __init__(
@@ -121,9 +120,9 @@ class Requests:
 
     def take(self, client: Client, envelope: Any, payload: bytes, now: float) -> None:
         """One message of a client: it waits for its turn, or is refused."""
-        pace = client.pace
-        in_pace = pace.take(self._shared(client, now), now)
-        if not in_pace and (pace.stopped or b"stop" not in payload):
+        pace, rate = client.pace, self._shared(client, now)
+        pace.behind = not pace.take(rate, rate, now) or pace.behind
+        if pace.behind and (pace.stopped or b"stop" not in payload):
             self._refuse_flood(client, envelope)
             return
         try:
@@ -149,30 +148,30 @@ class Requests:
             self._share_until = now + 1.0
             self._active.clear()
         self._active.add(client)
-        return min(self._per_second, max(_ALL / len(self._active), _FEWEST))
+        return min(self._per_second, max(bounds.ALL_RATE / len(self._active), bounds.LEAST_RATE))
 
     def _refuse_flood(self, client: Client, envelope: Any) -> None:
         self.refused += 1
         client.pace.refusals += 1
-        if client.pace.refusals <= _REFUSALS:
+        if client.pace.refusals <= bounds.REFUSALS:
             _refuse(client, envelope, f"too many commands: at most {self._per_second:g} a second")
 
     def _queue(self, client: Client, envelope: Any, packed: bytes, now: float) -> None:
-        held = self._waiting.get(client)
-        if held is None:
-            self._waiting[client] = held = deque()
-        elif len(held) >= _WAITING_EACH or self._count >= _WAITING:
+        queued = self._waiting.get(client)
+        if queued is None:
+            self._waiting[client] = queued = deque()
+        elif len(queued) >= bounds.WAITING_EACH or self._count >= bounds.WAITING:
             self.refused += 1
             _refuse(client, envelope, _FULL)
             return
-        held.append(_Request(envelope, client.epoch, now, packed))
+        queued.append(_Request(envelope, client.epoch, now, packed))
         self._count += 1
 
     def pump(self, now: float) -> None:
         """Give the loop what it may have now."""
         while self._asked:
             number, (_, then) = next(iter(self._asked.items()))
-            if now - then < _LOST:
+            if now - then < bounds.LOST:
                 break
             self.reply(number, None)
         if self._stops and not self._stop:
@@ -180,22 +179,22 @@ class Requests:
             self._stop = self._ask(self._stops, self.epoch, packed, now, stop=True)
             if self._stop:
                 self._stops = []
-        while self._waiting and len(self._asked) < _UNDER_WAY + bool(self._stop):
-            client, held = next(iter(self._waiting.items()))
-            request = held[0]
+        while self._waiting and len(self._asked) < bounds.UNDER_WAY + bool(self._stop):
+            client, queued = next(iter(self._waiting.items()))
+            request = queued[0]
             if request.epoch != self.epoch:
                 _refuse(client, request.envelope, PASSED)
-            elif now - request.came > _OLDEST:
+            elif now - request.came > bounds.OLDEST:
                 _refuse(client, request.envelope, _OLD)
             elif client.alive:
                 target = [(client, request.envelope)]
                 if not self._ask(target, request.epoch, request.packed, now):
                     return
-            held.popleft()
+            queued.popleft()
             self._count -= 1
             del self._waiting[client]
-            if held:
-                self._waiting[client] = held  # behind all others
+            if queued:
+                self._waiting[client] = queued  # behind all others
 
     def _ask(
         self,
@@ -226,8 +225,8 @@ class Requests:
         """Refuse all that waits; what is read from now on carries its client's epoch."""
         self.epoch = epoch
         waiting, self._waiting, self._count = self._waiting, {}, 0
-        for client, held in waiting.items():
-            for request in held:
+        for client, queued in waiting.items():
+            for request in queued:
                 _refuse(client, request.envelope, PASSED)
 
 

@@ -1,0 +1,57 @@
+"""All bounds of the gateway: what clients may send, hold and cost; see `docs/security.md`.
+
+Those that a profile sets (`commands.max_bytes`, `commands.per_second`, `stream.queue`) are in
+`gateway.config`.
+"""
+
+from __future__ import annotations
+
+# The process
+MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
+DESCRIPTORS = 64  # that are not clients'
+CLIENTS = 1024  # of the commands; a quarter as many of the stream
+STALLED = 3.0  # s without a step after which the process is ended
+
+# A connection without keys
+HANDSHAKE = 2.0  # s in which a client has to have finished its handshake
+ACCEPTED = 32  # connections taken at a time
+READ = 512  # bytes of one client at a time
+FRAMES = 4  # times commands.max_bytes, in one frame
+PARTS = 2  # of a request: REQ's empty one and the request
+CONTROLS = 64.0  # subscriptions, pings and the like of a client at once, …
+CONTROL_RATE = 10.0  # … and a second
+SUBSCRIPTION = 64  # bytes of one
+REPLIES = 256 * 1024  # bytes of replies that a client leaves unread
+BACKLOG = 32 << 20  # bytes that wait for all subscribers, before the slowest is disconnected
+REST = 0.05  # s in which a client that floods is not read, …
+REST_EACH = 5e-4  # … longer by this for each other one
+
+# Connections with keys, which libzmq holds; it ends when it is out of memory
+KEYED_CLIENTS = 256
+KEYED_MEMORY = 48 << 20  # bytes for …
+KEYED_CONNECTION = 100_000  # bytes of each, and for each message that waits for it …
+KEYED_WAITING = 128  # … two of libzmq's records
+KEYED_QUEUE = 64  # requests of one client in its socket
+KEYED_SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
+PURGE = 0.02  # s after a stop in which all requests are refused, …
+LONGEST_PURGE = 0.25  # … and while there are any
+KEYS_CHECKED = 0.5  # s between looks at the folder of keys
+
+# Requests
+UNDER_WAY = 4  # that the loop has and hasn't answered; a stop goes beside them
+WAITING_EACH = 64  # of one client that wait here …
+WAITING = 2048  # … and of all, beyond one of each
+ALL_RATE = 2000.0  # a second of all clients together …
+LEAST_RATE = 2.0  # … but each may send so many
+OLDEST = 1.0  # s after which one that waits is too old to act upon
+LOST = 2.0  # s after which an answer of the loop is given up
+REFUSALS = 1  # that are answered at one read from a client that floods
+
+# Turns
+TEND = 0.01  # s between looks at what is due by the time
+TURN = 0.004  # s of publishing, of serving clients or of reading requests with keys, before others
+FROM_LOOP = 64  # packets of the loop taken at a time
+UNSENT = 1000  # of them that wait to be sent; the oldest are dropped
+LARGEST = 64 << 20  # bytes of a message that comes in pieces
+LATE_EVENTS = 50  # that a late subscriber gets again
+LAST_WORDS = 0.2  # s for subscribers to take what waits when the loop has ended
