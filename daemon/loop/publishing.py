@@ -126,7 +126,7 @@ class Publishing:
         self._numbers[perception.finger] += 1
         self._maps += 1
         wall = state.wall - (state.t - frame.t_sample)
-        data = perception.shown(frame)
+        data = perception.published()
         number = self._numbers[perception.finger]
         self._publisher.tactile(frame, data, perception.finger, perception.facts, wall, n, number)
 

@@ -114,14 +114,8 @@ class ContactFilter:
             self._history,
             finger,
             frame.t_sample,
-            (
-                estimate.d,
-                estimate.tilt_x,
-                estimate.tilt_y,
-                estimate.gain,
-                estimate.d_std,
-                estimate.tilt_x_std,
-            ),
+            (estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain),
+            estimate.covariance,
         )
 
     def publish(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:

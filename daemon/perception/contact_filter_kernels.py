@@ -296,16 +296,16 @@ def correct(
     history: Records[Past],
     finger: int,
     t: float,
-    found: tuple[float, float, float, float, float, float],
+    found: tuple[float, float, float, float],
+    covariance: FloatArray,
 ) -> None:
-    """Take in what one finger's frame of time ``t`` has ``found``.
-
-    That is d, θ, tilt_y, gain, and the standard deviations of d and θ.
-    """
+    """Take in one finger's frame of time ``t``: d, θ, tilt_y and gain, and their covariance."""
     f = filters[0]
     tip = f.tip[finger]
     other = f.tip[1 - finger]
-    d, theta, tilt_y, gain, d_std, theta_std = found
+    d, theta, tilt_y, gain = found
+    d_std = math.sqrt(covariance[0, 0])
+    theta_std = math.sqrt(covariance[1, 1])
     d_variance = d_std * d_std
     row, later, share = _rows_at(history, f.newest, t)
     before = history[row]

@@ -7,6 +7,7 @@ to the contacts of every tick.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,13 +56,9 @@ class FingerPerception:
     """One finger's sensor: its newest frame, and what is estimated from that frame alone."""
 
     def __init__(
-        self,
-        sensor: TactileSensor,
-        model: FingerModel,
-        settings: Settings,
-        events: list[Event] | None = None,
+        self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """What became of a tare is added to ``events`` where it failed."""
+        """A tare that fails is added to ``events``."""
         tactile, calibration = settings.tactile, model.calibration
         self.finger = model.finger
         self.sensor = sensor
@@ -70,30 +67,28 @@ class FingerPerception:
         self.estimate = ContactEstimate()  # of the last valid frame
         live = getattr(sensor, "live", None)  # of a recording that lacks cells
         self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
-        self._scale = tactile.pascal_per_count
         self._full = float(tactile.full_count)
+        self._scale = tactile.pascal_per_count  # of the readings
         self._converter: Converter | None = None
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count)
             self._scale = 1.0
-        self._converted: Frame | None = None  # whose pressure the converter holds
-        self._pressure: NDArray[np.float64] | None = None
+        self._readings: NDArray[Any] | None = None  # of the newest frame: counts over zero, or Pa
         self._as_pressure = settings.stream.tactile_unit == "Pa"
         self.facts = self._facts(settings, model)
-        self._events = [] if events is None else events
-        self._zero: NDArray[np.uint16] | None = None
-        self._tare_sum: NDArray[np.uint32] | None = None
+        self._events = events
+        self._zero: NDArray[np.uint16] | None = None  # where there is no converter
+        self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_left = 0
-        self._zero_before: tuple[NDArray[np.uint16] | None, float | None] = None, None
 
     @property
     def taring(self) -> bool:
-        """The zero is being learnt: what is felt now is not yet right."""
+        """The zero is being learnt."""
         return self._tare_left > 0
 
     def tare(self) -> None:
         """Take the mean of the next frames as zero, cell by cell."""
-        self._tare_sum = None
+        self._tare_sum = 0
         self._tare_left = _TARE_FRAMES
 
     def update(self) -> Frame | None:
@@ -103,30 +98,30 @@ class FingerPerception:
             return None
         self.frame = frame
         self.frames += 1
+        counts = frame.data
+        if self._tare_left and frame.valid:
+            self._learn_zero(counts)
+        if self._converter is not None:
+            readings: NDArray[Any] = self._converter(counts)
+        elif self._zero is not None:
+            readings = np.maximum(counts, self._zero) - self._zero
+        else:
+            readings = counts
+        self._readings = readings
         if frame.valid:
-            counts = frame.data
-            if self._tare_left:
-                self._learn_zero(counts)
-            if self._converter is not None:
-                self._pressure, self._converted = self._converter(counts), frame
-                self.estimate = self._estimator.update(self._pressure, self._scale)
-            else:
-                if self._zero is not None:
-                    counts = np.maximum(counts, self._zero) - self._zero
-                self.estimate = self._estimator.update(counts, self._scale)
+            self.estimate = self._estimator.update(readings, self._scale)
         return frame
 
-    def shown(self, frame: Frame) -> NDArray[np.uint16]:
-        """The newest frame's data [rows, cols] for subscribers, in steps as ``facts`` tells."""
+    def published(self) -> NDArray[np.uint16]:
+        """The newest frame's data [rows, cols] for subscribers, in steps as ``facts`` says."""
+        assert self.frame is not None
+        assert self._readings is not None
         if not self._as_pressure:
-            return frame.data
+            return self.frame.data
         if self._converter is None:
-            zero = self._zero
-            return frame.data if zero is None else np.maximum(frame.data, zero) - zero
-        if self._pressure is None or self._converted is not frame:
-            self._pressure, self._converted = self._converter(frame.data), frame
+            return self._readings
         # A zero below the calibration's lets a cell read more than the scale was made for.
-        steps = np.minimum(self._pressure * (1.0 / self.facts.scale), _STEPS)
+        steps = np.minimum(self._readings * (1.0 / self.facts.scale), _STEPS)
         return np.rint(steps).astype(np.uint16)
 
     def _facts(self, settings: Settings, model: FingerModel) -> SensorFacts:
@@ -147,20 +142,13 @@ class FingerPerception:
         )
 
     def _learn_zero(self, counts: NDArray[np.uint16]) -> None:
-        if self._tare_sum is None:
-            self._zero_before = self._zero, self._estimator.saturation
-            if self._converter is None:
-                self._zero = None
-                self._estimator.saturation = self._full
-            self._tare_sum = np.zeros(counts.shape, np.uint32)
-        self._tare_sum += counts
+        self._tare_sum = self._tare_sum + counts.astype(np.uint32)
         self._tare_left -= 1
         if self._tare_left:
             return
         mean = self._tare_sum / _TARE_FRAMES
         ends = self._full - np.round(mean)
         if not np.median(ends) > 0.0:  # over such a zero no contact could be felt
-            self._zero, self._estimator.saturation = self._zero_before
             side = FINGERS[self.finger]
             text = f"{side} sensor's zero stays: most cells are full where nothing presses"
             self._events.append(("warning", "tare", text))

@@ -188,7 +188,7 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
             daemon.loop.advance(0.05)
             (perception,) = daemon.loop.perception.fingers
             frame, facts = perception.frame, perception.facts
-            shown = perception.shown(frame)
+            shown = perception.published()
             message = tactile_message(frame, shown, 0, facts, 1.0)
         assert message["centre_x"] == calibration.centre.centre[0]
         assert message["rotation"] == calibration.centre.rotation
