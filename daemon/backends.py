@@ -1,6 +1,6 @@
-"""Backends by name: the class that serves each name of the settings, imported when a scene asks.
+"""Backends by name: what serves each name of the settings, imported when a scene asks for it.
 
-A new servo backend or tactile board is a line here and a module of its own.
+A new servo backend, tactile board or object is a line here and a class or function of its own.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 class Backend(NamedTuple):
     """Where a backend's class stands, and what it needs beside its settings and the clock."""
 
-    place: str  # module:class
+    place: str  # module:class or function
     metal: bool = True  # it drives or reads real hardware
     hand: bool = False  # it needs the simulated hand
 
     def load(self) -> Any:
-        """The class."""
+        """The class or function."""
         module, _, name = self.place.partition(":")
         return getattr(import_module(f"softfinger.daemon.{module}"), name)
 
@@ -43,6 +43,15 @@ TACTILE = {
     "cobs": Backend("tactile.cobs:Cobs"),
     "replay": Backend("tactile.replay:ReplayTactile", metal=False),
     "none": NONE,
+}
+SHAPES = {  # of the simulated object
+    name: Backend(f"simulation.physics.shapes:{function}", metal=False)
+    for name, function in (
+        ("rectangle", "rectangle"),
+        ("disc", "disc"),
+        ("wedge", "wedge"),
+        ("none", "nothing"),
+    )
 }
 
 

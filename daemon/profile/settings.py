@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from softfinger.daemon.backends import SERVOS, TACTILE, known_servo_models
+from softfinger.daemon.backends import SERVOS, SHAPES, TACTILE, known_servo_models
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
 # Every number has an end on both sides: implausible values are typing errors, and must not reach
@@ -292,7 +292,7 @@ class Simulation(Section):
 
     seed: Annotated[int, Field(ge=0)] = 1
     object_mass: Factor = 0.10  # kg
-    object_shape: Literal["rectangle", "disc", "wedge", "none"] = "rectangle"
+    object_shape: Annotated[str, _one_of(SHAPES)] = "rectangle"
     object_width: Length = 0.040  # of a wedge: at half its height
     object_height: Length = 0.060
     object_radius: Length = 0.020  # of a disc

@@ -42,7 +42,7 @@ class _Watch:
         self._view = view
         self._terms = [(i, holding(term)) for i, term in limit.terms(view, "share")]
         lasts = limit.lasts
-        self._lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
+        self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
         self.since = math.inf  # broken since then, inf: it is not
         self._ended = -math.inf
         self.reported = False
@@ -58,13 +58,8 @@ class _Watch:
                 return limit.text(view, state, i, share)
         return ""
 
-    def cause(self, state: State) -> str:
-        """What stands now, and has for long enough; nothing is changed by asking."""
-        lasted = state.t - self.since >= self._lasts if self.since < math.inf else not self._lasts
-        return self.find(state, self.limit.share) if lasted else ""
-
     def look(self, state: State) -> str:
-        """The same at this tick, taken in."""
+        """What stands at this tick and has for long enough; keeps count of how long."""
         if self.limit.remember is not None:
             self.limit.remember(self._view, state)
         found = self.find(state, self.limit.share * (_EASE if self.reported else 1.0))
@@ -76,7 +71,7 @@ class _Watch:
                 self.reported = False
             return ""
         self.since = min(self.since, state.t)
-        return found if state.t - self.since >= self._lasts else ""
+        return found if state.t - self.since >= self.lasts else ""
 
 
 class Safety:
@@ -172,8 +167,12 @@ class Safety:
         With ``gripping`` the limits of a grip are judged, whatever the mode. Nothing is changed.
         """
         gripping = gripping or state.mode in GRIPPING
+        kept = self._holds(state, state.reading, state.contacts, self._view, 1.0)
         for watch in self._faults:
-            if (gripping or not watch.limit.gripping) and (found := watch.cause(state)):
+            if (kept and watch in self._each_tick) or (watch.limit.gripping and not gripping):
+                continue
+            lasted = state.t - min(watch.since, state.t) >= watch.lasts
+            if lasted and (found := watch.find(state, watch.limit.share)):
                 return found
         return ""
 

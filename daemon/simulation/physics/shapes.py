@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.backends import SHAPES
 from softfinger.daemon.profile.settings import Simulation
 from softfinger.daemon.simulation.physics.plant_state import (
     DISC,
@@ -52,18 +53,36 @@ class Shape:
 
 
 def shape_of(simulation: Simulation) -> Shape:
-    """The object of the settings."""
-    if simulation.object_shape == "disc":
-        radius = simulation.object_radius
-        square = _trapezoid(radius, radius, radius)
-        return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
+    """The object of the settings, made by the function that `daemon.backends` names for it."""
+    shape: Shape = SHAPES[simulation.object_shape].load()(simulation)
+    return shape
+
+
+def rectangle(simulation: Simulation) -> Shape:
+    """A box of the settings' width and height."""
+    return _polygon(RECTANGLE, simulation, 0.0)
+
+
+def wedge(simulation: Simulation) -> Shape:
+    """Faces that lean by half the taper each, with the settings' width at half the height."""
+    leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
+    return _polygon(POLYGON, simulation, leaning)
+
+
+def disc(simulation: Simulation) -> Shape:
+    """A disc of the settings' radius."""
+    radius = simulation.object_radius
+    square = _trapezoid(radius, radius, radius)
+    return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
+
+
+def nothing(simulation: Simulation) -> Shape:
+    """No object; its outline is the rectangle's."""
+    return _polygon(NO_OBJECT, simulation, 0.0)
+
+
+def _polygon(kind: int, simulation: Simulation, leaning: float) -> Shape:
     half, height = 0.5 * simulation.object_width, simulation.object_height
-    kind, leaning = RECTANGLE, 0.0
-    if simulation.object_shape == "wedge":
-        kind = POLYGON
-        leaning = 0.5 * height * math.tan(0.5 * simulation.object_taper)
-    elif simulation.object_shape == "none":
-        kind = NO_OBJECT
     corners = _trapezoid(half + leaning, half - leaning, 0.5 * height)
     lever, squared = _mean_distances(corners)
     return Shape(kind, corners, 0.0, math.sqrt(squared), lever)

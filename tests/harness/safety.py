@@ -1,0 +1,92 @@
+"""States for the limits to judge, and a `Safety` that does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.limits import LIMITS
+from softfinger.daemon.safety.supervisor import Safety
+from softfinger.daemon.types import Contact, Frame, Goal, State
+from softfinger.kinematics.estimation.estimator import ContactEstimate
+
+SETTINGS = Settings()
+BOUNDS = SETTINGS.safety
+
+
+class Sensor:
+    """What the rows see of a sensor."""
+
+    def __init__(self, finger: int) -> None:
+        self.finger = finger
+        self.frame: Frame | None = None
+        self.estimate = ContactEstimate()
+
+    def give(self, t: float, data: Any) -> None:
+        seq = 1 if self.frame is None else self.frame.seq + 1
+        self.frame = Frame(seq, t, t, True, np.array(data, np.uint16))
+
+
+def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> Safety:
+    return Safety(SETTINGS, has_servos, has_sensors, **parts)
+
+
+def sound(mode: Mode = Mode.HOLDING) -> State:
+    """A state with nothing wrong, at 5 s."""
+    state = State(t=5.0, mode=mode, torque=True, seq=10)
+    state.reading.t = 5.0
+    state.reading.valid = True
+    state.reading.temperature = [40.0, 40.0]
+    state.reading.voltage = [12.0, 12.0]
+    state.contacts = [
+        Contact(
+            seq=1,
+            t=4.99,
+            t_arrival=5.0,
+            t_sound=5.0,
+            valid=True,
+            contact=True,
+            d=0.004,
+            theta=0.1,
+            theta_std=1e-3,
+            force=5.0,
+        )
+        for _ in range(2)
+    ]
+    state.object.valid = True
+    state.object.width = 0.04
+    state.goal = goal((0.0, 0.0), (0.3, 0.3))
+    return state
+
+
+def goal(q: tuple[float, float], current: tuple[float, float]) -> Goal:
+    return Goal(valid=True, q=list(q), current=list(current))
+
+
+def later(state: State, dt: float) -> None:
+    """Time goes on, and everything is as fresh as it was."""
+    state.t += dt
+    state.reading.t += dt
+    state.seq += 1
+    for contact in state.contacts:
+        contact.t_sound += dt
+        contact.t_arrival += dt
+
+
+def levers(lever: float) -> GraspState:
+    held = GraspState()
+    held.lever = [lever, lever]
+    return held
+
+
+def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
+    """The fault after so many seconds of this state; every row has had its turn."""
+    found = None
+    for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
+        found = judge.judge(state)
+        later(state, 0.002)
+    return ("", "") if found is None else (found.name, found.text)

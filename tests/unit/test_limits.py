@@ -1,0 +1,411 @@
+"""The limits one by one, and when they are reported or latch."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from operator import setitem
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.profile.settings import Safety as Limits
+from softfinger.daemon.safety.limits import LIMITS
+from softfinger.daemon.types import State
+from softfinger.kinematics.estimation.estimator import ContactEstimate
+from tests.harness.safety import (
+    BOUNDS,
+    SETTINGS,
+    Sensor,
+    goal,
+    judged,
+    later,
+    levers,
+    safety,
+    sound,
+)
+
+
+def stale_reading(state: State) -> None:
+    state.reading.t = 4.9
+
+
+def alert(state: State) -> None:
+    state.reading.alert = 0b10
+    state.reading.hardware[1] = 0b100
+
+
+def past_the_limit(state: State) -> None:
+    state.reading.q[0] = SETTINGS.hand.q_max[0] + 0.2
+
+
+def no_angle(state: State) -> None:
+    state.reading.q[0] = math.nan
+
+
+def too_fast(state: State) -> None:
+    state.reading.dq[1] = -7.0
+
+
+def too_much_current(state: State) -> None:
+    state.reading.current[1] = -1.9
+
+
+def stalled(state: State) -> None:
+    state.mode = Mode.MOVING
+    state.goal = goal((0.0, 0.3), (0.4, 0.4))
+    state.reading.current = [0.0, 0.39]
+
+
+def dead(state: State) -> None:
+    state.goal = goal((0.3, 0.0), (0.4, 0.4))
+
+
+def pulled_away(state: State) -> None:
+    state.goal = goal((0.3, 0.0), (0.4, 0.4))
+    state.reading.current = [-0.4, 0.0]
+
+
+def old_readings(state: State) -> None:
+    state.reading.frozen = 0b01
+
+
+def deaf(state: State) -> None:
+    state.reading.lost = 0b11
+
+
+def thinner(state: State) -> None:
+    state.object.width = 0.0355
+
+
+def hot(state: State) -> None:
+    state.reading.temperature[0] = 71.0
+
+
+def brown_out(state: State) -> None:
+    state.reading.voltage[1] = 9.2
+
+
+def silent_frames(state: State) -> None:
+    state.contacts[0].t_arrival = state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+
+
+def unsound_estimates(state: State) -> None:
+    state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+
+
+def never_read(state: State) -> None:
+    state.reading.t = -math.inf
+
+
+def too_much_force(state: State) -> None:
+    state.contacts[1].force = 31.0
+
+
+def too_deep(state: State) -> None:
+    state.contacts[1].d = 0.013
+
+
+def near_the_rim(state: State) -> None:
+    state.contacts[0].theta = -math.asin(0.8) + 0.04
+
+
+def outside_the_model(state: State) -> None:
+    state.contacts[0].inside = False
+
+
+FAULTS: list[tuple[Callable[[State], None], str, str]] = [
+    (stale_reading, "servos.silent", "no good reading for 0.100 s"),
+    (alert, "servos.alert", "hardware error reported by right (overheating)"),
+    (past_the_limit, "joint.angle", "left joint at 1.200 rad, outside its limits"),
+    (no_angle, "joint.angle", "left joint at nan rad"),
+    (too_fast, "joint.velocity", "right joint at -7.00 rad/s, too fast"),
+    (too_much_current, "joint.current", "right joint takes -1.90 A, above 1.8 A"),
+    (stalled, "joint.stall", "right joint has stalled, 17.2° off its goal at 0.39 A"),
+    (dead, "joint.dead", "left joint stands 17.2° off its goal and takes 0.00 A of 0.40 A"),
+    (pulled_away, "joint.dead", "takes -0.40 A of 0.40 A"),
+    (old_readings, "servos.frozen", "servos: old readings from left"),
+    (deaf, "goal.lost", "none of the goals sent lately reached left and right"),
+    (hot, "servos.temperature", "left servo at 71 °C"),
+    (brown_out, "servos.voltage", "right servo's supply at 9.2 V, outside 9.5 to 16.0 V"),
+    (silent_frames, "tactile.silent", "tactile: no frame for 0.1"),
+    (unsound_estimates, "tactile.silent", "tactile: no sound estimate for 0.1"),
+    (never_read, "servos.silent", "servos: no good reading yet"),
+    (too_much_force, "tip.force", "right tip at 31.0 N, above 30 N"),
+    (too_deep, "tip.displacement", "right tip at 13.00 mm, above 12"),
+    (near_the_rim, "tip.tilt", "left tip at -50.8°, past 50.3° at this depth"),
+    (outside_the_model, "tip.tilt", "left tip at 5.7°, past"),
+]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name", "text"), FAULTS, ids=[each[0].__name__ for each in FAULTS]
+)
+def test_each_fault_is_found_and_named(
+    spoil: Callable[[State], None], name: str, text: str
+) -> None:
+    judge, state = safety(), sound()
+    spoil(state)
+    found = judged(judge, state, 2.5)
+    assert found[0] == name
+    assert text in found[1]
+    assert judge.cause(state), "and it refuses a command while it stands"
+
+
+def test_what_the_scene_lacks_is_no_cause() -> None:
+    state = sound()
+    for spoil in (stale_reading, alert, past_the_limit, too_fast, hot, brown_out):
+        spoil(state)
+    assert judged(safety(has_servos=False), state, 1.0) == ("", "")
+    state = sound()
+    for spoil in (silent_frames, too_much_force, near_the_rim):
+        spoil(state)
+    assert judged(safety(has_sensors=False), state, 1.0) == ("", "")
+
+
+def test_a_short_spike_of_what_must_last_is_no_fault() -> None:
+    judge, state = safety(), sound()
+    too_much_current(state)
+    for _ in range(20):
+        assert judge.judge(state) is None
+        later(state, 0.002)
+    state.reading.current = [0.0, 0.0]
+    judge.judge(state)
+    too_much_current(state)
+    assert judge.judge(state) is None, "it lasts anew"
+
+
+@pytest.mark.parametrize("name", ["too_much_current", "stalled", "dead", "brown_out", "thinner"])
+def test_asking_for_a_cause_changes_nothing(name: str) -> None:
+    """A limit that must last is found at the same tick, however often a command was refused."""
+    asked, alone, state = safety(), safety(), sound()
+    for k in range(1500):
+        if k == 100:
+            globals()[name](state)
+        for gripping in (False, True):
+            asked.cause(state, gripping)
+        assert asked.judge(state) == alone.judge(state)
+        later(state, 0.002)
+    assert asked.judge(state) is not None
+    assert asked.warnings == alone.warnings
+
+
+def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
+    state = sound()
+    state.contacts[0].t_sound = 5.0 - 4.0 / SETTINGS.tactile.rate
+    judge = safety()
+    assert judge.must_hold(state)
+    assert judge.limited["tactile.late"] == 1
+    assert judge.cause(state) == ""
+    state.mode = Mode.ARMED
+    assert not judge.must_hold(state)
+
+
+def test_overruns_in_a_row_are_a_cause() -> None:
+    judge, state = safety(), sound()
+    state.timing.late_in_row = SETTINGS.safety.overruns_fault
+    assert judged(judge, state) == ("loop.overruns", "loop: 100 overruns in a row")
+
+
+def felt(finger: int, theta: float) -> Sensor:
+    sensor = Sensor(finger)
+    sensor.estimate = ContactEstimate(contact=True, valid=True, tilt_x=theta)
+    sensor.estimate.covariance[1, 1] = 1e-3**2
+    return sensor
+
+
+def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -> None:
+    # θ1 = φ + q1, θ2 = φ − q2: the same φ of 0.1 rad by both
+    left, right = felt(0, 0.1 + 0.3), felt(1, 0.1 - 0.25)
+    judge, state = safety(sensors=[left, right]), sound()
+    state.reading.q = [0.3, 0.25]
+    state.goal.q = [0.3, 0.25]
+    assert judged(judge, state, 0.5) == ("", "")
+    right.estimate.tilt_x += 0.11
+    assert judged(judge, state, 0.5) == ("", "")
+    assert [warning.name for warning in judge.warnings] == ["hand.angle"]
+    right.estimate.tilt_x += 0.1
+    name, text = judged(judge, state, 0.5)
+    assert name == "hand.angle"
+    assert "12.0° apart: the object lies askew" in text
+    right.estimate.covariance[1, 1] = 0.06**2  # not known well enough to accuse anybody
+    assert judged(judge, state, 0.5) == ("", "")
+
+
+def test_a_held_object_that_changes_its_width_is_a_fault() -> None:
+    judge, state = safety(), sound()
+    judged(judge, state)
+    state.object.width = 0.0355
+    name, text = judged(judge, state, 0.5)
+    assert name == "hand.width"
+    assert "changed by -4.5 mm" in text
+    state.mode = Mode.ARMED  # let go; the next object may have any width
+    assert judged(judge, state) == ("", "")
+    state.mode = Mode.HOLDING
+    assert judged(judge, state, 0.5) == ("", "")
+
+
+def unequal_forces(state: State) -> None:
+    state.contacts[0].force = 12.0
+
+
+def strained(state: State) -> None:
+    state.reading.current = [1.19, 0.3]
+
+
+def warm(state: State) -> None:
+    state.reading.temperature[1] = 62.0
+
+
+def nearly_too_much_force(state: State) -> None:
+    state.contacts[0].force = state.contacts[1].force = 27.5
+
+
+WARNINGS: list[tuple[Callable[[State], None], str, str]] = [
+    (unequal_forces, "hand.force", "the tips feel 12.0 N and 5.0 N of one grip"),
+    (strained, "joint.strained", "left joint grips with all of its 1.2 A"),
+    (warm, "servos.temperature", "right servo at 62 °C"),
+    (nearly_too_much_force, "tip.force", "left tip at 27.5 N, above 27 N"),
+]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name", "text"), WARNINGS, ids=[each[0].__name__ for each in WARNINGS]
+)
+def test_a_warning_is_told_once_until_it_has_been_over(
+    spoil: Callable[[State], None], name: str, text: str
+) -> None:
+    judge, state = safety(), sound()
+    spoil(state)
+    assert judged(judge, state, 2.0) == ("", "")
+    assert [(each.name, each.text) for each in judge.warnings if each.name == name] == [
+        (name, text)
+    ]
+    judge.warnings.clear()
+    for wait, told in ((0.3, 0), (1.5, 1)):
+        well = sound()
+        well.t = well.reading.t = state.t
+        for contact in well.contacts:
+            contact.t_sound = state.t
+        judged(judge, well, wait)
+        state = well
+        spoil(state)
+        judged(judge, state, 2.0)
+        assert [each.name for each in judge.warnings].count(name) == told
+
+
+def test_a_warning_at_its_limit_does_not_flicker() -> None:
+    judge, state = safety(), sound()
+    for k in range(4000):
+        state.reading.temperature[0] = 60.0 + (0.5 if k // 700 % 2 else -0.5)
+        judge.judge(state)
+        later(state, 0.002)
+    assert len(judge.warnings) == 1
+
+
+def test_torque_that_the_tip_does_not_feel_is_told() -> None:
+    judge, state = safety(grasp=levers(0.08)), sound()
+    state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
+    judged(judge, state, 0.5)
+    assert judge.warnings == []
+    state.reading.current[1] *= 2.5
+    judged(judge, state, 0.5)
+    assert [each.name for each in judge.warnings] == ["hand.torque"]
+    assert "right joint gives 1.00 N·m, its tip feels what takes 0.40 N·m" in judge.warnings[0].text
+
+
+def test_shear_near_friction_is_told() -> None:
+    held = GraspState()
+    judge, state = safety(grasp=held), sound()
+    held.shear = 0.5
+    judged(judge, state, 0.3)
+    assert [each.name for each in judge.warnings if each.name == "grip.slip"] == ["grip.slip"]
+
+
+def test_a_frozen_sensor_is_a_fault_while_something_touches() -> None:
+    sensor = Sensor(1)
+    judge, state = safety(sensors=[sensor]), sound()
+    rng = np.random.default_rng(3)
+    for frozen, fault in ((False, False), (True, True)):
+        kept = rng.integers(0, 50, (4, 4))
+        found = None
+        for k in range(400):
+            if k % 5 == 0:
+                sensor.give(state.t, kept if frozen else rng.integers(0, 50, (4, 4)))
+            found = judge.judge(state)
+            later(state, 0.002)
+        assert (found is not None) is fault
+    assert found is not None
+    assert found.name == "tactile.frozen"
+    assert "right sensor frozen" in found.text
+    state.contacts[1].contact = False  # an empty sensor may well read the same again and again
+    assert judged(judge, state) == ("", "")
+
+
+def test_full_cells_are_told() -> None:
+    sensor = Sensor(0)
+    judge, state = safety(sensors=[sensor]), sound()
+    sensor.give(5.0, np.full((4, 4), 65535))
+    judged(judge, state, 0.3)
+    assert [each.text for each in judge.warnings] == [
+        "tactile: 100% of the left sensor's cells are full"
+    ]
+
+
+def deepest(share: float) -> float:
+    """A share of the greatest tilt [rad] that has its footprint on the sphere at `sound`'s d."""
+    return share * math.asin(1.0 - 0.004 / SETTINGS.tip.radius)
+
+
+# What may be pushed, as the share of its bound that it is given: (state, finger, share).
+PUSHES: tuple[Callable[[State, int, float], None], ...] = (
+    lambda state, i, share: setitem(state.reading.q, i, share * SETTINGS.hand.q_max[i]),
+    lambda state, i, share: setitem(state.reading.dq, i, share * BOUNDS.velocity_max),
+    lambda state, i, share: setitem(state.reading.current, i, share * BOUNDS.current_fault),
+    lambda state, _, share: setattr(state.reading, "t", 5.0 - share * SETTINGS.servos.fault_after),
+    lambda state, i, share: setattr(state.reading, "alert", (share > 1.0) << i),
+    lambda state, i, share: setattr(state.contacts[i], "force", share * BOUNDS.force_max),
+    lambda state, i, share: setattr(state.contacts[i], "d", share * BOUNDS.d_max),
+    lambda state, i, share: setattr(state.contacts[i], "theta", deepest(share)),
+    lambda state, i, share: setattr(
+        state.contacts[i], "t_sound", 5.0 - share * BOUNDS.frame_age_fault / SETTINGS.tactile.rate
+    ),
+    lambda state, i, share: setattr(state.contacts[i], "inside", share <= 1.0),
+    lambda state, i, share: setattr(state.contacts[i], "contact", share <= 1.0),
+    lambda state, _, share: setattr(
+        state.timing, "late_in_row", BOUNDS.overruns_fault if share > 1.0 else 0
+    ),
+)
+SHARES = (0.0, 0.5, 0.89, 0.9, 0.99, 1.01, 1.3, -0.5, -0.99, -1.01, math.nan, math.inf, -math.inf)
+
+
+def test_the_quick_look_never_passes_over_what_a_row_finds() -> None:
+    judge, quiet, loud = safety(), 0, 0
+    pushes = list(itertools.product(PUSHES, (0, 1), SHARES))
+    for first, second in itertools.combinations(pushes, 2):
+        state = sound()
+        for push, finger, share in (first, second):
+            push(state, finger, share)
+        if judge._holds(state, state.reading, state.contacts, judge._view, 1.0):
+            quiet += 1
+            for watch in judge._each_tick:
+                assert watch.find(state, watch.limit.share) == "", watch.limit.name
+        else:
+            loud += 1
+    assert quiet > 0.2 * (quiet + loud), "or nothing was compared"
+    assert loud > 0.2 * (quiet + loud)
+
+
+def test_every_row_is_named_once_a_level_and_its_settings_exist() -> None:
+    seen = [(row.name, row.level) for row in LIMITS]
+    assert len(seen) == len(set(seen))
+    for row in LIMITS:
+        for key in row.keys:
+            section, _, name = key.partition(".")
+            assert hasattr(getattr(SETTINGS, section), name), key
+    told = {key for row in LIMITS for key in row.keys}
+    missing = {f"safety.{name}" for name in Limits.model_fields} - told
+    assert missing == {"safety.current_move"}, "every limit that can be set stands in the table"
