@@ -76,6 +76,12 @@ def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: An
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
 
 
+def put_fault(bus: ServoBus, text: str, t: float) -> None:
+    """A fault in words, as ``silent=2``."""
+    kind, _, value = text.partition("=")
+    bus.fault(kind, float(value), t)
+
+
 def backend_settings(path: str, **servos: Any) -> Settings:
     """The Dynamixel backend on this port; a bus in a thread shares the interpreter's lock."""
     values = {"backend": "dynamixel", "port": path, "reply_timeout": 1.0} | servos
@@ -211,7 +217,7 @@ class RunningBus:
         return value
 
     def fault(self, text: str) -> None:
-        self.call(lambda: self.bus.fault(text, self._clock()))
+        self.call(lambda: put_fault(self.bus, text, self._clock()))
 
     def close(self) -> None:
         self._running = False

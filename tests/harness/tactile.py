@@ -15,7 +15,8 @@ from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import Clock, RealClock, VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
-from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
+from softfinger.daemon.simulation.emulator.fault_spec import parse_faults
+from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import Frame
@@ -64,9 +65,9 @@ class Rig:
         self.clock: Clock = RealClock() if backend in SERIAL else VirtualClock()
         hand = None
         if backend in SERIAL:
-            faults = (BoardFault.parse(fault),) if fault else ()
             self.images = _Images()
-            self.board = TactileBoard(self.images, ENCODERS[backend], RATE, 0.0, faults)
+            self.board = TactileBoard(self.images, ENCODERS[backend], RATE, 0.0)
+            self._faults = parse_faults([f"right:{fault}"] if fault else [], ())
             self._stack.callback(self.board.close)
             tactile["port"] = ("/dev/none", self.board.path)
             thread = threading.Thread(target=self._serve, daemon=True)
@@ -121,4 +122,7 @@ class Rig:
             if select.select([self.board], [], [], 0.5 / RATE)[0]:
                 self.board.hear()
             t += 1.0 / RATE
+            while self._faults and self._faults[0].after < t:
+                begun = self._faults.pop(0)
+                self.board.faults[begun.kind] = begun.value
             self.board.service(t)

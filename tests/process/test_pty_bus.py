@@ -17,7 +17,7 @@ from softfinger.daemon.simulation.emulator.pty_bus import PASSAGE, PtyServoBus
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from tests.harness.servos import make_bus
+from tests.harness.servos import make_bus, put_fault
 
 PING = frame(1, framing.PING)
 PONG = 14
@@ -106,7 +106,7 @@ def test_an_adapters_latency_timer_holds_replies(wires: list[Wire]) -> None:
 
 def test_a_late_reply_is_late_even_unpaced(wires: list[Wire]) -> None:
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
-    wire.port.bus.fault("late=1", wire.t)
+    put_fault(wire.port.bus, "late=1", wire.t)
     wire.send(PING)
     assert wire.when(0.009) == b""
     assert len(wire.when(0.002)) == PONG

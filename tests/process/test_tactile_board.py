@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encode_flexitac
-from softfinger.daemon.simulation.emulator.fault_spec import Faults
 from softfinger.daemon.simulation.emulator.tactile_board import (
-    BoardFault,
     FrameWriter,
     TactileBoard,
 )
-from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
 from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
 from softfinger.daemon.types import Frame
 from tests.conftest import until
@@ -62,19 +59,20 @@ class Client:
         return got
 
 
-def board(source: Source, *faults: str, rate: float = 100.0, delay: float = 0.01) -> TactileBoard:
-    parsed = tuple(BoardFault.parse(fault) for fault in faults)
-    return TactileBoard(source, ENCODERS["flexitac"], rate, delay, parsed, seed=4)
+def board(source: Source, rate: float = 100.0, delay: float = 0.01) -> TactileBoard:
+    return TactileBoard(source, ENCODERS["flexitac"], rate, delay, seed=4)
 
 
-def stream(*faults: str, frames: int = 40) -> tuple[list[bytes], TactileBoard]:
-    """What a client that reads at once gets for each frame."""
+def stream(kind: str, chance: float = 1.0, begin: int = 0) -> tuple[list[bytes], TactileBoard]:
+    """What a client that reads at once gets for each of 40 frames, with a fault from one on."""
     source = Source()
-    made = board(source, *faults)
+    made = board(source)
     client = Client(made.path)
     got = []
-    for k in range(frames):
+    for k in range(40):
         source.make(k)
+        if k == begin:
+            made.faults[kind] = chance
         before = made.sent
         made.service(k / 100 + 0.01)
         data = client.read()
@@ -159,7 +157,7 @@ def test_what_a_client_writes_is_taken_and_not_echoed():
 
 
 def test_torn_frames_lack_bytes():
-    got, made = stream("torn=0.5")
+    got, made = stream("torn", 0.5)
     whole = [len(data) == SIZE for data in got]
     assert 8 < sum(whole) < 32
     assert all(len(data) <= SIZE for data in got)
@@ -171,16 +169,16 @@ def test_torn_frames_lack_bytes():
 
 
 def test_noisy_frames_have_bytes_before_them():
-    got, _ = stream("noisy=1")
+    got, _ = stream("noisy")
     assert all(len(data) > SIZE for data in got)
     assert sum(data[-SIZE:].count(data[-1]) >= SIZE - 3 for data in got) >= 39
 
 
 def test_silent_and_frozen_begin_when_they_are_asked_to():
-    got, _ = stream("silent@0.2")
+    got, _ = stream("silent", begin=20)
     assert all(got[:20])
     assert not any(got[20:])
-    got, _ = stream("frozen@0.2")
+    got, _ = stream("frozen", begin=20)
     assert [data[-1] for data in got] == [*range(20), *[19] * 20]
 
 
@@ -193,57 +191,3 @@ def test_saturated_and_zero_boards_send_whole_frames_of_one_count():
 def test_wrong_size_is_half_the_grid():
     got, _ = stream("wrong-size")
     assert {len(data) for data in got} == {ROWS * COLS // 4 + 2}
-
-
-@pytest.mark.parametrize(
-    ("text", "kind", "value", "start"),
-    [
-        ("torn", "torn", 0.1, 0.0),
-        ("torn=0.5@2", "torn", 0.5, 2.0),
-        (" wrong-size ", "wrong-size", 1.0, 0.0),
-        ("silent@1e1", "silent", 1.0, 10.0),
-    ],
-)
-def test_faults_in_words(text, kind, value, start):
-    assert BoardFault.parse(text) == BoardFault(kind, value, start)
-
-
-def test_faults_are_sorted_to_boards_and_servos():
-    words = ["silent=2@3", "silent", "left:torn=0.2", "right:frozen@1", "drop=0.1", "unplug@2"]
-    assert Faults(words, (1, 2)).events == [
-        (0.0, "left", BoardFault("silent")),
-        (0.0, "right", BoardFault("silent")),
-        (0.0, "left", BoardFault("torn", 0.2)),
-        (0.0, "servos", "drop=0.1"),
-        (1.0, "right", BoardFault("frozen", 1.0, 1.0)),
-        (2.0, "servos", "unplug"),
-        (3.0, "servos", "silent=2"),
-    ]
-    assert Faults(["well", "left:well@1", "right:plug"], (1, 2)).events == [
-        (0.0, "servos", "well"),
-        (0.0, "left", "well"),
-        (0.0, "right", "well"),
-        (0.0, "right", "plug"),
-        (1.0, "left", "well"),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("melted", "wrong-size"),
-        ("left:melted", "wrong-size"),
-        ("middle:torn", "left: or right:"),
-        ("torn=2", "0 … 1"),
-        ("torn=much", "not a number"),
-        ("torn@never", "not a number"),
-        ("torn@-1", "0 s or more"),
-        ("torn@inf", "0 s or more"),
-        ("drop=0.1@later", "no time"),
-        ("drop=7", "0 … 1"),
-        ("silent=9", "no servo has that ID"),
-    ],
-)
-def test_faults_that_cannot_be_understood_are_told(text, told):
-    with pytest.raises(FaultError, match=told):
-        Faults([text], (1, 2))

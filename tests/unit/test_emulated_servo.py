@@ -13,7 +13,7 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
 from softfinger.daemon.simulation.servo_model.servo_health import OVERLOAD_TIME
-from tests.harness.servos import RADIAN, BusClient, make_bus
+from tests.harness.servos import RADIAN, BusClient, make_bus, put_fault
 
 
 def client(**options: Any) -> BusClient:
@@ -301,14 +301,14 @@ def test_bus_watchdog_sleeps_while_torque_is_off() -> None:
 def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
     c = client(model="XL330-M288")  # its shutdown mask has all three
     c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.bus.fault(fault, c.t)
+    put_fault(c.bus, fault, c.t)
     c.later(0.02)
     error, data = c.ask(framing.READ, struct.pack("<HH", reg.HARDWARE_ERROR_STATUS, 1))
     assert error == framing.ALERT
     assert data[0] == 1 << bit
     assert c.bus.servos[0].torque_on is False
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == framing.ALERT | framing.RESULT_FAIL
-    c.bus.fault("recover=1", c.t)
+    put_fault(c.bus, "recover=1", c.t)
     assert c.ask(framing.REBOOT)[0] == framing.ALERT
     assert c.send(1, framing.PING) == b""
     c.later(REBOOT_TIME)
@@ -319,7 +319,7 @@ def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
 def test_an_error_outside_the_shutdown_mask_only_alerts() -> None:
     c = client()  # XM430: mask 52 lacks the voltage bit
     c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.bus.fault("undervoltage=1", c.t)
+    put_fault(c.bus, "undervoltage=1", c.t)
     c.later(0.02)
     assert c.write(reg.LED, 1, 1) == framing.ALERT
     assert c.bus.servos[0].torque_on is True

@@ -24,7 +24,7 @@ from softfinger.daemon.servos.provisioning import (
 )
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.free_joints import FreeJoints
-from tests.harness.servos import DirectPort
+from tests.harness.servos import DirectPort, put_fault
 
 MODEL = by_name("XM430-W350")
 RATES = MODEL.baud_rates
@@ -220,7 +220,7 @@ def test_what_is_set_up(
 ) -> None:
     bus = wired()
     if fault:
-        bus.bus.fault(fault, 0.0)
+        put_fault(bus.bus, fault, 0.0)
     if register is not None:
         bus.servos[0].table.set(register, value)
     assert bus.provision() == ([done] if done else [], [])
@@ -231,7 +231,7 @@ def test_what_is_set_up(
 
 def test_what_can_not_be_set_up_is_reported_beside_what_was(wired: Callable[..., Bus]) -> None:
     bus = wired(prepared=False)
-    bus.bus.fault("silent=2", 0.0)
+    put_fault(bus.bus, "silent=2", 0.0)
     missing = f"{RIGHT}: no answer at any rate: check its power and cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")

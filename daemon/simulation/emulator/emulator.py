@@ -23,13 +23,18 @@ from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.simulation.emulator.control_port import ControlPort
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encoder_for
-from softfinger.daemon.simulation.emulator.fault_spec import SERVOS, Event, Faults
+from softfinger.daemon.simulation.emulator.fault_spec import (
+    SERVOS,
+    Event,
+    FaultError,
+    parse_faults,
+)
 from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
-from softfinger.daemon.simulation.emulator.tactile_board import BoardFault, TactileBoard
+from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
-from softfinger.daemon.simulation.servo_model.bus_faults import FaultError, LineFaults
+from softfinger.daemon.simulation.servo_model.bus_faults import LineFaults
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
@@ -104,7 +109,7 @@ class Emulator:
         ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
         with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
         rate. ``ids``: others than the settings', even one for both. ``faults``: see
-        :class:`Faults`. ``table_cache``: a folder where the contact table is kept.
+        :func:`parse_faults`. ``table_cache``: a folder where the contact table is kept.
         ``undisturbed``: a context without exceptions of signal handlers, for making what has to
         be removed again.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
@@ -121,7 +126,7 @@ class Emulator:
         self._advance_due = 0.0
         try:
             self._ids = settings.servos.ids if ids is None else ids
-            self._events = Faults(faults, self._ids).events
+            self._events = parse_faults(faults, self._ids)
             with undisturbed():
                 self._links = LinkFolder(folder)
                 self._closers.append(self._links.close)
@@ -259,7 +264,8 @@ class Emulator:
         """
         words = text.split()
         try:
-            fresh = Faults([word for word in words if word not in _REQUESTS], self._ids).events
+            faults = [word for word in words if word not in _REQUESTS]
+            fresh = parse_faults(faults, self._ids)
         except FaultError as error:
             return f"error: {error}"
         now = self.clock.now()
@@ -291,27 +297,27 @@ class Emulator:
         return {"t": t, "monotonic": time.monotonic(), "servos": servos}
 
     def _apply(self, event: Event, t: float) -> None:
-        part, what = event.part, event.what
+        _, part, kind, value = event
         device = self._servos if part == SERVOS else self._boards.get(part)
         if device is None:
             return
         name = part if part == SERVOS else f"tactile-{part}"
-        if what == "unplug":
+        if kind == "unplug":
             self._links.unlink(name)
             device.unplug()
-        elif what == "plug":
+        elif kind == "plug":
             if not device.plugged:
                 device.plug()
                 self._links.link(name, device.path)
         elif isinstance(device, TactileBoard):
-            if isinstance(what, BoardFault):
-                device.fault(what)
-            elif what == "well":
-                device.recover()
-        elif what == "well":
+            if kind == "well":
+                device.faults.clear()
+            else:
+                device.faults[kind] = value
+        elif kind == "well":
             device.bus.faults.rates = LineFaults()
-        elif isinstance(what, str):
-            device.bus.fault(what, t)
+        else:
+            device.bus.fault(kind, value, t)
 
 
 def with_board(settings: Settings) -> Settings:

@@ -1,22 +1,33 @@
-"""Words of text that say what shall go wrong with the stand-in hand, sorted to its parts."""
+"""Faults of the emulated hand in words: ``[PART:]KIND[=VALUE][@SECONDS]``."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from softfinger.daemon.simulation.emulator.tactile_board import BoardFault
-from softfinger.daemon.simulation.servo_model.bus_faults import (
-    SERVO_FAULTS,
-    FaultError,
-    parse_fault,
-)
+from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.simulation.servo_model.bus_faults import LINE_FAULTS, SERVO_FAULTS
 from softfinger.daemon.types import FINGERS
 
 SERVOS = "servos"
+BOARD_FAULTS = {  # kind → probability if none is given
+    "torn": 0.1,
+    "noisy": 0.1,
+    "silent": 1.0,
+    "frozen": 1.0,
+    "wrong-size": 1.0,
+    "saturated": 1.0,
+    "zero": 1.0,
+}
 _PORT = ("unplug", "plug")
 _WELL = "well"
+_WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*))?")
+
+
+class FaultError(SoftfingerError, ValueError):
+    """A fault that can't be understood. The message says what is known."""
 
 
 class Event(NamedTuple):
@@ -24,69 +35,71 @@ class Event(NamedTuple):
 
     after: float  # s
     part: str  # ``servos``, ``left`` or ``right``: a board
-    what: str | BoardFault  # a board's fault, or words for the part
+    kind: str
+    value: float = 1.0  # a probability, or a servo's ID
 
 
-class Faults:
-    """What shall go wrong: sorted from words of text to the servos and to each board.
+def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[Event]:
+    """Faults from words of text, in time's order, and as they were given where they start at once.
 
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` for both
-      boards, with ``left:`` or ``right:`` before it for one; see :class:`BoardFault`.
+      boards, with ``left:`` or ``right:`` before it for one; see :class:`TactileBoard`.
     - ``drop=0.01``, ``silent=2`` … for the servos; see :meth:`ServoBus.fault`.
     - ``unplug`` and ``plug`` for the servos' port, ``left:unplug`` … for a board's.
     - ``well`` ends what is wrong with the servos' line and boards, ``left:well`` with one board.
 
-    ``@SECONDS`` behind it says when it starts. ``events`` has them in time's order, and as they
-    were given where they start at once.
+    ``@SECONDS`` behind it says when it starts. ``ids`` are the servos'. Raises FaultError for a
+    word that can't be understood.
     """
-
-    def __init__(self, words: Iterable[str], ids: tuple[int, ...]) -> None:
-        """Raises FaultError for a word that can't be understood."""
-        events: list[Event] = []
-        for word in words:
-            events += self._parse(word.strip(), ids)
-        self.events = sorted(events, key=lambda event: event.after)
-
-    def _parse(self, word: str, ids: tuple[int, ...]) -> list[Event]:
-        side, colon, rest = word.partition(":")
-        if colon:
-            if side not in FINGERS:
-                raise FaultError(f"fault {word!r}: expected left: or right:, found {side}:")
-            text, after = _timed(rest)
-            if text in (*_PORT, _WELL):
-                return [Event(after, side, text)]
-            fault = BoardFault.parse(rest)
-            return [Event(fault.start, side, fault)]
-        kind = word.partition("@")[0].partition("=")[0]
-        if kind in BoardFault.KINDS and not word.startswith(tuple(f"{k}=" for k in SERVO_FAULTS)):
-            fault = BoardFault.parse(word)
-            return [Event(fault.start, name, fault) for name in FINGERS]
-        text, after = _timed(word)
-        if text == _WELL:
-            return [Event(after, name, _WELL) for name in (SERVOS, *FINGERS)]
-        if text not in _PORT:
-            kind, number = _servo_fault(text)
-            if kind in SERVO_FAULTS and number not in ids:
-                raise FaultError(f"fault {word!r}: no servo has that ID")
-        return [Event(after, SERVOS, text)]
+    return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
 
 
-def _timed(word: str) -> tuple[str, float]:
-    text, _, start = word.partition("@")
-    try:
-        after = float(start or "0")
-    except ValueError:
-        after = math.nan
+def _after(event: Event) -> float:
+    return event.after
+
+
+def _parse(word: str, ids: tuple[int, ...]) -> list[Event]:
+    def refused(why: str) -> FaultError:
+        return FaultError(f"fault {word!r}: {why}")
+
+    match = _WORD.fullmatch(word)
+    side, kind, text, start = match.groups() if match else (None, "", None, None)
+    if side is not None and side not in FINGERS:
+        raise refused(f"expected left: or right:, found {side}:")
+    after = _number(start) if start is not None else 0.0
     if not 0.0 <= after < math.inf:
-        raise FaultError(f"fault {word!r}: {start!r} is no time in seconds")
-    return text, after
+        raise refused(f"{start!r} is no time of 0 s or more")
+    value = _number(text) if text is not None else None
+    if value is not None and math.isnan(value):
+        raise refused(f"{text!r} is not a number")
+    probability = value is not None and 0.0 <= value <= 1.0
+    if value is None and kind in _PORT:
+        return [Event(after, side or SERVOS, kind)]
+    if value is None and kind == _WELL:
+        return [Event(after, part, kind) for part in ((side,) if side else (SERVOS, *FINGERS))]
+    # `silent=2` and `frozen=2` are a servo's, `silent` and `left:silent` a board's.
+    if kind in BOARD_FAULTS and (side or value is None or kind not in SERVO_FAULTS):
+        if value is not None and not probability:
+            raise refused("a probability lies in 0 … 1")
+        chance = BOARD_FAULTS[kind] if value is None else value
+        return [Event(after, part, kind, chance) for part in ((side,) if side else FINGERS)]
+    if value is not None and side is None and kind in LINE_FAULTS:
+        if not probability:
+            raise refused("a probability lies in 0 … 1")
+        return [Event(after, SERVOS, kind, value)]
+    if value is not None and side is None and kind in SERVO_FAULTS:
+        if value not in ids:
+            raise refused("no servo has that ID")
+        return [Event(after, SERVOS, kind, value)]
+    raise refused(
+        f"expected for tactile boards {', '.join(BOARD_FAULTS)} [=PROBABILITY]; for the servos "
+        f"{', '.join(LINE_FAULTS)} =PROBABILITY or {', '.join(SERVO_FAULTS)} =ID; or "
+        "unplug, plug, well"
+    )
 
 
-def _servo_fault(text: str) -> tuple[str, float]:
+def _number(text: str) -> float:
     try:
-        return parse_fault(text)
-    except FaultError as error:
-        boards = ", ".join(BoardFault.KINDS)
-        raise FaultError(
-            f"{error}; or for tactile boards {boards}; or unplug, plug, well"
-        ) from None
+        return float(text)
+    except ValueError:
+        return math.nan

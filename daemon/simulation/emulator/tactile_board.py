@@ -11,68 +11,20 @@ import contextlib
 import fcntl
 import math
 import os
-import re
 import termios
 import tty
-from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.simulation.emulator.encoders import Encoder
-from softfinger.daemon.simulation.servo_model.bus_faults import FaultError
 from softfinger.daemon.types import Frame
 
 _TTY_ROOM = 2048  # bytes; a tty reports at most 4095 unread ones, so more is never asked for
 _DRAIN = 4096
 _RETRY = 5e-4  # s until a frame that is late is asked for again
 _NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
-
-
-@dataclass(frozen=True, slots=True)
-class BoardFault:
-    """What goes wrong with a board from ``start`` [s] after its first frame on.
-
-    - ``torn``: with probability ``value`` a frame lacks some of its bytes, anywhere.
-    - ``noisy``: with probability ``value`` random bytes stand before a frame, and one byte of it
-      is wrong.
-    - ``silent``: it says nothing more.
-    - ``frozen``: it repeats its last frame.
-    - ``wrong-size``: it sends a grid of half the rows and half the columns.
-    - ``saturated``, ``zero``: all its cells read the greatest count, or none.
-    """
-
-    kind: str
-    value: float = 1.0
-    start: float = 0.0
-
-    KINDS = ("torn", "noisy", "silent", "frozen", "wrong-size", "saturated", "zero")
-
-    @classmethod
-    def parse(cls, text: str) -> BoardFault:
-        """``torn=0.1``, ``silent``, ``frozen@2.5``: kind, probability, seconds until it starts.
-
-        Raises:
-            FaultError: unknown kind, a probability outside 0 … 1, no such time.
-        """
-        match = re.fullmatch(r"([a-z-]+)(?:=([^@]*))?(?:@(.*))?", text.strip())
-        if match is None or match[1] not in cls.KINDS:
-            raise FaultError(
-                f"fault {text!r}: expected KIND[=PROBABILITY][@SECONDS] with {', '.join(cls.KINDS)}"
-            )
-        kind, chance, start = match[1], match[2], match[3]
-        default = "0.1" if kind in ("torn", "noisy") else "1"
-        try:
-            value = float(default if chance is None else chance)
-            after = float("0" if start is None else start)
-        except ValueError:
-            raise FaultError(f"fault {text!r}: not a number") from None
-        if not 0.0 <= value <= 1.0:
-            raise FaultError(f"fault {text!r}: a probability lies in 0 … 1")
-        if not (after >= 0.0 and math.isfinite(after)):
-            raise FaultError(f"fault {text!r}: it starts after 0 s or more")
-        return cls(kind, value, after)
 
 
 class FrameSource(Protocol):
@@ -146,6 +98,16 @@ class TactileBoard:
     """Sends each new frame of ``source`` on a pty, in one framing, with the faults asked for.
 
     A board that is asked for its frames sends the next one that comes after it was asked.
+    ``faults`` are in force, by their kind, with their probability:
+
+    - ``torn``: a frame lacks some of its bytes, anywhere.
+    - ``noisy``: random bytes stand before a frame, and one byte of it is wrong.
+    - ``silent``: it sends nothing more.
+    - ``frozen``: it repeats its last frame.
+    - ``wrong-size``: it sends a grid of half the rows and half the columns.
+    - ``saturated``, ``zero``: all its cells read the greatest count, or none.
+
+    The latter five are certain whatever their probability.
     """
 
     def __init__(
@@ -154,7 +116,6 @@ class TactileBoard:
         encoder: Encoder,
         rate: float,
         delay: float,
-        faults: tuple[BoardFault, ...] = (),
         seed: int = 1,
     ) -> None:
         """Frames are due at k/rate + delay [Hz, s]; ``seed`` drives the faults' chance."""
@@ -163,11 +124,10 @@ class TactileBoard:
         self._asked = not encoder.request
         self._rate = rate
         self._delay = delay
-        self._faults = list(faults)
+        self.faults: dict[str, float] = {}
         self._random = np.random.default_rng(seed)
         self.plug()
         self._seq = -1
-        self._start: float | None = None
         self._kept: NDArray[np.uint16] | None = None  # the image that a frozen board repeats
         self._due = -math.inf
         self.sent = 0  # frames
@@ -183,15 +143,6 @@ class TactileBoard:
         if self.plugged:
             self._writer.close()
         self.plugged = False
-
-    def fault(self, fault: BoardFault) -> None:
-        """Let this go wrong from now on, whatever its start, instead of an earlier one alike."""
-        kept = [each for each in self._faults if each.kind != fault.kind]
-        self._faults = [*kept, replace(fault, start=0.0)]
-
-    def recover(self) -> None:
-        """End all faults."""
-        self._faults = []
 
     @property
     def dropped(self) -> int:
@@ -224,11 +175,9 @@ class TactileBoard:
             self._due = min(self._due, t + _RETRY)
             return
         self._seq = frame.seq
-        if self._start is None:
-            self._start = t
         if not self._asked or not self.plugged:
             return
-        data = self._spoil(frame, t - self._start)
+        data = self._spoil(frame)
         if data:
             self._asked = not self._encoder.request
             self.sent += self._writer.send(data)
@@ -237,27 +186,25 @@ class TactileBoard:
         """Close the pty."""
         self.unplug()
 
-    def _spoil(self, frame: Frame, age: float) -> bytes:
-        counts = frame.data
-        faults = [fault for fault in self._faults if age >= fault.start]
-        kinds = {fault.kind for fault in faults}
-        if "silent" in kinds:
+    def _spoil(self, frame: Frame) -> bytes:
+        counts, faults = frame.data, self.faults
+        if "silent" in faults:
             return b""
-        if "frozen" in kinds:
+        if "frozen" in faults:
             counts = counts if self._kept is None else self._kept
         self._kept = counts
-        if "saturated" in kinds:
+        if "saturated" in faults:
             counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # framings clip it
-        elif "zero" in kinds:
+        elif "zero" in faults:
             counts = np.zeros_like(counts)
-        if "wrong-size" in kinds:
+        if "wrong-size" in faults:
             counts = counts[: counts.shape[0] // 2, : counts.shape[1] // 2]
         data = self._encoder.encode(counts, frame.seq, frame.t_sample)
-        for fault in faults:
-            if fault.kind == "torn" and self._random.random() < fault.value:
+        for kind, chance in faults.items():
+            if kind == "torn" and self._random.random() < chance:
                 left, right = sorted(self._random.integers(0, len(data) + 1, 2).tolist())
                 data = data[:left] + data[right:]
-            elif fault.kind == "noisy" and self._random.random() < fault.value:
+            elif kind == "noisy" and self._random.random() < chance:
                 wrong = bytearray(data)
                 wrong[self._random.integers(len(wrong))] = self._random.integers(256)
                 burst = self._random.bytes(int(self._random.integers(1, _NOISE_LENGTH + 1)))

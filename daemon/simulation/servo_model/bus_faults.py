@@ -1,22 +1,11 @@
-"""Faults on demand for the emulated servo bus: what may go wrong on the line and with servos.
-
-Instructions are lost on their way, replies are dropped, late, cut, damaged or doubled, with given
-probabilities from a seeded source. Everything can be set by a word of text, so that a flag and a
-control socket use the same terms.
-"""
+"""Faults of the emulated servo bus: what may go wrong on the line and with servos."""
 
 from __future__ import annotations
 
 import random
 from dataclasses import dataclass, fields
 
-from softfinger.daemon.errors import SoftfingerError
-
 LATE = 0.010  # s that a late reply is late by
-
-
-class FaultError(SoftfingerError, ValueError):
-    """A fault that can't be understood. The message says what is known."""
 
 
 @dataclass(slots=True)
@@ -83,27 +72,3 @@ class FaultSource:
             reply = bytes(damaged)
         copies = 2 if chance() < rates.duplicate else 1
         return [(delay, reply)] * copies
-
-
-def parse_fault(text: str) -> tuple[str, float]:
-    """``drop=0.01`` or ``overheat=2`` as (kind, number): a probability, or a servo's ID.
-
-    Raises:
-        FaultError: unknown kind, no number, a probability outside 0 … 1.
-    """
-    kind, equals, value = text.strip().partition("=")
-    known = LINE_FAULTS + SERVO_FAULTS
-    if kind not in known or not equals:
-        raise FaultError(
-            f"fault {text!r}: expected KIND=PROBABILITY with {', '.join(LINE_FAULTS)}, "
-            f"or KIND=ID with {', '.join(SERVO_FAULTS)}"
-        )
-    try:
-        number = float(value)
-    except ValueError:
-        raise FaultError(f"fault {text!r}: {value!r} is not a number") from None
-    if kind in LINE_FAULTS and not 0.0 <= number <= 1.0:
-        raise FaultError(f"fault {text!r}: a probability lies in 0 … 1")
-    if kind in SERVO_FAULTS and (number != int(number) or not 0 <= number <= 252):
-        raise FaultError(f"fault {text!r}: an ID is a whole number in 0 … 252")
-    return kind, number

@@ -20,9 +20,8 @@ from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_faults import (
     LINE_FAULTS,
-    FaultError,
+    SERVO_FAULTS,
     FaultSource,
-    parse_fault,
 )
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.collision import collide
@@ -171,21 +170,15 @@ class ServoBus:
             for late, spoilt in self.faults.spoil(reply.data)
         ]
 
-    def fault(self, text: str, t: float) -> None:
-        """Put a fault on the bus: ``drop=0.01``, ``silent=2``, ``overheat=1`` …
-
-        Raises:
-            FaultError: it can't be understood, or no servo has that ID.
-        """
-        kind, number = parse_fault(text)
+    def fault(self, kind: str, value: float, t: float) -> None:
+        """Let a fault begin: one of LINE_FAULTS with its probability, or of SERVO_FAULTS with the
+        servo's ID."""
         self._due = -math.inf
         if kind in LINE_FAULTS:
-            setattr(self.faults.rates, kind.replace("-", "_"), number)
-            return
-        servo = next((servo for servo in self.servos if servo.id == number), None)
-        if servo is None:
-            raise FaultError(f"fault {text!r}: no servo has that ID")
-        servo.fault(kind, t)
+            setattr(self.faults.rates, kind.replace("-", "_"), value)
+        for servo in self.servos:
+            if kind in SERVO_FAULTS and servo.id == value:
+                servo.fault(kind, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
         """Each servo's state, and what it was told since the record began."""

@@ -1,0 +1,54 @@
+"""Faults of the emulated hand in words: to which part, what, with which number, when."""
+
+from __future__ import annotations
+
+import pytest
+
+from softfinger.daemon.simulation.emulator.fault_spec import FaultError, parse_faults
+
+
+def test_faults_in_words() -> None:
+    words = [" silent=2@3 ", "silent", "left:torn=0.2", "right:frozen@1e1", "drop=0.1", "unplug@2"]
+    assert parse_faults(words, (1, 2)) == [
+        (0.0, "left", "silent", 1.0),
+        (0.0, "right", "silent", 1.0),
+        (0.0, "left", "torn", 0.2),
+        (0.0, "servos", "drop", 0.1),
+        (2.0, "servos", "unplug", 1.0),
+        (3.0, "servos", "silent", 2.0),
+        (10.0, "right", "frozen", 1.0),
+    ]
+    assert parse_faults(["well", "left:well@1", "right:plug", "noisy"], (1, 2)) == [
+        (0.0, "servos", "well", 1.0),
+        (0.0, "left", "well", 1.0),
+        (0.0, "right", "well", 1.0),
+        (0.0, "right", "plug", 1.0),
+        (0.0, "left", "noisy", 0.1),
+        (0.0, "right", "noisy", 0.1),
+        (1.0, "left", "well", 1.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "wrong-size"),
+        ("melted", "wrong-size"),
+        ("left:melted", "wrong-size"),
+        ("left:drop=0.1", "wrong-size"),
+        ("drop", "drop, late, .* =PROBABILITY"),
+        ("middle:torn", "left: or right:"),
+        ("torn=2", "0 … 1"),
+        ("left:silent=2", "0 … 1"),
+        ("drop=7", "0 … 1"),
+        ("torn=much", "not a number"),
+        ("torn@never", "no time of 0 s or more"),
+        ("torn@-1", "no time of 0 s or more"),
+        ("drop=0.1@inf", "no time of 0 s or more"),
+        ("silent=9", "no servo has that ID"),
+        ("reboot=1.5", "no servo has that ID"),
+    ],
+)
+def test_faults_that_can_not_be_understood(text: str, told: str) -> None:
+    with pytest.raises(FaultError, match=told):
+        parse_faults([text], (1, 2))
