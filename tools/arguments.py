@@ -85,6 +85,25 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
     return load_client(folder)
 
 
+def stream_address(text: str) -> str:
+    """The stream's address; when empty that of SOFTFINGER_ADDRESS, or else this machine's."""
+    return text or _default_addresses()[0]
+
+
+def command_address(text: str) -> str:
+    """The commands' address, likewise."""
+    return text or _default_addresses()[1]
+
+
+def _default_addresses() -> tuple[str, str]:
+    from softfinger.daemon.client.connection import default_addresses
+
+    try:
+        return default_addresses()
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def waiting(address: str, folder: Path | None) -> str:
     """What is told while nothing comes; a daemon that wants keys looks just so without them."""
     return f"waiting for a stream from {address}{_hint(folder)}"

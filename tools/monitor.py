@@ -24,7 +24,13 @@ import zmq
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.types import FINGERS
-from softfinger.tools.arguments import add_keys, client_keys, nothing
+from softfinger.tools.arguments import (
+    add_keys,
+    client_keys,
+    command_address,
+    nothing,
+    stream_address,
+)
 from softfinger.tools.terminal.feed import Feed, number, text
 from softfinger.tools.terminal.feed_sockets import Commander, Subscriber
 from softfinger.tools.terminal.monitor_keys import HandKeys
@@ -45,8 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "choose the force. "
         "Prints a plain line a second when the output is not a terminal."
     )
-    parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
-    parser.add_argument("--commands", metavar="ADDRESS", help="where commands are taken")
+    for name, kind, what in (
+        ("--state", stream_address, "where the state stream is published"),
+        ("--commands", command_address, "where commands are taken"),
+    ):
+        parser.add_argument(name, type=kind, default="", metavar="ADDRESS", help=what)
     add_keys(parser)
     parser.add_argument("--client", default="", help="name that owns the commander's lease")
     parser.add_argument(
@@ -60,11 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until q, a signal, the duration or the daemon's end. 1 when no stream ever came."""
     state, commands = args.state, args.commands
-    if state is None or commands is None:
-        from softfinger.daemon.profile.settings import CommandSettings, Stream
-
-        state = Stream().address if state is None else state
-        commands = CommandSettings().address if commands is None else commands
     if args.lifeline is not None:
         _stand_back()
     context: zmq.Context[Any] = zmq.Context(io_threads=1)

@@ -12,7 +12,6 @@ from typing import Any
 
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.profile.settings import Stream
 from softfinger.tools.arguments import (
     ALL,
     add_keys,
@@ -21,6 +20,7 @@ from softfinger.tools.arguments import (
     moment,
     nothing,
     seconds,
+    stream_address,
     topic,
     waiting,
 )
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not be there yet")
-    parser.add_argument("--address", default=Stream().address, help="the stream's socket")
+    parser.add_argument("--address", type=stream_address, default="", help="the stream's socket")
     add_keys(parser)
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(

@@ -11,8 +11,7 @@ from typing import Any
 from softfinger.daemon.client.command_client import UNCONFIRMED, NoAnswer, send
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
-from softfinger.daemon.profile.settings import CommandSettings
-from softfinger.tools.arguments import add_keys, client_keys, seconds
+from softfinger.tools.arguments import add_keys, client_keys, command_address, seconds
 
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
@@ -28,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("command", metavar="COMMAND")
     parser.add_argument("values", metavar="key=value", nargs="*")
-    parser.add_argument("--address", default=CommandSettings().address, help="command socket")
+    parser.add_argument("--address", type=command_address, default="", help="command socket")
     add_keys(parser)
     parser.add_argument("--client", default="", help="name that owns the commander's lease")
     parser.add_argument(
@@ -65,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _value(text: str) -> float | None:
-    degrees = text.endswith("deg")
+    """A number, or an angle in degrees as radians; None for what is neither."""
     try:
         number = float(text.removesuffix("deg"))
     except ValueError:
         return None
-    return math.radians(number) if degrees else number
+    return math.radians(number) if text.endswith("deg") else number

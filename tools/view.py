@@ -19,7 +19,6 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.client.connection import PATIENCE
-from softfinger.daemon.profile.settings import Stream
 from softfinger.tools.arguments import (
     add_keys,
     client_keys,
@@ -27,6 +26,7 @@ from softfinger.tools.arguments import (
     moment,
     nothing,
     seconds,
+    stream_address,
     waiting,
 )
 from softfinger.tools.viewing.errors import NoRerun, ViewError
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, nargs="?", metavar="FILE.mcap", help="a recording, instead of the stream"
     )
-    parser.add_argument("--address", default=Stream().address, help="the stream's socket")
+    parser.add_argument("--address", type=stream_address, default="", help="the stream's socket")
     add_keys(parser)
     parser.add_argument("--web", action="store_true", help="in the browser, instead of a window")
     parser.add_argument("--no-browser", action="store_true", help="only print the page's address")

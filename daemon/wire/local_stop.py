@@ -11,7 +11,6 @@ import hashlib
 import ipaddress
 import os
 import socket
-import stat
 import tempfile
 from collections import deque
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import AddressError
+from softfinger.daemon.wire.own_files import require_own
 
 _ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
 _LONGEST = 4096  # bytes
@@ -125,8 +125,8 @@ def _folders() -> Iterator[Path]:
         if place := os.environ.get(name):
             yield Path(place.split(":")[0]) / "softfinger"
     yield Path("/run/softfinger/softfinger")
-    yield Path(f"/run/user/{os.getuid()}/softfinger")
-    yield Path(tempfile.gettempdir()) / f"softfinger-{os.getuid()}"
+    yield Path(f"/run/user/{os.geteuid()}/softfinger")
+    yield Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
 
 
 def _own_folder() -> Path:
@@ -134,9 +134,7 @@ def _own_folder() -> Path:
     refused: OSError | None = None
     for folder in _folders():
         try:
-            folder.mkdir(mode=0o700)
-        except FileExistsError:
-            pass
+            folder.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
             refused = error
             continue
@@ -148,13 +146,12 @@ def _own_folder() -> Path:
 
 
 def _is_ours(folder: Path) -> bool:
+    """Whether it is this user's, no link, and nobody else may even look into it."""
     try:
-        status = folder.lstat()
+        require_own(folder)
     except OSError:
         return False
-    return (
-        stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
-    )
+    return not folder.stat().st_mode & 0o077
 
 
 def _remove_dead(path: Path, address: str) -> None:
