@@ -26,12 +26,12 @@ def tables() -> list[Table]:
 
 def test_errors_are_those_of_each_representation(tables: list[Table]) -> None:
     errors = {row["name"]: row[ERROR] for table in tables[:-1] for row in table.rows}
-    assert errors["closed form, constant E, six outputs"] < 4e-15
-    assert errors["table to 1e-09: six outputs"] <= 1e-9
-    assert errors["table to 1e-12: whole domain, six outputs"] <= 1e-12
-    assert errors["quadrature: 18 nodes a piece, six outputs"] < 1e-13
+    assert errors["closed form, constant E"] < 4e-15
+    assert errors["table to 1e-09"] <= 1e-9
+    assert errors["table to 1e-12: whole domain"] <= 1e-12
+    assert errors["quadrature: 18 nodes a piece"] < 1e-13
     assert errors["dblquad, F and U"] < 1e-5
-    assert 1e-12 < errors["RectBivariateSpline.ev: ratio 64², degree 3, F and U"] < 1e-7
+    assert 1e-12 < errors["RectBivariateSpline.ev: 64², degree 3, F and U"] < 1e-7
 
 
 def test_every_way_of_calling_has_a_table_and_the_page_its_rows(tables: list[Table]) -> None:
@@ -49,7 +49,7 @@ def test_every_way_of_calling_has_a_table_and_the_page_its_rows(tables: list[Tab
 def test_the_picture_is_drawn(tables: list[Table], tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    picture.draw(tables[:-1], tmp_path / "bench.png")
+    picture.draw(tables[3:4], tmp_path / "bench.png")
     pixels = imread(tmp_path / "bench.png")
     assert (pixels[..., :3].min(axis=-1) < 0.8).mean() > 0.01
 
@@ -70,30 +70,29 @@ def test_the_reference_of_the_closed_form() -> None:
     assert got[3, 0] == pytest.approx(got[0, 0] * math.tan(theta[0]), rel=1e-12)
 
 
-@pytest.mark.parametrize(("mode", "count"), [("loop", 2), ("loop", 6), ("chain", 6)])
-def test_compiled_loops_compute_what_they_time(mode: str, count: int) -> None:
+@pytest.mark.parametrize("mode", ["loop", "chain"])
+def test_compiled_loops_compute_what_they_time(mode: str) -> None:
     d, theta = contact.points(16)
     table = ContactTable.build(TIP, LAW, 1e-9)
     out = np.zeros((16, 6))
-    getattr(contact_kernels, f"lookup_{mode}_{count}")(2, table.data, d, theta, out)
-    expected = [lookup(table.data, *point)[:count] for point in zip(d, theta, strict=True)]
-    np.testing.assert_allclose(out[:, :count], expected, rtol=1e-15)
-    getattr(contact_kernels, f"closed_{mode}_{count}")(2, contact.MODULUS, d, theta, out)
+    getattr(contact_kernels, f"lookup_{mode}")(2, table.data, d, theta, out)
+    expected = [lookup(table.data, *point)[:6] for point in zip(d, theta, strict=True)]
+    np.testing.assert_allclose(out, expected, rtol=1e-15)
+    getattr(contact_kernels, f"closed_{mode}")(2, contact.MODULUS, d, theta, out)
     points = zip(d, theta, strict=True)
-    expected = [closed_form(contact.MODULUS, *point)[:count] for point in points]
-    np.testing.assert_allclose(out[:, :count], expected, rtol=1e-15)
+    expected = [closed_form(contact.MODULUS, *point)[:6] for point in points]
+    np.testing.assert_allclose(out, expected, rtol=1e-15)
 
 
 def test_scipy_methods_are_right_for_numbers_and_arrays() -> None:
     d, theta = np.array([0.003, 0.0065]), np.array([-0.3, 0.4])
     expected = np.array(integrate(TIP, LAW, d, theta))
     for method in contact_scipy.methods(TIP, LAW):
-        rtol = 1e-3 if "raw" in method.name else 2e-5
         one = [np.squeeze(value) for value in method.call(float(d[1]), float(theta[1]))]
-        np.testing.assert_allclose(one, expected[: method.outputs, 1], rtol=rtol)
+        np.testing.assert_allclose(one, expected[: len(one), 1], rtol=2e-5)
         if method.batch:
             many = np.array(method.call(d, theta))
-            np.testing.assert_allclose(many, expected[: method.outputs], rtol=rtol)
+            np.testing.assert_allclose(many, expected[: len(many)], rtol=2e-5)
 
 
 def test_without_scipy_its_rows_are_left_out(

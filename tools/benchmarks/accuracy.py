@@ -25,7 +25,7 @@ PARTS: dict[str, Callable[[int], list[Table]]] = {
     "bound": lambda n: against_the_bound(_sweep(n)),
     "eight bits": lambda n: of_eight_bits(_sweep(n)),
     "faint contacts": lambda n: detection(16, 5 * n // 2, 50 * n),
-    "false alarms": lambda n: false_alarms(1500 * n, 10 * n),
+    "false alarms": lambda n: false_alarms(1500 * n),
     "other models": lambda n: mismatches(max(n // 4, 1)),
     "imperfect sensors": lambda n: flaws(max(n // 10, 1)),
 }

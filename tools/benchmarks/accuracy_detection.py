@@ -9,8 +9,7 @@ expected number of such cells in a frame, which bounds the chance of one from ab
 For frames that can go below zero both are Gaussian tails. For counts the neighbours' sum is a sum
 of independent rounded, clipped and thresholded variables: its distribution is the convolution of
 theirs on the counts' own lattice; it is skewed, so that the estimator asks ``CLIPPED_MORE`` more of
-counts. Sampled frames check the figure where a lower patch_level makes alarms frequent enough, and
-importance sampling where they aren't.
+counts. Sampled frames check the figure where a lower patch_level makes alarms frequent enough.
 """
 
 from __future__ import annotations
@@ -91,15 +90,13 @@ def _missed(place: trials.Place, frames: int, random: np.random.Generator, board
     return missed
 
 
-def false_alarms(frames: int, samples: int) -> list[Table]:
+def false_alarms(frames: int) -> list[Table]:
     """The default level on every board, and lower ones to check the computed figure."""
     rows = []
     levels = (2.5, 3.0, 3.5, 4.0, PATCH_LEVEL)
     for name, board in list(_BOARDS.items())[:2]:
         for level, count in zip(levels, sampled(levels, frames, NOISE, board), strict=True):
             row = _alarm_row(name, board, NOISE, level)
-            if board is FLOAT:
-                row["by importance"] = importance(samples, level)
             row |= {"sampled": count / frames, "95 % below": upper_bound(count, frames)}
             rows.append(row | {"frames": frames})
     # Counts at other noises: how much of it rounding and the threshold leave differs.
@@ -169,39 +166,6 @@ def neighbours_distribution(one: FloatArray) -> FloatArray:
         spread[: weight * len(one) : weight][: len(one)] = one
         spectrum *= np.fft.rfft(spread) ** int(np.count_nonzero(weights == weight))
     return np.asarray(np.fft.irfft(spectrum, size))
-
-
-def importance(samples: int, patch_level: float = PATCH_LEVEL, seed: int = 13) -> float:
-    """Alarms a frame in Gaussian noise, by sampling frames that have one.
-
-    A cell is chosen evenly and made to alarm; the frame counts 1 over the number of its alarming
-    cells, so that each frame is counted once. Times the expected number of alarming cells.
-    """
-    random = np.random.default_rng(seed)
-    inside = disc()
-    places = np.argwhere(inside)
-    unit = _WEIGHTS / _ROOT
-    total = 0.0
-    for _ in range(samples):
-        frame = random.standard_normal((_SMALL, _SMALL))
-        i, j = places[random.integers(len(places))]
-        patch = frame[i - 2 : i + 3, j - 2 : j + 3]
-        patch += unit * (_beyond(patch_level, random) - float(np.sum(unit * patch)))
-        frame[i, j] = _beyond(PEAK_LEVEL, random)
-        alarms = 0
-        for m, n in np.argwhere(inside & (frame > PEAK_LEVEL)):
-            alarms += int(np.sum(unit * frame[m - 2 : m + 3, n - 2 : n + 3]) > patch_level)
-        total += 1.0 / alarms
-    return expected_alarms(1.0, FLOAT, patch_level) * total / samples
-
-
-def _beyond(level: float, random: np.random.Generator) -> float:
-    """A standard normal number given that it is above ``level`` (Robert's rejection)."""
-    rate = 0.5 * (level + math.sqrt(level * level + 4.0))
-    while True:
-        value = level + random.exponential(1.0 / rate)
-        if random.random() <= math.exp(-0.5 * (value - rate) ** 2):
-            return float(value)
 
 
 def sampled(

@@ -3,9 +3,8 @@
 In a ``loop`` the calls are independent, so that the processor overlaps them; the order of the n
 points, n a power of two, jumps about so that the compiler can't merge calls into vector
 instructions, which a single call has none of. In a ``chain`` each call's arguments wait for the
-last call's result. The results go to the point's row of ``out`` [n, 6], which keeps the compiler
-from dropping a call's work; ``_2`` writes force and energy alone, so that the partials may be
-dropped.
+last call's result. The six outputs go to the point's row of ``out`` [n, 6], which keeps the
+compiler from dropping a call's work.
 """
 
 from __future__ import annotations
@@ -28,17 +27,7 @@ def _next(i: int, count: int) -> int:
 
 
 @kernel
-def closed_loop_2(
-    repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
-) -> None:
-    i = 0
-    for _ in range(repeat * d.shape[0]):
-        i = _next(i, d.shape[0])
-        out[i, 0], out[i, 1], _, _, _, _ = closed_form(modulus, d[i], theta[i])
-
-
-@kernel
-def closed_loop_6(
+def closed_loop(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     i = 0
@@ -50,7 +39,7 @@ def closed_loop_6(
 
 
 @kernel
-def closed_chain_6(
+def closed_chain(
     repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     wait = 0.0
@@ -64,18 +53,7 @@ def closed_chain_6(
 
 
 @kernel
-def lookup_loop_2(
-    repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
-) -> None:
-    p = address(data)
-    i = 0
-    for _ in range(repeat * d.shape[0]):
-        i = _next(i, d.shape[0])
-        out[i, 0], out[i, 1], _, _, _, _, _ = lookup_at(p, d[i], theta[i])
-
-
-@kernel
-def lookup_loop_6(
+def lookup_loop(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     p = address(data)
@@ -88,7 +66,7 @@ def lookup_loop_6(
 
 
 @kernel
-def lookup_chain_6(
+def lookup_chain(
     repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
 ) -> None:
     p = address(data)

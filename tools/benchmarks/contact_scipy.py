@@ -1,8 +1,8 @@
 """Force and energy as a user of SciPy would get them: integrated, or interpolated from a table.
 
-The tables cover d ≤ 8 mm and |θ| ≤ 30°. A ``raw`` one holds F and U over (d, θ). A ``ratio`` holds
-them over the closed form in (d, θ²): the form that our own tables take, which costs the closed form
-besides and keeps the relative error small near d = 0.
+The tables cover d ≤ 8 mm and |θ| ≤ 30° and hold F and U over the closed form in (d, θ²): the form
+that our own tables take, which costs the closed form besides and keeps the relative error small
+near d = 0.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ Call = Callable[[Any, Any], Any]
 
 @dataclass(frozen=True)
 class Method:
-    """One of SciPy's ways. ``call(d, θ)`` takes numbers, or arrays where ``batch`` says so."""
+    """One of SciPy's ways. ``call(d, θ)`` takes numbers, or arrays where ``batch`` says so.
+
+    It gives F and U, or all six outputs in the order of `closed_forms`.
+    """
 
     name: str
-    outputs: int  # 2: F, U; 6: with their partials, in the order of `closed_forms`
     call: Call
     batch: bool = True
     nbytes: float = math.nan
@@ -39,27 +41,22 @@ class Method:
 
 def methods(tip: Fingertip, material: Material) -> Iterator[Method]:
     """All of them. Needs SciPy."""
-    yield Method("dblquad", 2, _double_quadrature(tip, material), batch=False)
-    for raw, degree in ((True, 3), (False, 3), (False, 5)):
-        name = f"RectBivariateSpline.ev: {'raw' if raw else 'ratio'} {_SIZE}², degree {degree}"
+    yield Method("dblquad, F and U", _double_quadrature(tip, material), batch=False)
+    for degree in (3, 5):
         before = time.perf_counter()
-        values, partials, nbytes = _splines(tip, material, degree, raw)
+        values, partials, nbytes = _splines(tip, material, degree)
         spent = time.perf_counter() - before
-        yield Method(name, 2, values, True, nbytes, spent)
-        yield Method(name, 6, partials, True, nbytes, spent)
+        name = f"RectBivariateSpline.ev: {_SIZE}², degree {degree}"
+        yield Method(f"{name}, F and U", values, True, nbytes, spent)
+        yield Method(name, partials, True, nbytes, spent)
     before = time.perf_counter()
     values, nbytes = _grid(tip, material)
     spent = time.perf_counter() - before
-    name = f"RegularGridInterpolator: ratio {_SIZE}², linear"
-    yield Method(name, 2, values, True, nbytes, spent)
+    yield Method(f"RegularGridInterpolator: {_SIZE}², linear, F and U", values, True, nbytes, spent)
 
 
-def _nodes(tip: Fingertip, material: Material, raw: bool) -> tuple[Any, Any, Any, Any]:
-    """d, θ or θ², and F and U or their ratios [d, θ] there."""
-    if raw:
-        d, theta = np.linspace(0.0, DEEPEST, _SIZE), np.linspace(-STEEPEST, STEEPEST, _SIZE)
-        values = integrate(tip, material, d[:, None], theta)
-        return d, theta, values.force, values.energy
+def _nodes(tip: Fingertip, material: Material) -> tuple[Any, Any, Any, Any]:
+    """d, θ², and the ratios of F and of U [d, θ²] there."""
     d, square = np.linspace(1e-9, DEEPEST, _SIZE), np.linspace(0.0, STEEPEST**2, _SIZE)
     values = integrate(tip, material, d[:, None], np.sqrt(square))
     over = closed_forms(material.reference_modulus, d[:, None], np.sqrt(square))
@@ -108,24 +105,14 @@ def _double_quadrature(tip: Fingertip, material: Material) -> Call:
     return call
 
 
-def _splines(
-    tip: Fingertip, material: Material, degree: int, raw: bool
-) -> tuple[Call, Call, float]:
+def _splines(tip: Fingertip, material: Material, degree: int) -> tuple[Call, Call, float]:
     """`RectBivariateSpline`, one of F and one of U: values, partials, bytes."""
     from scipy.interpolate import RectBivariateSpline
 
-    d_nodes, angles, *values = _nodes(tip, material, raw)
-    f, u = (RectBivariateSpline(d_nodes, angles, each, kx=degree, ky=degree) for each in values)
+    d_nodes, squares, *values = _nodes(tip, material)
+    f, u = (RectBivariateSpline(d_nodes, squares, each, kx=degree, ky=degree) for each in values)
     nbytes = sum(part.nbytes for each in (f, u) for part in each.tck)
     modulus = material.reference_modulus
-
-    def raw_two(d: Any, theta: Any) -> tuple[Any, ...]:
-        return f.ev(d, theta), u.ev(d, theta)
-
-    def raw_six(d: Any, theta: Any) -> tuple[Any, ...]:
-        force, energy = raw_two(d, theta)
-        slopes = f.ev(d, theta, dx=1), f.ev(d, theta, dy=1)
-        return force, energy, *slopes, force / np.cos(theta), u.ev(d, theta, dy=1)
 
     def two(d: Any, theta: Any) -> tuple[Any, ...]:
         force, energy = _closed(modulus, d, theta)
@@ -146,14 +133,14 @@ def _splines(
             over_u * 2.0 * (slope * ratio_u + theta * u.ev(d, square, dy=1)),
         )
 
-    return (raw_two, raw_six, nbytes) if raw else (two, six, nbytes)
+    return two, six, nbytes
 
 
 def _grid(tip: Fingertip, material: Material) -> tuple[Call, float]:
     """`RegularGridInterpolator` with both ratios in one call, and its bytes."""
     from scipy.interpolate import RegularGridInterpolator
 
-    d_nodes, squares, *values = _nodes(tip, material, raw=False)
+    d_nodes, squares, *values = _nodes(tip, material)
     both = np.stack(values, axis=-1)
     interpolator = RegularGridInterpolator(
         (d_nodes, squares), both, bounds_error=False, fill_value=None

@@ -20,20 +20,18 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Answer = tuple[float, float, float]  # d, tilt_x, tilt_y
 Method = Callable[[FloatArray], Answer]
-Teller = Callable[[float, float, float, float], Answer]
+Answers = Callable[[float, float, float, float], Answer]
 
 
 def rivals(
     tip: Fingertip, material: Material, grid: SensorGrid, noise: float
 ) -> tuple[dict[str, Method], list[str]]:
     """The methods that can run here, by name, and what to install for the others."""
-    found: dict[str, Method] = {}
-    missing: list[str] = []
     level = 3.0 * noise
     pitch_x, pitch_y = grid.pitches
     a = tip.radius
 
-    def tell(x: float, y: float, variance_x: float, variance_y: float) -> Answer:
+    def answer(x: float, y: float, variance_x: float, variance_y: float) -> Answer:
         """From centroid and variances in cells, the middle of the grid at 0."""
         x, y = x * pitch_x - grid.centre[0], y * pitch_y - grid.centre[1]
         trace = (variance_x - 1 / 12) * pitch_x**2 + (variance_y - 1 / 12) * pitch_y**2
@@ -46,40 +44,40 @@ def rivals(
         return d, math.asin(_bounded(x / arm)), math.asin(_bounded(y / arm))
 
     rows, cols = grid.shape
-    i_axis: FloatArray = np.linspace(0.5 - 0.5 * rows, 0.5 * rows - 0.5, rows)
-    j_axis: FloatArray = np.linspace(0.5 - 0.5 * cols, 0.5 * cols - 0.5, cols)
-
-    def numpy_moments(frame: FloatArray) -> Answer:
-        kept = np.where(frame > level, frame, 0.0)
-        by_col, by_row = kept.sum(axis=0), kept.sum(axis=1)
-        total = by_col.sum()
-        x, y = by_col @ j_axis / total, by_row @ i_axis / total
-        return tell(x, y, by_col @ j_axis**2 / total - x * x, by_row @ i_axis**2 / total - y * y)
-
-    found["NumPy moments over a threshold"] = numpy_moments
+    axes = [np.linspace(0.5 - 0.5 * n, 0.5 * n - 0.5, n) for n in (rows, cols)]
+    moments = _numpy(level, axes[0], axes[1], answer)
+    found, missing = {"NumPy moments over a threshold": moments}, []
     for name, package, make in (
         ("SciPy ndimage center_of_mass, label", "scipy", _ndimage),
         ("OpenCV moments", "opencv-python-headless", _opencv),
         ("scikit-image regionprops", "scikit-image", _skimage),
     ):
         try:
-            found[name] = make(level, i_axis, j_axis, tell)
+            found[name] = make(level, axes[0], axes[1], answer)
         except ImportError:
             missing.append(package)
-    try:
-        found["scipy least_squares, the same model"] = _least_squares(
-            tip, material, grid, numpy_moments
-        )
-    except ImportError:
-        pass
+    if "scipy" not in missing:
+        fit = _least_squares(tip, material, grid, moments)
+        found["scipy least_squares, the same model"] = fit
     return found, missing
+
+
+def _numpy(level: float, i_axis: FloatArray, j_axis: FloatArray, answer: Answers) -> Method:
+    def method(frame: FloatArray) -> Answer:
+        kept = np.where(frame > level, frame, 0.0)
+        by_col, by_row = kept.sum(axis=0), kept.sum(axis=1)
+        total = by_col.sum()
+        x, y = by_col @ j_axis / total, by_row @ i_axis / total
+        return answer(x, y, by_col @ j_axis**2 / total - x * x, by_row @ i_axis**2 / total - y * y)
+
+    return method
 
 
 def _bounded(s: float) -> float:
     return min(max(s, -0.95), 0.95)
 
 
-def _ndimage(level: float, i_axis: FloatArray, j_axis: FloatArray, tell: Teller) -> Method:
+def _ndimage(level: float, i_axis: FloatArray, j_axis: FloatArray, answer: Answers) -> Method:
     from scipy import ndimage
 
     def method(frame: FloatArray) -> Answer:
@@ -91,12 +89,12 @@ def _ndimage(level: float, i_axis: FloatArray, j_axis: FloatArray, tell: Teller)
         cols = np.arange(len(j_axis))[None, :] - x
         vy = ndimage.sum_labels(frame * rows**2, labels, index) / total
         vx = ndimage.sum_labels(frame * cols**2, labels, index) / total
-        return tell(x + j_axis[0], y + i_axis[0], vx, vy)
+        return answer(x + j_axis[0], y + i_axis[0], vx, vy)
 
     return method
 
 
-def _opencv(level: float, i_axis: FloatArray, j_axis: FloatArray, tell: Teller) -> Method:
+def _opencv(level: float, i_axis: FloatArray, j_axis: FloatArray, answer: Answers) -> Method:
     import cv2
 
     def method(frame: FloatArray) -> Answer:
@@ -104,12 +102,12 @@ def _opencv(level: float, i_axis: FloatArray, j_axis: FloatArray, tell: Teller) 
         m = cv2.moments(kept)
         total = m["m00"]
         x, y = m["m10"] / total, m["m01"] / total
-        return tell(x + j_axis[0], y + i_axis[0], m["mu20"] / total, m["mu02"] / total)
+        return answer(x + j_axis[0], y + i_axis[0], m["mu20"] / total, m["mu02"] / total)
 
     return method
 
 
-def _skimage(level: float, i_axis: FloatArray, j_axis: FloatArray, tell: Teller) -> Method:
+def _skimage(level: float, i_axis: FloatArray, j_axis: FloatArray, answer: Answers) -> Method:
     from skimage.measure import label, regionprops
 
     def method(frame: FloatArray) -> Answer:
@@ -118,7 +116,7 @@ def _skimage(level: float, i_axis: FloatArray, j_axis: FloatArray, tell: Teller)
         moments = region.moments_weighted_central
         y, x = region.centroid_weighted
         total = moments[0, 0]
-        return tell(x + j_axis[0], y + i_axis[0], moments[0, 2] / total, moments[2, 0] / total)
+        return answer(x + j_axis[0], y + i_axis[0], moments[0, 2] / total, moments[2, 0] / total)
 
     return method
 
