@@ -7,7 +7,6 @@ emulated hand, never of the daemon.
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -30,7 +29,6 @@ SOFTFINGER = (sys.executable, "-m", "softfinger")
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new
 _STATE_RATE = 250.0  # Hz
 _LOOK = 0.003  # s between two looks at the hand
-_SCHEDSTAT = 80  # bytes
 
 
 class Rig:
@@ -53,9 +51,6 @@ class Rig:
         self.context: zmq.Context[Any] = zmq.Context()
         self.hand: subprocess.Popen[str] | None = None
         self.daemon: subprocess.Popen[bytes] | None = None
-        self.starts = 0  # of the daemon
-        self.placed = 0  # times that the object was put back
-        self.start_seconds = 0.0  # that the last one took
         self._states: zmq.Socket[bytes] | None = None
         self._last_waited: dict[int, float] = {}
 
@@ -79,7 +74,6 @@ class Rig:
         log = str(self.folder / "daemon.log")
         daemon = subprocess.Popen([*SOFTFINGER, *words, "--log-file", log])
         self.daemon = daemon
-        self.starts += 1
         while self.status() is None:
             if daemon.poll() is not None:
                 return False
@@ -87,7 +81,6 @@ class Rig:
                 daemon.kill()
                 daemon.wait()
                 return False
-        self.start_seconds = time.monotonic() - begin
         return True
 
     def start(self) -> None:
@@ -220,19 +213,13 @@ class Rig:
 def _waiting(process: int) -> float:
     """How long a process's threads have been ready to run and did not, altogether [s].
 
-    All of them: while one is put aside with the interpreter's lock, the others can't go on.
+    All of them: while one waits with the interpreter's lock, the others can't go on.
     """
-    total = 0
     try:
-        for task in Path(f"/proc/{process}/task").iterdir():
-            descriptor = os.open(task / "schedstat", os.O_RDONLY)
-            try:
-                total += int(os.read(descriptor, _SCHEDSTAT).split()[1])
-            finally:
-                os.close(descriptor)
+        tasks = list(Path(f"/proc/{process}/task").iterdir())
+        return 1e-9 * sum(int((task / "schedstat").read_text().split()[1]) for task in tasks)
     except (OSError, IndexError, ValueError):
         return 0.0
-    return total * 1e-9
 
 
 def stopped(report: dict[str, Any]) -> bool:

@@ -73,9 +73,6 @@ def trial(rig: Rig, case: Case, seed: int) -> Trial:
     return found
 
 
-# --- before and after --------------------------------------------------------------------------
-
-
 def _grip(rig: Rig, case: Case, chance: random.Random, found: Trial) -> None:
     """A hand that grips, and an empty record. Raises RigError when that can't be had."""
     for attempt in range(_TRIES):
@@ -150,7 +147,6 @@ def _place(rig: Rig) -> None:
                 break
             time.sleep(0.01)
     rig.send("place")
-    rig.placed += 1
 
 
 def _start_anew(rig: Rig) -> None:
@@ -169,9 +165,6 @@ def _phase(rig: Rig, case: Case, chance: random.Random) -> str:
     elif phase == "rotating":
         rig.ask({"command": "rotate", "angle": chance.uniform(-_TURN, _TURN)})
     return phase
-
-
-# --- looking -----------------------------------------------------------------------------------
 
 
 def _look(rig: Rig, case: Case, found: Trial) -> None:
