@@ -1,4 +1,4 @@
-"""``softfinger emulate``: the stand-in hand's process. Arguments, signals and exit status."""
+"""``softfinger emulate``: the emulated hand's process. Arguments, signals and exit status."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.settings import ServoSettings, Settings
+from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 
 _FAULTS = """\
@@ -29,7 +27,7 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
   all well again   well for the servos' line and boards, left:well for one board
   @SECONDS         when it starts; at once without
 
-softfinger emulate --send "drop=0.01 left:frozen@2" tells a running one, by DIR/control.
+softfinger emulate --send "drop=0.01 left:frozen@2" changes a running one, by DIR/control.
 
 the object, where it slipped away: --send place puts it back, at rest.
 
@@ -77,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         metavar="N",
-        help="servos take the wire's time at this rate and are deaf at others; "
+        help="servos take the wire's time at this rate and hear no other; "
         "0 answers at once and at any rate (default)",
     )
     parser.add_argument(
@@ -96,8 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--send",
         metavar="WORDS",
-        help="tell the emulator that runs in DIR what goes wrong from now on, or ask for a report, "
-        "and end",
+        help="send words to the emulator that runs in DIR: faults that begin, or a request for a "
+        "report; then end",
     )
     parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
@@ -131,7 +129,9 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.dir = arguments.dir or own_runtime_folder()
         if arguments.send is not None:
             return _send(arguments.dir, arguments.send)
-        settings = _settings(arguments)
+        if arguments.model is not None:
+            arguments.set = [*arguments.set, f"servos.model={arguments.model}"]
+        settings = profile(arguments)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
@@ -143,7 +143,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals) -> int:
-    # What follows imports numpy and numba: wrong settings are told without waiting for them.
+    # What follows imports numpy and numba: wrong settings are reported without waiting for them.
     from softfinger.daemon.loop.realtime import RealTime, hold_collector
 
     hold_collector()
@@ -203,7 +203,7 @@ class _Signals:
             signal.signal(number, self._end)
 
     def hand_over(self, emulator: Any) -> None:
-        """From now on signals speak to the emulator. Raises Interrupted when one came before."""
+        """From now on signals stop the emulator. Raises Interrupted when one came before."""
         self._emulator = emulator
         if self._ended:
             raise Interrupted
@@ -238,17 +238,3 @@ def _send(folder: Path, words: str) -> int:
     if reply != "ok":
         print(reply)
     return 0
-
-
-def _settings(arguments: argparse.Namespace) -> Settings:
-    settings = profile(arguments)
-    if arguments.model is None:
-        return settings
-    try:
-        servos = ServoSettings.model_validate(
-            {**settings.servos.model_dump(), "model": arguments.model}
-        )
-    except ValidationError as error:
-        told = error.errors()[0]["msg"]
-        raise SettingsError(f"--model: found {arguments.model!r}, expected {told}") from None
-    return settings.model_copy(update={"servos": servos})

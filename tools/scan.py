@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Scan, print a line for each servo, tell by the exit status whether there was one."""
+    """Scan and print a line for each servo; the exit status is 0 when there was one."""
     paths = arguments.ports or [path for path, _ in serial_ports()]
     if not paths:
         print("scan: this machine has no serial port; name one", file=sys.stderr)

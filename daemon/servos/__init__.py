@@ -1,4 +1,4 @@
 """Servos: the interface of every backend, the simulated one, and Dynamixel's on a serial port.
 
-Which name in the settings is which backend stands in `daemon.backends`.
+`daemon.backends` maps the settings' names to them.
 """

@@ -49,7 +49,7 @@ _CHECK_SHARE = 0.05  # of the line's time that checks may take
 _SENT_LATELY = 0.035  # s for which a goal counts as sent lately
 _FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
 # A reply may come after its deadline, and be taken for the next request's. So after a request
-# without a reply the next ones ask for spans of different lengths, which tell replies apart.
+# without a reply the next ones ask for spans of different lengths, which distinguishes the replies.
 _LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
 _DOUBTFUL = 32  # requests
 _PATIENCE = 0.02  # s that a reply may take while the servos are checked: nothing hurries there

@@ -1,6 +1,6 @@
 """The SDK's port over pyserial, exclusive, with a monotonic deadline for each exchange.
 
-What the SDK's own port would cost stands in :mod:`servos.protocol`.
+Why the SDK's own port is not used is listed in :mod:`servos.protocol`.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             if self._low_latency:
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
-            pass  # a pseudo-terminal or an adapter without that mode; latency_timer() tells
+            pass  # a pseudo-terminal or an adapter without that mode; see latency_timer()
         self.received.clear()
         self.ser.reset_input_buffer()
         return True

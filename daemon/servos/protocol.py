@@ -1,4 +1,4 @@
-"""Protocol 2.0 as the client speaks it: the SDK's packet handler, group exchanges, single servos.
+"""The client's side of Protocol 2.0: the SDK's packet handler, group exchanges, single servos.
 
 What the SDK (4.1.0) does otherwise than the daemon needs, with its consequence; each is overridden
 here or in :mod:`servos.port`, and everything else of the SDK is used as it is:

@@ -1,7 +1,7 @@
 """Finding servos on a port, and setting up those of the settings: ID, rate, mode, return delay.
 
 :func:`provision` is the one place that writes a servo's EEPROM, and only when it is asked to
-(`softfinger doctor --fix`); the hand lets go meanwhile. IDs and rates are written only where there
+(`softfinger doctor --fix`); torque is off meanwhile. IDs and rates are written only where there
 is no doubt which servo is meant (:func:`plan`).
 """
 
@@ -151,14 +151,14 @@ class Plan:
 
     changes: tuple[Change, ...]
     missing: tuple[int, ...]  # fingers whose servo is not known yet
-    strangers: tuple[FoundServo, ...]  # that answer and are nobody's
+    strangers: tuple[FoundServo, ...]  # that answer and are no finger's
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
     """Which servo is which, of those found at ``rates``.
 
     A servo of the settings' model that has a missing servo's ID, at another rate, is that servo.
-    Failing that, one single servo that is nobody's is the single missing one. Whatever is garbled
+    Failing that, a single servo that is no finger's is the single missing one. Whatever is garbled
     stays as it is.
     """
     servos = settings.servos

@@ -94,7 +94,7 @@ class Torque:
     def ask_off(self) -> None:
         """Ask the servos to switch torque off: all in one packet, and each in one of its own.
 
-        Nothing is answered; whoever asks reads the registers.
+        Nothing is answered; the caller reads the registers.
         """
         self.goals = None
         for _ in range(_COPIES):

@@ -1,7 +1,6 @@
-"""The stand-in hand's control socket: words of text in, one line back, for faults while it runs.
+"""The emulated hand's control socket: words of text in, one line back, for faults while it runs.
 
-A Unix socket in the emulator's folder, served from the emulator's own event loop; the client's half
-is here too. What the words mean is :mod:`simulation.emulator.fault_spec`'s affair.
+A Unix socket in the emulator's folder, served by the emulator's own event loop, and its client.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # A killed emulator's; the folder's lock says that nobody else is here.
+                # A killed emulator's; the folder's lock says that it is gone.
                 if not stat.S_ISSOCK(os.stat(NAME, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / NAME}: is in the way; move it elsewhere")
                 os.unlink(NAME, dir_fd=self._folder)

@@ -60,7 +60,7 @@ class EmulatorClock:
     """Time of the emulated hand: real time from 0, less the interruptions of its process.
 
     Without that a process that was stopped for a minute would have to compute that minute, and
-    would answer nobody meanwhile.
+    would answer no client meanwhile.
     """
 
     def __init__(self) -> None:

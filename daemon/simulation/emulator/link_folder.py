@@ -15,13 +15,13 @@ _LOCK = ".emulator.lock"
 
 
 class FolderError(SoftfingerError):
-    """The folder can't be used. The message says why, and what mends it."""
+    """The folder can't be used. The message says why, and how to fix it."""
 
 
 class LinkFolder:
     """The folder with the links to the ptys, held by one emulator at a time.
 
-    It must be this user's, and nobody else's to write in.
+    It must be this user's, and no other may write in it.
     Links that a killed emulator left behind are replaced; anything else in their place is not.
     """
 

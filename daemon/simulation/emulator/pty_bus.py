@@ -41,7 +41,7 @@ class PtyServoBus:
     then calls :meth:`service`; ``clock`` must be the clock that those times are of.
 
     Args:
-        baud: 0 answers at any rate and at once. Above 0 a servo is deaf to a client whose port is
+        baud: 0 answers at any rate and at once. Above 0 a servo ignores a client whose port is
             set to another rate than its own, and replies take their time on the wire.
         latency: s, a USB adapter's latency timer: replies come at multiples of it.
         spin: s before a paced reply is due in which :meth:`service` waits for it awake, since a

@@ -1,1 +1,4 @@
-"""Emulated Dynamixel servos: control table, what its registers do, packets on their bus."""
+"""Emulated Dynamixel servos: their registers, what these do, and the packets on their bus.
+
+Bytes and times in, bytes out: no port, and no code of the client but the control table and CRC.
+"""

@@ -1,7 +1,6 @@
-"""What an emulated servo was told since the record began: kept beside it, and read on demand.
+"""Record of what an emulated servo was sent, for tests of a daemon against its limits.
 
-It judges nothing: whoever tests a daemon compares the record with the limits it was given. Counts
-as they came over the wire; a goal counts whether the servo took or refused it.
+In counts as they came over the wire; a goal counts whether the servo took or refused it.
 """
 
 from __future__ import annotations

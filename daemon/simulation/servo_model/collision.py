@@ -1,4 +1,4 @@
-"""What a client hears when several servos answer at once: their bits on one line.
+"""What a client receives when several servos answer at once: their bits on one line.
 
 The line idles high and a low bit wins. Servos start within JITTER of each other, so that replies
 that are alike may even come through whole, at slow rates above all.

@@ -266,7 +266,7 @@ class EmulatedServo:
         return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
-        """Its state, and what it was told since the record began."""
+        """Its state, and the record of what it was sent."""
         ticks = self.table.memory[reg.BUS_WATCHDOG]
         return {
             "id": self.id,

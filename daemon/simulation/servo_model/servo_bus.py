@@ -56,7 +56,7 @@ class Reply(NamedTuple):
 
 
 class ServoBus:
-    """Servos sharing one wire and one plant. A damaged packet is met with silence."""
+    """Servos sharing one wire and one plant. A damaged packet stays unanswered."""
 
     def __init__(
         self,
@@ -181,7 +181,7 @@ class ServoBus:
                 servo.fault(kind, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
-        """Each servo's state, and what it was told since the record began."""
+        """Each servo's state, and the record of what it was sent."""
         self.advance(t)
         return [servo.report(t) for servo in self.servos]
 

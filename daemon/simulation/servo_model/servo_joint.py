@@ -1,7 +1,7 @@
 """The mechanical side of an emulated servo: between its registers and a joint of the plant.
 
-Maps counts to angles (turns, homing offset, drive direction), follows the profile, tells the plant
-what each operating mode means, and writes the present values into the control table.
+Maps counts to angles (turns, homing offset, drive direction), follows the profile, drives the plant
+as each operating mode asks, and writes the present values into the control table.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ServoJoint:
         self._joint = joint
         self._scale = scale
         self.stuck: int | None = None  # where the encoder stands still [counts]
-        self.shift = 0  # counts that it tells too many
+        self.shift = 0  # counts that are added to the encoder
         self._turns = 0  # whole turns that the position has forgotten
         self._load = scale.direction / model.stall_current  # share of stall current, counts' sign
         self._speed = scale.direction * reg.VELOCITY_UNIT / scale.velocity / model.no_load_speed
@@ -74,7 +74,7 @@ class ServoJoint:
     # --- position ----------------------------------------------------------------------------
 
     def encoder(self) -> int:
-        """What the encoder tells, in counts of all turns."""
+        """The encoder's count, over all turns."""
         if self.stuck is not None:
             return self.stuck
         return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
@@ -86,7 +86,7 @@ class ServoJoint:
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
 
     def position(self) -> int:
-        """Present position in counts, as register 132 tells it."""
+        """Present position in counts, as register 132 has it."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
         memory = self._table.memory
         if memory[reg.DRIVE_MODE] & 1:
@@ -146,7 +146,7 @@ class ServoJoint:
     # --- plant -------------------------------------------------------------------------------
 
     def drive(self) -> None:
-        """Tell the plant what the registers say."""
+        """Command the plant as the registers say."""
         table, joint = self._table, self._joint
         mode = table.memory[reg.OPERATING_MODE]
         if not table.memory[reg.TORQUE_ENABLE]:
