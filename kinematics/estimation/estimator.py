@@ -145,7 +145,7 @@ class ContactEstimator:
         self._quantum = quantum
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
         state = self._state = State()
-        options = state.options
+        options = self._options = state.options
         options.noise = noise
         options.saturation = math.inf
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
@@ -193,8 +193,9 @@ class ContactEstimator:
         kept = self._estimate.copy()
         try:
             estimate.warm = False
-            self._run(frame, pascal_per_count)
-            return self._publish(ContactEstimate(covariance=estimate.covariance.copy()))
+            found = self._run(frame, pascal_per_count, ContactEstimate())
+            found.covariance[:] = estimate.covariance
+            return found
         finally:
             self._estimate[:] = kept
 
@@ -210,9 +211,9 @@ class ContactEstimator:
         """
         if seq is not None and seq == self._seq:
             return self._last
-        self._run(frame, pascal_per_count)
+        self._run(frame, pascal_per_count, self._last)
         self._seq = seq
-        return self._publish(self._last)
+        return self._last
 
     def reset(self) -> None:
         """Forget the last estimate: the next frame starts cold."""
@@ -229,16 +230,19 @@ class ContactEstimator:
         """The arrays that the same function takes last; see `estimation.state`."""
         return self._arena, self._places
 
-    def _run(self, frame: NDArray[Any], pascal_per_count: float) -> None:
+    def _run(
+        self, frame: NDArray[Any], pascal_per_count: float, result: ContactEstimate
+    ) -> ContactEstimate:
+        """Estimate from ``frame`` and fill in ``result``, but for its covariance."""
         full = _FULL.get(frame.dtype) if isinstance(frame, np.ndarray) else None
         if full is None:
             kind = getattr(frame, "dtype", type(frame).__name__)
             raise ValueError(f"a frame is uint8, uint16, float32 or float64, got {kind}")
-        if frame.shape != self.grid.shape:
-            raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
+        if frame.shape != self._frame.shape:
+            raise ValueError(f"a frame must have shape {self._frame.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
-        self._state.options.saturation = full if self._saturation is None else self._saturation
+        self._options.saturation = full if self._saturation is None else self._saturation
         # One copy makes every type, layout and read-only frame the same to the compiled entry.
         np.copyto(self._frame, frame)
         step = self._quantum if full == math.inf else pascal_per_count
@@ -250,8 +254,6 @@ class ContactEstimator:
             self._arena,
             self._places,
         )
-
-    def _publish(self, result: ContactEstimate) -> ContactEstimate:
         (
             result.d,
             result.gain,
