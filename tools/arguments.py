@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.own_files import require_own, runtime_folder
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.own_files import require_own, runtime_folder
 
 if TYPE_CHECKING:
     from softfinger.daemon.wire.keys import ClientKeys

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from softfinger.daemon.wire.own_files import write_text
+from softfinger.daemon.own_files import write_text
 
 if TYPE_CHECKING:
     from softfinger.tools.benchmarks.report import Row, Table

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.load import find
-from softfinger.daemon.wire.own_files import write_text
 
 UNIT = "softfinger.service"
 RULES = "70-softfinger.rules"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.errors import RecordingError, SettingsError
+from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Stream
-from softfinger.daemon.wire.own_files import write_text
 from softfinger.tools.arguments import moment, seconds, teller
 
 _EPILOG = """\

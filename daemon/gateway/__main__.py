@@ -15,10 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from softfinger.daemon.errors import AddressError, KeyFileError
-from softfinger.daemon.gateway import bounds, loop_link
+from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.endpoints import CommandEndpoint, StartAnew, StreamEndpoint
 from softfinger.daemon.gateway.server import Server
+from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.sockets import Listener
 
 _STEPS = 0.5  # s between two words that it lives

@@ -5,19 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 
-
-@dataclass(frozen=True, slots=True)
-class Topics:
-    """The stream's topics, and which of them late subscribers get again."""
-
-    names: tuple[str, ...]
-    settings: int  # index of the one of which they get the last message
-    events: int  # and of which the last few
-
-    def matching(self, *prefixes: bytes) -> int:
-        """The topics that begin with any of these, as bits."""
-        names = enumerate(self.names)
-        return sum(1 << k for k, name in names if name.encode().startswith(prefixes))
+from softfinger.daemon.wire.loop_link import Topics
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,11 +15,11 @@ from typing import Generic, TypeVar
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.config import Topics
 from softfinger.daemon.gateway.connections import CommandConnection, Connection, StreamConnection
 from softfinger.daemon.gateway.poller import Poller
 from softfinger.daemon.gateway.request_queue import RequestQueue
 from softfinger.daemon.gateway.zmtp import frame
+from softfinger.daemon.wire.loop_link import Topics
 from softfinger.daemon.wire.sockets import Listener
 
 _Connection = TypeVar("_Connection", bound=Connection)

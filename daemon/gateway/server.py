@@ -11,11 +11,13 @@ from typing import Protocol
 
 import msgpack
 
-from softfinger.daemon.gateway import bounds, loop_link
-from softfinger.daemon.gateway.config import Config, Topics
+from softfinger.daemon.gateway import bounds
+from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.endpoints import Endpoint
 from softfinger.daemon.gateway.poller import Poller
 from softfinger.daemon.gateway.request_queue import RequestQueue
+from softfinger.daemon.wire import loop_link
+from softfinger.daemon.wire.loop_link import Topics
 
 
 class Stream(Protocol):

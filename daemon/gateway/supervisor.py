@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.gateway import loop_link
 from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.wire import loop_link
 
 _ROOT = Path(__file__).parents[3]  # where the package is found
 _PATIENCE = 20.0  # s for a gateway to bind its sockets

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softfinger.daemon.errors import TactileError
+from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Finite, Positive, Settings
-from softfinger.daemon.wire.own_files import write_text
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.gateway.loop_link import Ask, Link
+from softfinger.daemon.wire.loop_link import Ask, Link
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 

@@ -20,7 +20,7 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.wire.own_files import require_own
+from softfinger.daemon.own_files import require_own
 
 _ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
 _LONGEST = 4096  # bytes

@@ -13,9 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.gateway.config import Topics
-from softfinger.daemon.gateway.loop_link import Link
 from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State, Truth
+from softfinger.daemon.wire.loop_link import Link, Topics
 from softfinger.daemon.wire.packer import packer
 from softfinger.daemon.wire.schema import (
     COMMAND,

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from softfinger.daemon.gateway import loop_link
 from softfinger.daemon.gateway.__main__ import open_server
 from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.command_server import CommandServer, Handler
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 

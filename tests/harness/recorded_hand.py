@@ -10,10 +10,10 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.gateway.loop_link import Link
 from softfinger.daemon.loop.build import Daemon, facts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire.command_server import Handler
+from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
 from softfinger.tools.recordings.writer import RecordingWriter
 

@@ -17,11 +17,11 @@ import pytest
 from softfinger.daemon.client import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.gateway import loop_link
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.keys import make_keys
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher

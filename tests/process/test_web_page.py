@@ -18,9 +18,9 @@ import pytest
 import zmq
 
 from softfinger.daemon.client.command_client import send
-from softfinger.daemon.gateway.config import Topics
 from softfinger.daemon.gateway.endpoints import StreamEndpoint
 from softfinger.daemon.wire.keys import load_client, make_keys
+from softfinger.daemon.wire.loop_link import Topics
 from tests.conftest import own_addresses, until
 from tests.harness.gateway import Served
 from tests.harness.headless_browser import Browser, browser_path

@@ -106,3 +106,9 @@ def test_no_files_import_in_a_circle() -> None:
 
 def test_no_rooms_of_kinematics_import_in_a_circle() -> None:
     assert circles(rooms("kinematics")) == []
+
+
+def test_clients_and_gateway_use_the_wire_which_knows_neither() -> None:
+    graph = rooms("daemon")
+    assert not {"client", "gateway", "loop"} & graph["wire"]
+    assert not {"loop", "profile"} & (graph["client"] | graph["gateway"])

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from softfinger.daemon import own_files
+from softfinger.daemon.own_files import require_own, runtime_folder, write_bytes, write_text
 from softfinger.daemon.profile.table_files import save_table
 from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
-from softfinger.daemon.wire import own_files
-from softfinger.daemon.wire.own_files import require_own, runtime_folder, write_bytes, write_text
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable

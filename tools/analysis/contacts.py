@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.own_files import write_text
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, State
-from softfinger.daemon.wire.own_files import write_text
 from softfinger.tools.analysis.sources import Progress, Source
 
 FloatArray = NDArray[np.float64]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.daemon.wire.own_files import write_text
+from softfinger.daemon.own_files import write_text
 from softfinger.tools.paper.style import caption, label_ends
 
 if TYPE_CHECKING:

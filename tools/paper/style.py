@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.wire.own_files import write_bytes
+from softfinger.daemon.own_files import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

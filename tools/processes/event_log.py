@@ -19,7 +19,7 @@ from collections import deque
 from pathlib import Path
 from typing import TextIO
 
-from softfinger.daemon.wire.own_files import write_text
+from softfinger.daemon.own_files import write_text
 
 _KEPT = 1000  # lines that wait for a slow reader; older ones are dropped
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.own_files import write_bytes, write_text
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.own_files import write_bytes, write_text
 from softfinger.tools.recordings.reader import Recording
 
 BLOCK = 2000  # rows

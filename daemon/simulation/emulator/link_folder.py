@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.wire.own_files import require_own
+from softfinger.daemon.own_files import require_own
 
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"

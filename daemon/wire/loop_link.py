@@ -13,6 +13,7 @@ import select
 import socket
 import struct
 from collections import deque
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 # From the loop. A message too long for one packet comes in pieces.
@@ -54,6 +55,20 @@ class PollFd(ctypes.Structure):
     """One descriptor, as the system's poll takes it."""
 
     _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """The stream's topics, and which of them late subscribers get again."""
+
+    names: tuple[str, ...]
+    settings: int  # index of the one of which they get the last message
+    events: int  # and of which the last few
+
+    def matching(self, *prefixes: bytes) -> int:
+        """The topics that begin with any of these, as bits."""
+        names = enumerate(self.names)
+        return sum(1 << k for k, name in names if name.encode().startswith(prefixes))
 
 
 class Ask(NamedTuple):
