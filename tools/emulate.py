@@ -158,7 +158,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals)
             arguments.dir,
             baud=arguments.baud,
             latency=arguments.latency,
-            prepared=not arguments.factory,
+            factory=arguments.factory,
             ids=arguments.ids,
             faults=arguments.fault,
             table_cache=table_cache(),

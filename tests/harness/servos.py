@@ -17,6 +17,7 @@ from typing import Any
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import (
     COUNTS_PER_TURN,
     VELOCITY_UNIT,
@@ -26,7 +27,7 @@ from softfinger.daemon.servos.control_table import (
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
-from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model import framing, servo
 from softfinger.daemon.simulation.servo_model.framing import Parser, frame
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
@@ -51,18 +52,18 @@ def make_bus(
     **options: Any,
 ) -> ServoBus:
     """Factory-new servos on free joints that stand at ``counts``, with the time at ``t``."""
-    plant = FreeJoints(len(ids), t)
+    plant, chosen = FreeJoints(len(ids), t), by_name(model)
+    eeprom = servo.prepared(chosen, reg.CURRENT_BASED_POSITION_MODE) if prepared else {}
     for joint, count in enumerate(counts):
         plant.q[joint] = count * RADIAN
     servos = [
         EmulatedServo(
-            by_name(model),
-            servo_id,
+            chosen,
             plant,
             joint,
             plain_scale(model),
+            eeprom | {reg.ID: servo_id},
             firmware=firmware,
-            prepared=prepared,
             t=t,
         )
         for joint, servo_id in enumerate(ids)

@@ -83,7 +83,7 @@ def with_status(lines: list[str], status: str) -> list[str]:
 
 
 def test_factory_new_servos_fail_and_are_repaired_only_when_asked(hands, capsys):
-    hand = hands(prepared=False)
+    hand = hands(factory=True)
     before = hand.registers()
     status, lines = hand.doctor(capsys)
     assert status == 1

@@ -77,7 +77,7 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
     ("options", "faults", "registers", "told"),
     [
         (
-            {"prepared": False},
+            {"factory": True},
             ["overload=2"],
             {},
             [

@@ -158,14 +158,14 @@ def test_a_search_finds_servos_at_their_rate(wired: Callable[..., Bus]) -> None:
 
 
 def test_factory_modes_are_changed(wired: Callable[..., Bus]) -> None:
-    bus = wired(prepared=False)
+    bus = wired(factory=True)
     done = named(LEFT, *MODE_AND_DELAY) + named(RIGHT, *MODE_AND_DELAY)
     assert bus.provision() == (done, [])
     assert bus.provision() == ([], [])
 
 
 def test_two_factory_servos_are_set_up_one_after_the_other(wired: Callable[..., Bus]) -> None:
-    bus = wired(baud=57600, ids=(1, 1), prepared=False)
+    bus = wired(baud=57600, ids=(1, 1), factory=True)
     bus.servos[1].silent = True
     assert bus.provision() == (
         named(LEFT, "57600 → 2000000 baud", *MODE_AND_DELAY),
@@ -181,7 +181,7 @@ def test_two_factory_servos_are_set_up_one_after_the_other(wired: Callable[..., 
 
 
 def test_factory_servos_together_are_reported_and_not_changed(wired: Callable[..., Bus]) -> None:
-    bus = wired(baud=57600, ids=(1, 1), prepared=False)
+    bus = wired(baud=57600, ids=(1, 1), factory=True)
     before = [bytes(each.table.memory[: reg.RAM]) for each in bus.servos]
     assert search("line", (57600, HOME)).garbled == (Garbled(1, 57600),)
     done, problems = bus.provision()
@@ -230,7 +230,7 @@ def test_what_is_set_up(
 
 
 def test_what_can_not_be_set_up_is_reported_beside_what_was(wired: Callable[..., Bus]) -> None:
-    bus = wired(prepared=False)
+    bus = wired(factory=True)
     put_fault(bus.bus, "silent=2", 0.0)
     missing = f"{RIGHT}: no answer at any rate: check its power and cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])

@@ -98,7 +98,7 @@ class Emulator:
         *,
         baud: int = 0,
         latency: float = 0.0,
-        prepared: bool = True,
+        factory: bool = False,
         ids: tuple[int, ...] | None = None,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
@@ -107,8 +107,8 @@ class Emulator:
         """Build it; nothing answers before :meth:`run`.
 
         ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
-        with a ``baud``. ``prepared`` False: servos as they leave the factory but for their IDs and
-        rate. ``ids``: others than the settings', even one for both. ``faults``: see
+        with a ``baud``. ``factory``: servos as they leave the factory but for their IDs and rate.
+        ``ids``: others than the settings', even one for both. ``faults``: see
         :func:`parse_faults`. ``table_cache``: a folder where the contact table is kept.
         ``undisturbed``: a context without exceptions of signal handlers, for making what has to
         be removed again.
@@ -138,7 +138,7 @@ class Emulator:
             table = make_table(settings, make_material(settings.material), table_cache)
             self.hand = SimulatedHand(settings, 0.0, table)
             if settings.servos.backend != "none":
-                self._add_servos(settings, baud, latency, prepared)
+                self._add_servos(settings, baud, latency, factory)
             if settings.tactile.backend != "none":
                 for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
                     self._add_board(settings, finger)
@@ -149,10 +149,10 @@ class Emulator:
             self.close()
             raise
 
-    def _add_servos(self, settings: Settings, baud: int, latency: float, prepared: bool) -> None:
+    def _add_servos(self, settings: Settings, baud: int, latency: float, factory: bool) -> None:
         try:
             bus = ServoBus.from_settings(
-                settings, self.hand, ids=self._ids, baud=baud, prepared=prepared
+                settings, self.hand, ids=self._ids, baud=baud, factory=factory
             )
         except ValueError as error:
             raise EmulatorError(str(error)) from None

@@ -9,6 +9,7 @@ shutdown is refused with RESULT_FAIL.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from softfinger.daemon.servos import control_table as reg
@@ -29,27 +30,29 @@ _CLEAR_KEY = b"\x01DXL\x22"
 _BACKUP_KEY = b"CTRL"
 
 
-class EmulatedServo:
-    """A servo on joint ``joint`` of ``plant``, factory-new unless ``prepared``.
+def prepared(model: ServoModel, mode: int) -> dict[int, int]:
+    """EEPROM as the daemon needs it: no return delay, and the mode where the model has it."""
+    needed = {reg.RETURN_DELAY_TIME: 0}
+    return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
-    ``prepared`` sets it up as the daemon needs it: in operating mode ``mode`` where the model has
-    it, and with no return delay. ``health`` may be set from outside; a ``silent`` servo neither
-    hears nor answers, with ``frozen`` what it measures stands still, its time included, and with
-    ``refuses`` it answers every reading with an error.
+
+class EmulatedServo:
+    """A servo on joint ``joint`` of ``plant``, factory-new but for the registers in ``eeprom``.
+
+    ``health`` may be set from outside; a ``silent`` servo neither hears nor answers, with
+    ``frozen`` what it measures stands still, its time included, and with ``refuses`` it answers
+    every reading with an error.
     """
 
     def __init__(
         self,
         model: ServoModel,
-        servo_id: int,
         plant: JointPlant,
         joint: int,
         scale: JointScale,
+        eeprom: Mapping[int, int],
         *,
         firmware: int | None = None,
-        prepared: bool = False,
-        mode: int = reg.CURRENT_BASED_POSITION_MODE,
-        baud_index: int = 1,
         t: float = 0.0,
     ) -> None:
         self.model = model
@@ -66,12 +69,8 @@ class EmulatedServo:
         self._boot_at = -math.inf  # a reboot ends then
         self._next_step = math.inf
         self._next_sense = t
-        self.table.set(reg.ID, servo_id)
-        self.table.set(reg.BAUD_RATE, baud_index)
-        if prepared:
-            self.table.set(reg.RETURN_DELAY_TIME, 0)
-            if mode in model.modes:
-                self.table.set(reg.OPERATING_MODE, mode)
+        for address, value in eeprom.items():
+            self.table.set(address, value)
         self._start(t)
 
     # --- state that the bus asks for -------------------------------------------------------

@@ -14,8 +14,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import MODE_NUMBERS, JointScale, by_name
+from softfinger.daemon.servos.control_table import JointScale, by_name
 from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_faults import (
@@ -26,7 +27,7 @@ from softfinger.daemon.simulation.servo_model.bus_faults import (
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.collision import collide
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, Parser
-from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
+from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
 
 _GROUP_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _BULK_READS = frozenset((framing.BULK_READ, framing.FAST_BULK_READ))
@@ -82,13 +83,14 @@ class ServoBus:
         *,
         ids: Sequence[int] | None = None,
         baud: int = 0,
-        prepared: bool = True,
+        factory: bool = False,
         t: float = 0.0,
     ) -> ServoBus:
         """The settings' servos, one a joint, left first.
 
-        ``baud`` > 0 sets the servos to that rate, ``ids`` to others than the settings'. Raises
-        ValueError for a rate the model has not.
+        ``baud`` > 0 sets the servos to that rate, ``ids`` to others than the settings'; with
+        ``factory`` all else is as the maker delivers it. Raises ValueError for a rate the model
+        has not.
         """
         servos = settings.servos
         model = by_name(servos.model)
@@ -97,20 +99,14 @@ class ServoBus:
             raise ValueError(
                 f"{model.name} has no {rate} baud; it has {', '.join(map(str, model.baud_rates))}"
             )
-        made = [
-            EmulatedServo(
-                model,
-                servo_id,
-                plant,
-                joint,
-                JointScale.of(servos, joint, model),
-                prepared=prepared,
-                mode=MODE_NUMBERS[servos.mode],
-                baud_index=model.baud_rates.index(rate),
-                t=t,
-            )
-            for joint, servo_id in enumerate(servos.ids if ids is None else ids)
-        ]
+        eeprom = {reg.BAUD_RATE: model.baud_rates.index(rate)}
+        if not factory:
+            eeprom |= prepared(model, reg.MODE_NUMBERS[servos.mode])
+        made = []
+        for joint, servo_id in enumerate(servos.ids if ids is None else ids):
+            scale = JointScale.of(servos, joint, model)
+            eeprom[reg.ID] = servo_id
+            made.append(EmulatedServo(model, plant, joint, scale, eeprom, t=t))
         return cls(made, plant, seed=settings.simulation.seed)
 
     # --- time ------------------------------------------------------------------------------
