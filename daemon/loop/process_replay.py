@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.perception.finger_model import make_models
@@ -67,7 +68,8 @@ class ProcessReplay:
         The state is the loop's own, and changes with the next call.
         """
         loop = self._loop
-        self._clock.t, self._clock.unix = taken["t"], taken["timestamp"]
+        self._clock.sleep_until(taken["t"])
+        self._clock.unix = taken["timestamp"]
         for finger, frame in frames.items():
             self._sensors[finger].frame = frame
         if self._servos is not None:
@@ -92,27 +94,14 @@ def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: P
     return settings.model_copy(update={"tactile": tactile})
 
 
-class _Clock:
+class _Clock(VirtualClock):
     """The recorded time."""
 
-    behind = 0.0
-
-    def __init__(self) -> None:
-        self.t = 0.0
-        self.unix = 0.0
-
-    def now(self) -> float:
-        return self.t
+    unix = 0.0
 
     def wall(self) -> float:
+        """The recorded Unix time [s]."""
         return self.unix
-
-    def host(self) -> float:
-        return self.t
-
-    def sleep_until(self, t: float) -> float:
-        self.t = t
-        return 0.0
 
 
 class _Servos:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-from softfinger.daemon.profile.settings import Realtime, Settings
+from softfinger.daemon.profile.settings import Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
 _LATENCY = "/dev/cpu_dma_latency"
@@ -53,23 +53,11 @@ def hold_collector() -> None:
     gc.disable()
 
 
-def settle(freeze: bool = True) -> None:
-    """Keep the collector and other threads from delaying the loop.
-
-    A full collection over all of numpy and numba takes tens of milliseconds: what exists now is
-    frozen out of it. A thread may keep the interpreter for a switch interval, 5 ms by default.
-    """
-    if freeze:
-        gc.freeze()
-    gc.enable()
-    sys.setswitchinterval(_SWITCH_INTERVAL)
-
-
 class Outcome(NamedTuple):
     """What became of one measure."""
 
     granted: bool
-    text: str  # what is had; or what was refused and what is lost by it
+    text: str  # what was granted; or what was refused and what is lost by it
     remedy: str = ""  # the command that grants it
 
     def __str__(self) -> str:
@@ -87,37 +75,29 @@ class RealTime:
         self.outcomes: list[Outcome] = []
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
-        self._keep_interpreter(wanted)
+        self._keep_interpreter(wanted.freeze_collector)
         if settings.loop.clock == "virtual":
             return
-        for ask in (
-            _schedule,
-            _shorten_slice,
-            _keep_to_processors,
-            _lock_memory,
-            _hold_latency,
-            _sharpen_timer,
-        ):
-            outcome, undo = ask(wanted)
-            if outcome is not None:
-                self.outcomes.append(outcome)
-            self._undo += undo
+        if wanted.priority:
+            self._schedule(wanted.priority)
+        if wanted.slice:
+            self._shorten_slice(min(max(round(wanted.slice * 1e9), _SHORTEST), _LONGEST))
+        if wanted.cpus:
+            self._keep_to_processors(wanted.cpus)
+        if wanted.lock_memory:
+            self._lock_memory()
+        if wanted.hold_latency:
+            self._hold_latency()
+        if wanted.timer_slack:
+            self._sharpen_timer(max(round(wanted.timer_slack * 1e9), 1))
         if wanted.spin:
-            text = f"spin of {wanted.spin * 1e6:g} µs before each tick"
-            self.outcomes.append(Outcome(True, text))
-
-    def _keep_interpreter(self, wanted: Realtime) -> None:
-        interval = sys.getswitchinterval()
-        settle(freeze=wanted.freeze_collector)
-        self._undo += [gc.unfreeze, lambda: sys.setswitchinterval(interval)]
-        if wanted.freeze_collector:
-            self.outcomes.append(Outcome(True, "collector frozen"))
+            self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
-        """For the loop's events: one that names all that is had, one for each refusal."""
-        had = ", ".join(outcome.text for outcome in self.outcomes if outcome.granted)
+        """For the loop's events: one with all that was granted, one for each refusal."""
+        granted = ", ".join(outcome.text for outcome in self.outcomes if outcome.granted)
         refused = [str(outcome) for outcome in self.outcomes if not outcome.granted]
-        events = [("info", "realtime", had)] if had else []
+        events = [("info", "realtime", granted)] if granted else []
         return events + [("warning", "realtime", text) for text in refused]
 
     def close(self) -> None:
@@ -134,65 +114,130 @@ class RealTime:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _granted(self, text: str, *undo: Callable[[], object]) -> None:
+        self.outcomes.append(Outcome(True, text))
+        self._undo += undo
 
-# What came of a measure, None where it was not asked for, and what takes it back.
-Asked = tuple[Outcome | None, list[Callable[[], object]]]
+    def _refused(self, text: str, remedy: str = "") -> None:
+        self.outcomes.append(Outcome(False, text, remedy))
+
+    def _keep_interpreter(self, freeze: bool) -> None:
+        """Keep the collector and other threads from delaying the loop.
+
+        A full collection over all of numpy and numba takes tens of milliseconds: what exists now is
+        frozen out of it. A thread may keep the interpreter for a switch interval, 5 ms by default.
+        """
+        self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
+        if freeze:
+            gc.freeze()
+            self._granted("collector frozen")
+        gc.enable()
+        sys.setswitchinterval(_SWITCH_INTERVAL)
+
+    def _schedule(self, priority: int) -> None:
+        """SCHED_FIFO for the loop, one step below it for the threads that share its interpreter.
+
+        A reader thread that is preempted while it has the interpreter would hold up the loop for as
+        long. Threads without it, as ZeroMQ's, and child processes keep the usual scheduling.
+        """
+        undo: list[Callable[[], object]] = []
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        try:
+            for thread in _threads():
+                before = os.sched_getscheduler(thread), os.sched_getparam(thread)
+                mine = thread == threading.get_native_id()
+                level = os.sched_param(priority if mine else max(priority - 1, 1))
+                os.sched_setscheduler(thread, policy, level)
+                undo.append(partial(os.sched_setscheduler, thread, *before))
+        except OSError as error:
+            for each in undo:
+                each()
+            self._refused(
+                f"SCHED_FIFO {priority} refused ({error.strerror}): "
+                "other processes can hold up a tick",
+                GRANT_PRIORITY,
+            )
+        else:
+            self._granted(f"SCHED_FIFO {priority}", *undo)
+
+    def _shorten_slice(self, nanoseconds: int) -> None:
+        """Without SCHED_FIFO, a short slice for the loop and the threads of its interpreter.
+
+        Linux (from 6.12 on) runs the thread whose slice would end first: a short one runs sooner.
+        """
+        usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+        calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
+        if not usual or calls is None:
+            return
+        threads = _threads()
+        shortened = [_set_slice(calls, thread, nanoseconds) for thread in threads]
+        if any(shortened):  # not by an older kernel
+            undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
+            self._granted(f"slices of {nanoseconds * 1e-6:g} ms", *undo)
+
+    def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
+        """The loop's thread alone: others may run beside it."""
+        names = ", ".join(map(str, cpus))
+        before = os.sched_getaffinity(0)
+        try:
+            os.sched_setaffinity(0, cpus)
+        except OSError as error:
+            there = ", ".join(map(str, sorted(before)))
+            self._refused(
+                f"processor {names} refused ({error.strerror}; there are {there}): "
+                "the loop may move between processors"
+            )
+        else:
+            self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
+
+    def _lock_memory(self) -> None:
+        """Lock pages in memory once they have been touched, as after warm-up they are.
+
+        Two thirds of a compiler's libraries never are, and reading them in takes most of a second.
+        Under a limit only what is mapped now is locked, or later mappings would fail.
+        """
+        limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+        flags = _MCL_CURRENT | _MCL_ONFAULT
+        if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
+            flags |= _MCL_FUTURE
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(flags) != 0:
+            why = os.strerror(ctypes.get_errno())
+            text = f"memory lock refused ({why}): pages of the loop can be swapped out"
+            self._refused(text, GRANT_MEMORY_LOCK)
+        else:
+            self._granted("memory locked", libc.munlockall)
+
+    def _hold_latency(self) -> None:
+        """As long as the file is open, no processor goes into a state that takes time to leave."""
+        try:
+            descriptor = os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
+        except OSError as error:
+            text = f"{_LATENCY} refused ({error.strerror}): wake-ups take what idle states take"
+            self._refused(text, "" if isinstance(error, FileNotFoundError) else GRANT_LATENCY)
+            return
+        try:
+            os.write(descriptor, bytes(4))
+        except OSError as error:
+            os.close(descriptor)
+            self._refused(f"{_LATENCY} refused ({error.strerror})")
+        else:
+            self._granted("idle states held off", partial(os.close, descriptor))
+
+    def _sharpen_timer(self, nanoseconds: int) -> None:
+        """The kernel may put off a wake-up by this thread's slack, to make one of several."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
+            why = os.strerror(ctypes.get_errno())
+            self._refused(f"timer slack refused ({why}): wake-ups come 50 µs later")
+        else:  # 0 stands for what the thread began with
+            undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
+            self._granted(f"timer slack {nanoseconds} ns", undo)
 
 
-def _schedule(wanted: Realtime) -> Asked:
-    """SCHED_FIFO for the loop, and one step below it for the threads that share its interpreter.
-
-    A reader thread that the system puts aside while it has the interpreter would hold up the loop
-    for as long. Threads without it, as ZeroMQ's, and child processes keep the usual scheduling.
-    """
-    if not wanted.priority:
-        return None, []
-    own = threading.get_native_id()
-    undo: list[Callable[[], object]] = []
-    try:
-        for thread in threading.enumerate():
-            if thread.native_id is None:
-                continue
-            mine = thread.native_id == own
-            priority = wanted.priority if mine else max(wanted.priority - 1, 1)
-            undo.append(_fifo(thread.native_id, priority))
-    except OSError as error:
-        for each in undo:
-            each()
-        text = (
-            f"SCHED_FIFO {wanted.priority} refused ({error.strerror}): "
-            "other processes can hold up a tick"
-        )
-        return Outcome(False, text, GRANT_PRIORITY), []
-    return Outcome(True, f"SCHED_FIFO {wanted.priority}"), undo
-
-
-def _fifo(thread: int, priority: int) -> Callable[[], None]:
-    before = os.sched_getscheduler(thread), os.sched_getparam(thread)
-    policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-    os.sched_setscheduler(thread, policy, os.sched_param(priority))
-    return lambda: os.sched_setscheduler(thread, *before)
-
-
-def _shorten_slice(wanted: Realtime) -> Asked:
-    """Under the usual scheduling, a short slice for the loop and the threads of its interpreter.
-
-    Linux (from 6.12 on) runs the thread whose slice would end first: a short one runs sooner.
-    """
-    usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
-    calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
-    if not wanted.slice or not usual or calls is None:
-        return None, []
-    nanoseconds = min(max(round(wanted.slice * 1e9), _SHORTEST), _LONGEST)
-    had = False
-    undo: list[Callable[[], object]] = []
-    for thread in threading.enumerate():
-        if thread.native_id is not None:
-            had = _set_slice(calls, thread.native_id, nanoseconds) or had
-            undo.append(partial(_set_slice, calls, thread.native_id, 0))
-    if not had:
-        return None, []  # an older kernel, where there is nothing to be had
-    return Outcome(True, f"slices of {nanoseconds * 1e-6:g} ms"), undo
+def _threads() -> list[int]:
+    """The system's numbers of the threads that share this interpreter."""
+    return [each.native_id for each in threading.enumerate() if each.native_id is not None]
 
 
 def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
@@ -208,75 +253,3 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
     if libc.syscall(get_call, thread, found, size, 0) != 0:
         return False
     return bool(_ATTRIBUTES.unpack(found.raw)[5] == nanoseconds)
-
-
-def _keep_to_processors(wanted: Realtime) -> Asked:
-    """The loop's thread alone: others may run beside it."""
-    if not wanted.cpus:
-        return None, []
-    names = ", ".join(map(str, wanted.cpus))
-    before = os.sched_getaffinity(0)
-    try:
-        os.sched_setaffinity(0, wanted.cpus)
-    except OSError as error:
-        there = ", ".join(map(str, sorted(before)))
-        text = (
-            f"processor {names} refused ({error.strerror}; there are {there}): "
-            "the loop may move between processors"
-        )
-        return Outcome(False, text), []
-    return Outcome(True, f"processor {names}"), [lambda: os.sched_setaffinity(0, before)]
-
-
-def _lock_memory(wanted: Realtime) -> Asked:
-    """Lock pages in memory once they have been touched, as after warm-up they are.
-
-    Two thirds of a compiler's libraries never are, and reading them in takes most of a second.
-    Under a limit only what is mapped now is locked, or later mappings would fail.
-    """
-    if not wanted.lock_memory:
-        return None, []
-    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    flags = _MCL_CURRENT | _MCL_ONFAULT
-    if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
-        flags |= _MCL_FUTURE
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(flags) != 0:
-        why = os.strerror(ctypes.get_errno())
-        text = f"memory lock refused ({why}): pages of the loop can be swapped out"
-        return Outcome(False, text, GRANT_MEMORY_LOCK), []
-    return Outcome(True, "memory locked"), [libc.munlockall]
-
-
-def _hold_latency(wanted: Realtime) -> Asked:
-    """As long as the file is open, no processor goes into a state that takes time to leave."""
-    if not wanted.hold_latency:
-        return None, []
-    try:
-        descriptor = os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
-    except OSError as error:
-        text = f"{_LATENCY} refused ({error.strerror}): wake-ups take what idle states take"
-        missing = isinstance(error, FileNotFoundError)
-        return Outcome(False, text, "" if missing else GRANT_LATENCY), []
-    try:
-        os.write(descriptor, bytes(4))
-    except OSError as error:
-        os.close(descriptor)
-        return Outcome(False, f"{_LATENCY} refused ({error.strerror})"), []
-    return Outcome(True, "idle states held off"), [lambda: os.close(descriptor)]
-
-
-def _sharpen_timer(wanted: Realtime) -> Asked:
-    """The kernel may put off a wake-up by this thread's slack, to make one of several."""
-    if not wanted.timer_slack:
-        return None, []
-    nanoseconds = max(round(wanted.timer_slack * 1e9), 1)
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
-        why = os.strerror(ctypes.get_errno())
-        return Outcome(False, f"timer slack refused ({why}): wake-ups come 50 µs later"), []
-    usual = 0  # which stands for what the thread began with
-    return (
-        Outcome(True, f"timer slack {nanoseconds} ns"),
-        [lambda: libc.prctl(_PR_SET_TIMERSLACK, usual, 0, 0, 0)],
-    )
