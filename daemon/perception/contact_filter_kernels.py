@@ -15,10 +15,15 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.external_load import load_by_torques
-from softfinger.kinematics.hand.grasp_state import held_motion, holding_levers, total_tilt
+from softfinger.kinematics.hand.grasp_state import (
+    Motion,
+    Two,
+    held_motion,
+    holding_levers,
+    total_tilt,
+)
 
 FloatArray = NDArray[np.float64]
-Two = tuple[float, float]  # (left, right)
 Tip = tuple[float, float, float, float, float, float, bool]  # as `publish` says
 
 HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
@@ -208,21 +213,11 @@ def advance(
 
 
 @inner_kernel
-def _motion(f: FilterState) -> tuple[float, float, float, float, float, float, float]:
-    left = f.tip[0]
-    right = f.tip[1]
-    return held_motion(
-        left.q,
-        right.q,
-        left.d.mean,
-        right.d.mean,
-        f.angle.mean,
-        f.taper,
-        f.half_separation,
-        f.length,
-        f.offset,
-        f.radius,
-    )
+def _motion(f: FilterState) -> Motion:
+    q = f.tip[0].q, f.tip[1].q
+    d = f.tip[0].d.mean, f.tip[1].d.mean
+    lengths = f.half_separation, f.length, f.offset, f.radius
+    return held_motion(q, d, f.angle.mean, f.taper, lengths)
 
 
 @inner_kernel
@@ -396,8 +391,10 @@ def publish(
     grasp.arm[1] = arm2
     grasp.turn[0] = turn1
     grasp.turn[1] = turn2
+    d = left.d.mean, right.d.mean
+    theta = theta1, theta2
     lever1, lever2, shear, normal1, normal2 = holding_levers(
-        table1, table2, left.d.mean, right.d.mean, theta1, theta2, taper, motion
+        table1, table2, d, theta, taper, motion
     )
     out_of_grip = 0.5 * math.tan(0.5 * taper) * (normal1 + normal2)
     grasp.lever[0] = lever1
@@ -409,18 +406,9 @@ def publish(
     grasp.normal[1] = right.gain * normal2
     if left.gain > 0.0 and right.gain > 0.0:
         rolled = (shear - out_of_grip, shear + out_of_grip)
+        torques = left.torque / left.gain, right.torque / right.gain
         load, grasp.load_lever = load_by_torques(
-            table1,
-            table2,
-            left.d.mean,
-            right.d.mean,
-            theta1,
-            theta2,
-            taper,
-            motion,
-            rolled,
-            left.torque / left.gain,
-            right.torque / right.gain,
+            table1, table2, d, theta, taper, motion, rolled, torques
         )
         grasp.load = 0.5 * (left.gain + right.gain) * load
     return seen1, seen2, angle, width

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.grasp_state import sheared_gradient
+from softfinger.kinematics.hand.grasp_state import Motion, Two, sheared_gradient
 
 _STEPS = 4  # of Newton's method; the equation is a parabola, all but a line
 _LEAST_SLOPE = 0.2  # of what it is where no tip is tilted
@@ -51,15 +51,12 @@ def _unexplained(
 def load_by_torques(
     data1: NDArray[float64],
     data2: NDArray[float64],
-    d1: float,
-    d2: float,
-    theta1: float,
-    theta2: float,
+    d: Two,
+    theta: Two,
     taper: float,
-    motion: tuple[float, float, float, float, float, float, float],
-    rolled: tuple[float, float],
-    torque1: float,
-    torque2: float,
+    motion: Motion,
+    rolled: Two,
+    torques: Two,
 ) -> tuple[float, float]:
     """(L, lever): the share L [N] that each tip bears of a load 2 L along the object's t.
 
@@ -74,6 +71,8 @@ def load_by_torques(
     turn_i; ``motion`` is what :func:`hand.grasp_state.held_motion` gives. An error of both torques
     by e makes one of e/lever in L [m]. Zeros without two contacts.
     """
+    d1, d2 = d
+    theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0
     arm1, arm2, turn1, turn2, _, width, across = motion
@@ -92,10 +91,10 @@ def load_by_torques(
     load = slope = 0.0
     for _ in range(_STEPS):
         left1, slope1 = _unexplained(
-            data1, d1, theta1, 1.0, rolled[0] + load, torque1, arm1, lever1
+            data1, d1, theta1, 1.0, rolled[0] + load, torques[0], arm1, lever1
         )
         left2, slope2 = _unexplained(
-            data2, d2, theta2, -1.0, rolled[1] - load, torque2, arm2, lever2
+            data2, d2, theta2, -1.0, rolled[1] - load, torques[1], arm2, lever2
         )
         over = lever1 * left1 - lever2 * left2
         slope = max(lever1 * slope1 + lever2 * slope2, least)

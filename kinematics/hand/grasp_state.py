@@ -17,6 +17,9 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 
+Two = tuple[float, float]  # (left, right)
+Motion = tuple[float, float, float, float, float, float, float]  # as `held_motion` says
+
 _SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
 
 
@@ -28,18 +31,12 @@ def total_tilt(tilt_x: float, tilt_y: float) -> float:
 
 @inner_kernel
 def held_motion(
-    q1: float,
-    q2: float,
-    d1: float,
-    d2: float,
-    angle: float,
-    taper: float,
-    half_separation: float,
-    length: float,
-    offset: float,
-    radius: float,
-) -> tuple[float, float, float, float, float, float, float]:
+    q: Two, d: Two, angle: float, taper: float, lengths: tuple[float, float, float, float]
+) -> Motion:
     """(arm1, arm2, turn1, turn2, slide, width, across) of a held object.
+
+    ``lengths`` [m] of the hand: half the pivots' separation, a finger's length and offset, and the
+    tip's radius.
 
     Rolling without slip, both tips pressed deeper alike, gives with the tips' velocities v_i by q_i
 
@@ -54,6 +51,9 @@ def held_motion(
     2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m],
     ``width`` the distance of the contacts along n, W cos(α/2).
     """
+    q1, q2 = q
+    d1, d2 = d
+    half_separation, length, offset, radius = lengths
     nx = math.cos(angle)
     ny = math.sin(angle)
     lean = math.tan(0.5 * taper)
@@ -100,12 +100,10 @@ def sheared_gradient(
 def holding_levers(
     data1: NDArray[float64],
     data2: NDArray[float64],
-    d1: float,
-    d2: float,
-    theta1: float,
-    theta2: float,
+    d: Two,
+    theta: Two,
     taper: float,
-    motion: tuple[float, float, float, float, float, float, float],
+    motion: Motion,
 ) -> tuple[float, float, float, float, float]:
     """(τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
 
@@ -121,6 +119,8 @@ def holding_levers(
     differ where the object rubs on something. ``data1`` and ``data2`` are the tables' data. All
     zero without two contacts.
     """
+    d1, d2 = d
+    theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, slide, _, across = motion

@@ -36,10 +36,12 @@ def load_of(
     table: ContactTable, state: GraspState, rolled: float, more: float = 0.0
 ) -> tuple[float, float]:
     c = HAND.contacts(state.q, state.pose, WIDTH)
-    motion = held_motion(*state.q, *c.d, state.pose[2], 0.0, *LENGTHS)
+    motion = held_motion(tuple(state.q), tuple(c.d), state.pose[2], 0.0, LENGTHS)
     torque = Grasp(HAND, table, WIDTH).forces(state).torque + more
     data = table.data
-    return load_by_torques(data, data, *c.d, *c.theta, 0.0, motion, (rolled, rolled), *torque)
+    return load_by_torques(
+        data, data, tuple(c.d), tuple(c.theta), 0.0, motion, (rolled, rolled), tuple(torque)
+    )
 
 
 @pytest.mark.parametrize("load", [0.0, 4.0, 8.0, -3.0, -6.0])
@@ -62,19 +64,19 @@ def test_load_is_what_the_tips_bear(table: ContactTable, load: float, delta: flo
 
 
 def test_without_two_contacts_there_is_no_load(table: ContactTable) -> None:
-    motion = held_motion(0.1, 0.1, 0.0, 1e-3, 0.0, 0.0, *LENGTHS)
+    motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
     data = table.data
     rolled = (0.0, 0.0)
-    found = load_by_torques(data, data, 0.0, 1e-3, 0.1, -0.1, 0.0, motion, rolled, 0.5, 0.5)
+    found = load_by_torques(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion, rolled, (0.5, 0.5))
     assert found == (0.0, 0.0)
 
 
 def test_torques_that_no_load_explains_give_a_finite_one(table: ContactTable) -> None:
     for torque in (-50.0, 50.0):
         for q in np.linspace(-0.5, 1.0, 7):
-            motion = held_motion(q, 0.1, 1e-6, 1e-3, 0.1, 0.3, *LENGTHS)
-            at = (table.data, table.data, 1e-6, 1e-3, q, -0.1, 0.3, motion)
-            load, lever = load_by_torques(*at, (0.3, 0.3), torque, 0.5)
+            motion = held_motion((q, 0.1), (1e-6, 1e-3), 0.1, 0.3, LENGTHS)
+            at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
+            load, lever = load_by_torques(*at, (0.3, 0.3), (torque, 0.5))
             assert math.isfinite(load)
             assert lever > 0.0
 
@@ -87,8 +89,8 @@ def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(
     q, d, angle = (0.2, 0.2), (3e-3, 3e-3), 0.0
     theta = (q[0] - 0.5 * taper, 0.5 * taper - q[1])
     data, lean = table.data, math.tan(0.5 * taper)
-    motion = held_motion(*q, *d, angle, taper, *LENGTHS)
-    _, _, mean, normal1, normal2 = holding_levers(data, data, *d, *theta, taper, motion)
+    motion = held_motion(q, d, angle, taper, LENGTHS)
+    _, _, mean, normal1, normal2 = holding_levers(data, data, d, theta, taper, motion)
     out = 0.5 * lean * (normal1 + normal2)
     rolled = (mean - out, mean + out)
     # The torques of both tips' energies, each with the shear that it bears.
@@ -101,5 +103,5 @@ def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(
         normal = by_d - shear * math.tan(theta[i])
         torque = normal * n @ v[i] + shear * (HAND.tip_radius - d[i] - v[i] @ t) + by_theta
         torques.append(torque if i == 0 else -torque)
-    found, _ = load_by_torques(data, data, *d, *theta, taper, motion, rolled, *torques)
+    found, _ = load_by_torques(data, data, d, theta, taper, motion, rolled, tuple(torques))
     assert found == pytest.approx(load, abs=2e-3)

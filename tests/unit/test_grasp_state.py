@@ -37,7 +37,7 @@ def grasp(request: pytest.FixtureRequest) -> Grasp:
 
 def motion_of(state: GraspState) -> tuple[float, ...]:
     c = HAND.contacts(state.q, state.pose, WIDTH)
-    return held_motion(*state.q, *c.d, state.pose[2], 0.0, *LENGTHS)
+    return held_motion(tuple(state.q), tuple(c.d), state.pose[2], 0.0, LENGTHS)
 
 
 @pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
@@ -47,7 +47,9 @@ def test_levers_are_the_torques_that_balance_the_grasp(grasp: Grasp, delta: floa
         state = grasp.steer(state, delta)
     c = HAND.contacts(state.q, state.pose, WIDTH)
     data = grasp.table.data
-    lever1, lever2, *rest = holding_levers(data, data, *c.d, *c.theta, 0.0, motion_of(state))
+    lever1, lever2, *rest = holding_levers(
+        data, data, tuple(c.d), tuple(c.theta), 0.0, motion_of(state)
+    )
     forces = grasp.forces(state)
     assert [lever1, lever2] == pytest.approx(forces.torque / forces.force.mean(), rel=5e-4)
     shear = forces.tangential.mean()
@@ -72,7 +74,7 @@ def test_arms_and_slide_are_the_derivatives_of_what_the_tips_share() -> None:
         return -float((tips[1] - tips[0]) @ [math.cos(angle), math.sin(angle)])
 
     at = (0.12, 0.21, -0.1)
-    arm1, arm2, _, _, slide, _, _ = held_motion(at[0], at[1], 3e-3, 4e-3, at[2], 0.0, *LENGTHS)
+    arm1, arm2, _, _, slide, _, _ = held_motion(at[:2], (3e-3, 4e-3), at[2], 0.0, LENGTHS)
     step = 1e-6
     slopes = []
     for j in range(3):
@@ -84,9 +86,9 @@ def test_arms_and_slide_are_the_derivatives_of_what_the_tips_share() -> None:
 
 
 def test_levers_without_contacts_are_zero(grasp: Grasp) -> None:
-    motion = held_motion(0.1, 0.1, 0.0, 1e-3, 0.0, 0.0, *LENGTHS)
+    motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
     data = grasp.table.data
-    assert holding_levers(data, data, 0.0, 1e-3, 0.1, -0.1, 0.0, motion) == (0.0,) * 5
+    assert holding_levers(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
 
 
 def faces(q, d, angle: float, taper: float):
@@ -109,7 +111,7 @@ def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper: float) -
     middle = tips.mean(axis=0)  # whatever point of the object
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
-    arm1, arm2, turn1, turn2, slide, width, across = held_motion(*q, *d, angle, taper, *LENGTHS)
+    arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
         # For (Gx, Gy, φ): d_t of both tips stays, and both d change alike.
         left = np.array(
@@ -138,8 +140,8 @@ def test_what_holds_a_tapering_object_balances_it(grasp: Grasp, taper: float) ->
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a, data = HAND.tip_radius, grasp.table.data
     theta = (angle - 0.5 * taper + q[0], angle + 0.5 * taper - q[1])
-    motion = held_motion(*q, *d, angle, taper, *LENGTHS)
-    lever1, lever2, mean, normal1, normal2 = holding_levers(data, data, *d, *theta, taper, motion)
+    motion = held_motion(q, d, angle, taper, LENGTHS)
+    lever1, lever2, mean, normal1, normal2 = holding_levers(data, data, d, theta, taper, motion)
     lean = math.tan(0.5 * taper)
     normal = 0.5 * (normal1 + normal2)
     shear = (mean - lean * normal, mean + lean * normal)
@@ -168,9 +170,9 @@ def test_each_tip_has_its_own_table(grasp: Grasp) -> None:
     q1, q2, d1, d2, angle = 0.14, 0.22, 4.0e-3, 2.6e-3, 0.03
 
     def levers(left, right, q1, q2, d1, d2, angle):
-        motion = held_motion(q1, q2, d1, d2, angle, 0.2, *LENGTHS)
-        theta1, theta2 = angle - 0.1 + q1, angle + 0.1 - q2
-        return holding_levers(left, right, d1, d2, theta1, theta2, 0.2, motion)
+        motion = held_motion((q1, q2), (d1, d2), angle, 0.2, LENGTHS)
+        theta = angle - 0.1 + q1, angle + 0.1 - q2
+        return holding_levers(left, right, (d1, d2), theta, 0.2, motion)
 
     here = levers(soft, stiff, q1, q2, d1, d2, angle)
     mirrored = levers(stiff, soft, q2, q1, d2, d1, -angle)
