@@ -50,12 +50,13 @@ def average(
 
     ``fine`` has the stencils' half lengths more on each side than there are parts.
     """
-    wide = fine.shape[1] - len(across) + 1
-    high = fine.shape[0] - len(along) + 1
-    half = np.zeros((fine.shape[0], wide))
-    for k, weight in enumerate(across):
-        half += weight * fine[:, k : k + wide]
-    whole = np.zeros((high, wide))
-    for k, weight in enumerate(along):
-        whole += weight * half[k : k + high]
-    return np.asarray(whole.reshape(high // n[1], n[1], wide // n[0], n[0]).mean(axis=(1, 3)))
+    cols = (fine.shape[1] - len(across) + 1) // n[0]
+    rows = (fine.shape[0] - len(along) + 1) // n[1]
+    # The mean over a cell's parts goes into the weights, so that only cells are summed.
+    half = np.zeros((fine.shape[0], cols))
+    for k, weight in enumerate(np.convolve(across, np.full(n[0], 1.0 / n[0]))):
+        half += weight * fine[:, k : k + cols * n[0] : n[0]]
+    whole = np.zeros((rows, cols))
+    for k, weight in enumerate(np.convolve(along, np.full(n[1], 1.0 / n[1]))):
+        whole += weight * half[k : k + rows * n[1] : n[1]]
+    return whole

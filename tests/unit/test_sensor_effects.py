@@ -181,7 +181,7 @@ def test_counting_rounds_clips_and_leaves_out_what_is_small_or_dead(least):
     rows, cols = rng.normal(0.0, 1.0, 5), rng.normal(0.0, 1.0, 7)
     live = (rng.random((5, 7)) > 0.2).astype(float)
     out = np.zeros((5, 7), np.uint16)
-    sensor_effects.count(signal, offset, rows, cols, live, 0.7, normals, (least, 9), out)
+    sensor_effects.count(signal, offset, (rows, cols), live, 0.7, normals, (least, 9), out)
     value = signal + offset + rows[:, None] + cols + 0.7 * normals
     expected = np.clip(np.floor(value + 0.5), 0, 9)
     expected[(expected < least) | (live == 0.0)] = 0

@@ -1,14 +1,13 @@
-"""The simulated pressure sensor: a contact → the counts that a board would send.
+"""The simulated pressure sensor: from a contact to the counts that a board would send.
 
-Holds the forward model, the order of the sensor's imperfections round it, and their seed; what each
-of them does is in sensor_effects.py. Delay and lost frames are not here.
+Delay and lost frames are in arrivals.py.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,26 +15,29 @@ from numpy.typing import NDArray
 from softfinger.daemon.profile.settings import Simulation
 from softfinger.daemon.simulation.sensor import sensor_effects
 from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, render_curved
-from softfinger.daemon.simulation.sensor.sensor_effects import PLAYS, Blur
+from softfinger.daemon.simulation.sensor.sensor_effects import PLAYS
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.blur import average, parts
 from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
 
 FloatArray = NDArray[np.float64]
 
+_MOST_PARTS = 3  # of a cell's side for the blur: within 2.5e-4 of the modulus
+
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """What is wrong with a sensor; the default is nothing.
+    """A sensor's imperfections; the default has none.
 
     - ``noise`` [Pa]: a cell's standard deviation from frame to frame.
     - ``gain_spread``: standard deviation of the cells' sensitivities round 1.
-    - ``dead``: share of cells that always read 0 and that nobody is told of.
+    - ``dead``: share of cells that always read 0 and that no setting names.
     - ``blur`` [m]: the elastomer spreads a point's pressure, standard deviation.
     - ``hysteresis``: a cell being unloaded reads up to this share more than when it was loaded.
     - ``creep``, ``creep_time`` [s]: a cell's reading rises by this share under a lasting pressure.
     - ``crosstalk``: each cell reads this share of its row's and of its column's mean too much.
-    - ``drift`` [Pa], ``drift_time`` [s]: the cells' zeros wander so far over such a time.
+    - ``drift`` [Pa], ``drift_time`` [s]: the cells' zeros drift so far over such a time.
 
     Raises ValueError for values out of their range.
     """
@@ -111,13 +113,16 @@ class SensorModel:
         if flaws.dead > 0.0:
             sensitivity[self._generator.random(shape) < flaws.dead] = 0.0
         self._sensitivity = sensitivity
-        cells = grid.on(tip)
-        self._blur = Blur(cells, flaws.blur) if flaws.blur > 0.0 else None
-        self._pressure = np.zeros(shape)
-        self._target = self._pressure if self._blur is None else self._blur.fine
+        self._pressure = self._rendered = np.zeros(shape)
+        cells = grid
+        if flaws.blur > 0.0:
+            n_x, n_y = (min(parts(flaws.blur / pitch), _MOST_PARTS) for pitch in grid.pitches)
+            self._parts = n_x, n_y
+            self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._parts)
+            self._rendered = np.zeros(cells.shape)
         self._plane, self._curved = Rendering(), CurvedContact()
         for contact in (self._plane, self._curved):
-            contact.grid.assign(cells if self._blur is None else self._blur.fine_grid)
+            contact.grid.assign(cells.on(tip))
         self._plane.gain = 1.0
         self._curved.across_x, self._curved.across_y = grid.to_sensor(1.0, 0.0)
         self._plays = np.zeros((PLAYS if flaws.hysteresis > 0.0 else 0, *shape))
@@ -172,11 +177,11 @@ class SensorModel:
         contact.d, contact.n_x, contact.n_y = d, n_x, n_y
         if bend > 0.0:
             self._curved.bend = bend
-            render_curved(self._curved.array, self._law, self._target)
+            render_curved(self._curved.array, self._law, self._rendered)
         else:
-            render(self._plane.array, self._law, self._target)
-        if self._blur is not None:
-            self._blur.apply(pressure)
+            render(self._plane.array, self._law, self._rendered)
+        if flaws.blur > 0.0:
+            pressure[:] = average(self._rendered, *self._stencils, self._parts)
         if flaws.hysteresis > 0.0:
             sensor_effects.hysteresis(pressure, flaws.hysteresis, self._plays)
         if flaws.creep > 0.0:
@@ -198,7 +203,7 @@ class SensorModel:
         sensor_effects.count(
             self._signal,
             self._offset,
-            *self._lines,
+            self._lines,
             self._sensitivity,
             flaws.noise / self._per_count,
             self._normals,
