@@ -26,7 +26,7 @@ What a board's firmware has to do, at any baud (USB boards may ignore it), for e
 3. Stuff it with COBS, which leaves no zero byte: cut the message at its zero bytes (drop those);
    write each piece as one byte, its length + 1, and then the piece. A piece of 254 bytes or more
    goes out in blocks of 254 with the byte 255 before each; the rest of it, which may be empty,
-   follows as a piece of its own, unless the message ends right behind a block of 254.
+   follows as a piece of its own. (An empty one at the message's end may be left out.)
 
 4. Send a zero byte. One more before the first frame does no harm.
 
@@ -67,17 +67,12 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
     message = _HEADER.pack(kind, 0, seq & 0xFFFF, ticks, *counts.shape)
     message += counts.astype(f"<u{kind}").tobytes()
     message += _CRC.pack(binascii.crc_hqx(message, _CRC_START))
-    parts = []
-    pieces = message.split(b"\0")
-    for number, piece in enumerate(pieces):
-        while len(piece) >= _BLOCK:
-            parts.append(b"\xff" + piece[:_BLOCK])
-            piece = piece[_BLOCK:]
-            if not piece and number == len(pieces) - 1:
-                break
-        else:
-            parts.append(bytes((len(piece) + 1,)) + piece)
-    return b"".join(parts) + b"\0"
+    blocks = (
+        piece[k : k + _BLOCK]
+        for piece in message.split(b"\0")
+        for k in range(0, len(piece) + 1, _BLOCK)
+    )
+    return b"".join(bytes((len(block) + 1,)) + block for block in blocks) + b"\0"
 
 
 def longest_frame(rows: int, cols: int) -> int:

@@ -206,7 +206,7 @@ def test_tips_press_each_other_as_each_a_plane_midway():
     settled(hand, (0.9, 0.9), 0.5, 4.0)
     q = float(hand.q[0])
     assert hand.q[1] == pytest.approx(q, abs=1e-9)
-    assert hand.mutual.tolist() == [1.0, 1.0]
+    assert hand.on_other_tip.tolist() == [1.0, 1.0]
     # The plane stands at x = 0: each tip as deep as it reaches past it, tilted by its finger.
     d = RADIUS - (HAND.half_separation - HAND.finger_length * math.sin(q))
     np.testing.assert_allclose(hand.d, d, atol=1e-12)
@@ -288,11 +288,11 @@ def test_sensors_feel_the_other_tip():
 def test_an_object_keeps_the_tips_apart_until_it_is_gone():
     hand = make()
     settled(hand, (0.9, 0.9), 0.4, 1.0)
-    assert hand.mutual.tolist() == [0.0, 0.0]
+    assert hand.on_other_tip.tolist() == [0.0, 0.0]
     held = hand.q.copy()
     place(hand, hand.q, (0.0, 0.4, 0.0))
     run(hand, 1.0)
-    assert hand.mutual.tolist() == [1.0, 1.0]
+    assert hand.on_other_tip.tolist() == [1.0, 1.0]
     assert (hand.q > held + 0.1).all()
 
 

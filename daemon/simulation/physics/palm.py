@@ -39,22 +39,14 @@ def touch_palm(
 
     The first stage also brings the shears within friction and hands the rows to the full matrix.
     """
-    if not palm_is_far(plant, now):
-        press_on_palm(plant, now, stage, nx, ny, is_first)
-        return
-    for corner in range(CORNERS):
-        stage.extra_rate[corner] = 0.0
-    if is_first and plant.palm_energy != 0.0:
-        plant.palm_energy = 0.0
+    if palm_is_far(plant, now):
         for corner in range(CORNERS):
-            now.extra_shear[corner] = 0.0
-
-
-@inner_kernel
-def press_on_palm(
-    plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
-) -> None:
-    """As :func:`touch_palm`, where the palm is near; writes its energy and its shears' rates."""
+            stage.extra_rate[corner] = 0.0
+        if is_first and plant.palm_energy != 0.0:
+            plant.palm_energy = 0.0
+            for corner in range(CORNERS):
+                now.extra_shear[corner] = 0.0
+        return
     p = plant.parameters
     height = now.position[3] - p.palm
     x_rate = now.velocity[2]

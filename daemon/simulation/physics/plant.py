@@ -36,7 +36,7 @@ from softfinger.daemon.simulation.physics.full_solver import (
     solve_full,
     take_extra_stiffness,
 )
-from softfinger.daemon.simulation.physics.plant_state import ALONG_SHEAR, Motion, Plant, Sample
+from softfinger.daemon.simulation.physics.plant_state import ALONG_SHEAR, Motion, Plant, SampleRow
 from softfinger.daemon.simulation.physics.samples import settle
 from softfinger.daemon.simulation.physics.servo_loop import (
     current_reference,
@@ -198,7 +198,7 @@ def go_back(plant: Plant, table: Pointer) -> None:
 
 
 @kernel
-def step(plants: Records[Plant], table: FloatArray, ring: Records[Sample], count: int) -> None:
+def step(plants: Records[Plant], table: FloatArray, ring: Records[SampleRow], count: int) -> None:
     """Advance the plant by ``count`` sub-steps; what the tips feel is then current.
 
     ``table`` is the contact table's data; ``ring`` takes the samples that fall due.

@@ -61,10 +61,10 @@ class Felt(Record):
     tangential: Pair  # T [N]
     rim: Pair  # how far the backing plate's rim is pressed in [m]
     bend: Pair  # curvature of what is touched [1/m]
-    mutual: Flags  # it is the other tip
+    on_other_tip: Flags
 
 
-class Sample(Record):
+class SampleRow(Record):
     """What the tips felt at a frame's instant; fields as in :class:`Felt`."""
 
     number: int  # -1: none

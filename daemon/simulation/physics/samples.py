@@ -6,7 +6,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     CORNERS,
     NO_OBJECT,
     Plant,
-    Sample,
+    SampleRow,
     TipContact,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
@@ -32,7 +32,7 @@ def felt_contact(plant: Plant, finger: int) -> TipContact:
 
 
 @inner_kernel
-def take_sample(plant: Plant, ring: Records[Sample]) -> None:
+def take_sample(plant: Plant, ring: Records[SampleRow]) -> None:
     """Write the sample that is due into ``ring``, between what was felt before and is felt now."""
     p, before = plant.parameters, plant.felt
     due = plant.samples * p.sample_period
@@ -43,7 +43,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     for finger in range(2):
         now = felt_contact(plant, finger)
         # Between what is touched before and after there is nothing to interpolate.
-        same = feels_tip(plant, finger) == (before.mutual[finger] != 0)
+        same = feels_tip(plant, finger) == (before.on_other_tip[finger] != 0)
         share = back if same else 0.0
         row.d[finger] = now.d - share * (now.d - before.d[finger])
         row.theta[finger] = now.theta - share * (now.theta - before.theta[finger])
@@ -53,7 +53,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
 
 
 @inner_kernel
-def settle(plant: Plant, ring: Records[Sample]) -> None:
+def settle(plant: Plant, ring: Records[SampleRow]) -> None:
     """Take the samples that are due at the state's instant, then record what the tips feel."""
     p, felt, stage = plant.parameters, plant.felt, plant.stages[0]
     while plant.samples * p.sample_period <= plant.steps * p.step:
@@ -71,4 +71,4 @@ def settle(plant: Plant, ring: Records[Sample]) -> None:
         felt.tangential[finger] = now.tangential
         felt.rim[finger] = now.rim
         felt.bend[finger] = now.bend
-        felt.mutual[finger] = 1 if feels_tip(plant, finger) else 0
+        felt.on_other_tip[finger] = 1 if feels_tip(plant, finger) else 0

@@ -7,6 +7,7 @@ on when which command came, so that two runs are the same to the bit.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,9 @@ from softfinger.daemon.simulation.physics.plant_state import (
     CURRENT_BASED_POSITION_MODE,
     CURRENT_MODE,
     POSITION_MODE,
+    FloatArray,
     Plant,
-    Sample,
+    SampleRow,
 )
 from softfinger.kinematics.contact.table import ContactTable
 
@@ -27,6 +29,16 @@ SPARE_SAMPLES = 8
 LONGEST_ADVANCE = 10.0  # s of simulated time in one kernel call
 
 _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
+
+
+class Sample(NamedTuple):
+    """What the tips felt at a frame's instant ``t`` [s] since the start; arrays are (2,)."""
+
+    t: float
+    d: FloatArray  # m
+    theta: FloatArray  # rad
+    gain: FloatArray  # of the force over that on a plane at d and θ
+    bend: FloatArray  # curvature of what is touched, across the hand's plane [1/m]
 
 
 class SimulatedHand:
@@ -67,12 +79,15 @@ class SimulatedHand:
         state.position[:2] = settings.hand.open_angle
         state.position[2:4] = simulation.object_position
         state.position[4] = simulation.object_angle
-        self.plant.goals.mode[:] = CURRENT_BASED_POSITION_MODE
+        goals = self.plant.goals
+        goals.mode[:] = CURRENT_BASED_POSITION_MODE
         # As many as may be on their way to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         kept = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
-        self._ring = np.zeros(kept, Sample.dtype)
-        self._ring["number"] = -1
+        self._ring = np.zeros(kept, SampleRow.dtype)
+        self._numbers = self._ring["number"]
+        self._numbers[:] = -1
+        self._samples = tuple(self._ring[name] for name in Sample._fields)
         self._done = 0
         self._torque_until = math.inf
         self._per_step = 1.0 / self.step
@@ -89,8 +104,9 @@ class SimulatedHand:
         self.shear = state.shear  # d_t [m]
         # How far the backing plate's rim is pressed into the object: > 0 is past the tip's limit.
         self.rim = felt.rim  # m
-        self.mutual = felt.mutual  # 1 where the other tip is felt
-        self.torque_on = self.plant.goals.torque_on  # 1 where a servo has torque
+        self.on_other_tip = felt.on_other_tip  # 1 where the other tip is felt, not the object
+        self.torque_on = goals.torque_on  # 1 where a servo has torque
+        self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
         self._run(0)
 
     @property
@@ -116,7 +132,7 @@ class SimulatedHand:
             behind -= count
 
     def refresh(self) -> None:
-        """Bring the tips' truth up to a state that was written by hand; time stays."""
+        """Evaluate the contacts of a state that was written from outside; time stays."""
         self._run(0)
 
     def drive(
@@ -131,14 +147,13 @@ class SimulatedHand:
             raise ValueError(f"operating mode {mode} is not simulated; {_MODES} are")
         if not (math.isfinite(goal_q) and math.isfinite(goal_current)):
             raise ValueError(f"goals must be finite, not {goal_q!r} rad, {goal_current!r} A")
-        goals = self.plant.goals
-        goals.mode[joint] = mode
-        goals.torque_on[joint] = torque_on
-        goals.q[joint] = goal_q
-        goals.current[joint] = goal_current
+        self._mode[joint] = mode
+        self.torque_on[joint] = torque_on
+        self._goal_q[joint] = goal_q
+        self._goal_current[joint] = goal_current
 
     def hold_torque_until(self, t: float) -> None:
-        """Let both servos drop their torque by themselves at ``t`` [s]; infinity ends it."""
+        """End both servos' torque at ``t`` [s]; infinity: don't."""
         self._torque_until = t
 
     def push(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
@@ -158,9 +173,9 @@ class SimulatedHand:
     def sample(self, number: int) -> Sample:
         """Sample ``number``. Raises LookupError for one that is not taken yet or is overwritten."""
         place = number % len(self._ring)
-        if self._ring["number"][place] != number:
+        if self._numbers[place] != number:
             raise LookupError(f"sample {number} is not kept; {self.samples} were taken")
-        return Sample(self._ring[place : place + 1])
+        return Sample(*[values[place] for values in self._samples])
 
     def energy(self) -> float:
         """Kinetic, elastic and gravitational energy of joints, tips and object [J]."""
