@@ -1,8 +1,7 @@
-"""What a pressure grid under a soft tip reads from a curved face: a cylinder, as a disc has it.
+"""The pressure on a grid under a soft tip from a curved face: a cylinder, as a disc has it.
 
-Holds that forward model alone; the plane face's is `sensing.pressure_grid`. The springs are those
-of the plane: over each point of the base a vertical one as long as the hemisphere is high there,
-pressed down to the face.
+The plane face's model is `sensing.pressure_grid`. The springs are the same: over each point of the
+base a vertical one as long as the hemisphere is high there, pressed down to the face.
 
 A tip that takes the face for a plane, as the estimator does, finds a narrower footprint and takes
 it for a smaller d: 0.72 of the true one for R = a, 0.83 for R = 2a, θ 1 % to 12 % too small,
