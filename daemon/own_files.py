@@ -17,7 +17,7 @@ _SHARED = stat.S_IWOTH
 
 
 def runtime_folder() -> Path:
-    """Where a stand-in hand links its ports unless it is told: in the user's own runtime folder.
+    """The user's own runtime folder, where an emulated hand links its ports by default.
 
     Without one (XDG_RUNTIME_DIR, /run/user), a folder named after the user where temporary files
     are; whether that is this user's has to be looked at: `require_own`.

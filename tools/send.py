@@ -17,8 +17,8 @@ _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
 set compliance=RAD/NM, stop, clear, status. Numbers are SI; an angle may carry its unit, as in
 angle=10deg.
-Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was heard, but
-the servos have not confirmed torque off yet."""
+Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was received,
+but the servos have not confirmed torque off yet."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send, print the reply, tell by the exit status whether it was carried out."""
+    """Send, print the reply, exit status by whether it was carried out."""
     request: dict[str, Any] = {"command": arguments.command}
     if arguments.client:
         request["client"] = arguments.client

@@ -85,7 +85,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
-        """Tactile frames of both fingers; `TactileFrame.finger` says whose."""
+        """Tactile frames of both fingers; see `TactileFrame.finger`."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:

@@ -93,7 +93,7 @@ class Hand(HandClient[None]):
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
-        """Tactile frames of both fingers; `TactileFrame.finger` says whose."""
+        """Tactile frames of both fingers; see `TactileFrame.finger`."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:

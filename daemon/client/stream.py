@@ -123,7 +123,7 @@ class Subscriber(Generic[_Record]):
 
     @property
     def unreadable(self) -> int:
-        """Messages that could not be read, and were passed over."""
+        """Messages that could not be read, and were left out."""
         return self._decoder.unreadable
 
     def close(self) -> None:

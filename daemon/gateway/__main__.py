@@ -35,7 +35,7 @@ def main(words: list[str]) -> int:
     try:
         return _serve(socket.socket(fileno=int(words[0])), Config.from_json(words[1]))
     except (BrokenPipeError, ConnectionResetError):
-        return 0  # the loop ended before all was told
+        return 0  # the loop ended before all was sent
 
 
 def _serve(end: socket.socket, config: Config) -> int:

@@ -1,4 +1,4 @@
-"""Clients with keys: libzmq's sockets, and pyzmq's authenticator, which says whose key it is.
+"""Clients with keys: libzmq's sockets, and pyzmq's authenticator.
 
 Nobody gets past the handshake without a key, and libzmq bounds what comes before. Its own thread
 reads ahead of us, so what arrived before a stop is known by time alone: for a moment after it all
@@ -89,7 +89,7 @@ class _Client:
 
 
 class _KeyedEndpoint(Endpoint):
-    """A bound socket in the poll. libzmq tells of a change once, so all of it is read."""
+    """A bound socket. libzmq signals a change once, so all of it is read."""
 
     def __init__(
         self, server: Server, keys: Keys, config: Config, kind: int, queue: int, limit: int
@@ -131,7 +131,7 @@ class _KeyedEndpoint(Endpoint):
         return found
 
     def close(self) -> None:
-        """Hang up on all."""
+        """Disconnect all."""
         self._poller.forget(self._fd)
         self._socket.close()
         if self._file is not None:
@@ -161,7 +161,7 @@ class KeyedCommands(_KeyedEndpoint):
             elif self._replies and time.monotonic() - self._held_since > bounds.LONGEST_PURGE:
                 self._answer_held()  # others stop without pause: what comes next is refused, too
         self._empty = False
-        heard = set()
+        seen = set()
         until = time.monotonic() + bounds.TURN
         while time.monotonic() < until:
             parts = self._parts()
@@ -171,8 +171,8 @@ class KeyedCommands(_KeyedEndpoint):
             route, *envelope, payload = (part.bytes for part in parts)
             if len(envelope) <= 1 and route:
                 client = self._client(route, str(parts[-1].get("User-Id")))
-                if client not in heard:
-                    heard.add(client)
+                if client not in seen:
+                    seen.add(client)
                     client.pace.begin_read()
                     client.pace.behind = False
                 self._requests.take(client, envelope, payload, self.now)
@@ -228,7 +228,7 @@ class KeyedStream(_KeyedEndpoint):
         self.wanted = 0
         self.backlog = 0
         super().__init__(server, keys, config, zmq.XPUB, config.queue, bounds.KEYED_SUBSCRIPTION)
-        self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # tells every new subscriber, not a first one
+        self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
 
     def tend(self) -> None:
         self._keys.look(self.now)

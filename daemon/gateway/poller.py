@@ -40,7 +40,7 @@ class Poller:
         until = time.monotonic() + most
         while self._due:
             fd, events, call = self._due.popleft()
-            if self._calls.get(fd) is call:  # else it was hung up on meanwhile
+            if self._calls.get(fd) is call:  # else it was forgotten meanwhile
                 call(events)
             if time.monotonic() > until:
                 return

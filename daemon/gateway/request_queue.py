@@ -1,6 +1,6 @@
 """Which request goes to the loop next, and which is refused: pace, fairness, and what a stop ends.
 
-A ``stop`` goes first, whoever else speaks, and one stop to the loop answers all that wait. Of all
+A ``stop`` goes first, whoever else sends, and one stop to the loop answers all that wait. Of all
 else few are on their way to the loop at a time; the rest waits here, where every client has a place
 and none more than its share. A client that sends more than it may a second is refused until it
 pauses. Nothing here reads or sends.
@@ -28,7 +28,7 @@ _OLD = "waited too long for its turn; send it again"
 
 
 class Client(Protocol):
-    """Somebody who asks. ``pace`` is the account of what it sends."""
+    """Somebody who asks. ``pace`` counts what it sends."""
 
     alive: bool
     pace: Pace
@@ -115,7 +115,7 @@ class RequestQueue:
         self.refused = 0  # because too many came
 
     def new_pace(self, now: float) -> Pace:
-        """The account of a new client."""
+        """The pace of a new client."""
         return Pace(self._per_second, now)
 
     def take(self, client: Client, envelope: Any, payload: bytes, now: float) -> None:

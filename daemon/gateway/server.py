@@ -131,7 +131,7 @@ class Server:
         return self._send(kind + loop_link.ASKED.pack(epoch, number) + packed)
 
     def _take_packets(self) -> None:
-        """Take in what the loop says."""
+        """Take in the loop's packets."""
         for _ in range(bounds.FROM_LOOP):
             try:
                 packet = self._end.recv(loop_link.LARGEST)
@@ -181,7 +181,7 @@ class Server:
             self._stream.publish(topic, message)
 
     def close(self) -> None:
-        """Let subscribers take what waits, for a moment, and hang up."""
+        """Let subscribers take what waits, for a moment, and disconnect all."""
         deadline = time.monotonic() + bounds.LAST_WORDS
         self.poller.forget(self._end.fileno())
         self._end.close()

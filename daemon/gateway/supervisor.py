@@ -67,13 +67,13 @@ class Gateway:
     def _meet(self) -> None:
         """Wait until its sockets are bound, and give it what lasts. Raises AddressError."""
         ours = self._end
-        said = b""
+        first = b""
         if select.select([ours], [], [], _PATIENCE)[0]:
             with contextlib.suppress(OSError):
-                said = ours.recv(loop_link.LARGEST)
-        if said[:1] == loop_link.FAILED:
-            raise AddressError(said[1:].decode())
-        if said[:1] != loop_link.READY:
+                first = ours.recv(loop_link.LARGEST)
+        if first[:1] == loop_link.FAILED:
+            raise AddressError(first[1:].decode())
+        if first[:1] != loop_link.READY:
             raise AddressError("the process that serves clients could not be started")
         try:
             loop_link.send_all(ours, self.link.lasting)
@@ -94,7 +94,7 @@ class Gateway:
                 )
             if time.monotonic() - began > _LASTED:
                 wait = _AGAIN[0]
-            told = ""
+            error_before = ""
             while not self._closing.wait(wait):
                 wait = min(2.0 * wait, longest)
                 try:
@@ -104,16 +104,16 @@ class Gateway:
                     self._end.close()
                     self._process.kill()
                     self._process.wait()
-                    if str(error) != told:
-                        told = str(error)
-                        self.link.notices.append(f"clients can't be served: {told}")
+                    if str(error) != error_before:
+                        error_before = str(error)
+                        self.link.notices.append(f"clients can't be served: {error}")
                 else:
                     break
             if self._closing.is_set():  # while it was started
                 self._end.close()
 
     def close(self) -> None:
-        """Hang up, and wait until all has been sent."""
+        """Disconnect, and wait until all has been sent."""
         self._closing.set()
         self.link.close()
         self._end.close()

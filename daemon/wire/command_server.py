@@ -1,8 +1,7 @@
 """The loop's side of commands: takes requests from the gateway, and has them carried out.
 
-It lives in the loop's own thread: it is asked once a tick, costs one look when nobody speaks, and
-needs no lock. A ``stop`` goes first; what came before one is refused, wherever it waits (see
-`gateway.request_queue`).
+It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first; what came before
+one is refused, wherever it waits (see `gateway.request_queue`).
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class CommandServer:
     def __init__(self, link: Link, local: Local | None = None) -> None:
         self._link = link
         self._local = local
-        self._stopped: bytes | None = None  # the local answer, until what comes next is heard
+        self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
             link.watch(local.fileno())
@@ -57,7 +56,7 @@ class CommandServer:
 
     @property
     def notices(self) -> deque[str]:
-        """What is to be told of the gateway."""
+        """The gateway's warnings, to be published as events."""
         return self._link.notices
 
     def serve(self, handler: Handler) -> None:
@@ -131,7 +130,7 @@ def decode(payload: bytes) -> dict[str, Any]:
         raise Refused('expected a text under "command"')
     if not all(isinstance(key, str) for key in request):
         raise Refused("expected texts as keys")
-    # Nothing nested: what comes from outside is told to subscribers as it came.
+    # Nothing nested: requests are published as they came.
     if not all(value is None or isinstance(value, _VALUES) for value in request.values()):
         raise Refused("expected numbers and texts as values")
     return request

@@ -29,7 +29,7 @@ _A_TICK = 4  # taken at one; the system keeps few more
 
 
 class LocalStop:
-    """The daemon's end. ``address`` is where it takes commands, which tells it from others."""
+    """The daemon's end. The socket is named after ``address``, where it takes commands."""
 
     def __init__(self, address: str) -> None:
         """Raises AddressError."""

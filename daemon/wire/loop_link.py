@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 PUBLISH = b"P"  # topic's index, flags, piece of the message
 REPLY = b"R"  # number, reply
 EPOCH = b"E"  # epoch
-FIRST, LAST, KEEP = 1, 2, 4  # piece's place; and: don't publish it, but tell late subscribers
+FIRST, LAST, KEEP = 1, 2, 4  # place of the piece; KEEP: for late subscribers alone
 
 # From the gateway.
 READY = b"U"  # nothing: the sockets are bound
@@ -28,24 +28,24 @@ FAILED = b"!"  # why they are not
 BEGUN = b"B"  # epoch that all connections are in, or will be once they have been read
 WANTED = b"W"  # topics that somebody subscribes to as bits, refused requests
 ASK = b"C"  # epoch, number, request
-NOTICE = b"N"  # what is to be told of the gateway
-STOP = b"S"  # likewise; a stop, which goes before all else
+NOTICE = b"N"  # a warning
+STOP = b"S"  # as ASK: a stop, which goes before all else
 
 NUMBER = struct.Struct("<I")
 EPOCHS = struct.Struct("<Q")
 WANTS = struct.Struct("<IQ")
 ASKED = struct.Struct("<QI")
 
-ANEW = 3  # status of a gateway that is to be started again, and has said why
+ANEW = 3  # exit status of a gateway that is to be started again, and has given the reason
 
 LARGEST = 65_536  # bytes of a packet
 _PIECE = 60_000
 _ROOM = 1 << 20  # bytes that may be on the way; the kernel may allow less
 _LOOK = 16  # packets taken in at a tick
-_OWED = 64  # replies and epochs that wait for room
+_WAITING = 64  # replies and epochs that wait for room
 _OURS, _OTHER = 0, 1  # of the descriptors that are looked at
 _NOTICES = 20
-_KEPT = 50  # events that a gateway is given anew
+_EVENTS = 50  # events that a gateway is given anew
 
 # The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
 poll = ctypes.PyDLL(None).poll
@@ -119,30 +119,30 @@ class Link:
         self.refused = 0  # requests that the gateway refused because too many came
         self.lost = 0  # messages of the stream that found no room
         self.asked: deque[Ask] = deque()
-        self.notices: deque[str] = deque(maxlen=_NOTICES)  # of the gateway's life
+        self.notices: deque[str] = deque(maxlen=_NOTICES)  # the gateway's warnings
         self.lasting: list[bytes] = []  # packets that every gateway is sent before it is offered
         self._socket: socket.socket | None = None
         self._offered: socket.socket | None = None
-        self._owed: deque[bytes] = deque(maxlen=_OWED)
-        self._kept: deque[bytes] = deque(maxlen=_KEPT)
-        self.called = False  # until whoever takes it says otherwise
+        self._waiting: deque[bytes] = deque(maxlen=_WAITING)
+        self._last_events: deque[bytes] = deque(maxlen=_EVENTS)
+        self.called = False  # something came at the descriptor of `watch`
         self._polled = (PollFd * 2)(PollFd(-1, select.POLLIN, 0), PollFd(-1, select.POLLIN, 0))
         self._asked_of: Any = ctypes.byref(self._polled)
 
     def offer(self, end: socket.socket) -> None:
-        """Speak over this from the next look on. From any thread."""
+        """Use this from the next look on. From any thread."""
         self._offered = end
 
     def watch(self, descriptor: int) -> None:
-        """Look at another descriptor, too: `called` tells that something waits there."""
+        """Look at another descriptor, too: `called` is set when something waits there."""
         self._polled[_OTHER].fd = descriptor
 
     def look(self) -> None:
-        """Take in what the gateway says. Less than a microsecond when that is nothing."""
+        """Take in the gateway's packets. Less than a microsecond when there are none."""
         if self._offered is not None:
             self._adopt()
-        if self._owed:
-            self._pay()
+        if self._waiting:
+            self._send_waiting()
         if not poll(self._asked_of, 2, 0):
             return
         self.called = self._polled[_OTHER].revents != 0
@@ -154,15 +154,15 @@ class Link:
             except OSError:  # nothing more, or the gateway has died
                 return
             if not packet:
-                self._hang_up()
+                self._disconnect()
                 return
             self._take(packet)
 
     def wait(self, seconds: float) -> None:
-        """`look` when the gateway says something, or after so long. Not for a tick."""
+        """`look` when the gateway sends something, or after so long. Not for a tick."""
         self.look()
-        heard = [] if self._socket is None else [self._socket]
-        select.select(heard, [], [], seconds)
+        sockets = [] if self._socket is None else [self._socket]
+        select.select(sockets, [], [], seconds)
         self.look()
 
     def wait_for_room(self, seconds: float) -> None:
@@ -184,38 +184,38 @@ class Link:
             self.wanted, self.refused = WANTS.unpack_from(packet, 1)
 
     def _adopt(self) -> None:
-        """A gateway has been started: it is told the epoch and the last events."""
-        self._hang_up()
+        """Use a new gateway's socket, and give it the epoch and the last events."""
+        self._disconnect()
         self._socket, self._offered = self._offered, None
         assert self._socket is not None
         self._polled[_OURS].fd = self._socket.fileno()
-        for packet in self._kept:
+        for packet in self._last_events:
             self._send(packet)
         self.begin_epoch()
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
             self._polled[_OURS].fd = -1
         self.wanted = 0
         self.asked.clear()
-        self._owed.clear()
+        self._waiting.clear()
 
     def begin_epoch(self) -> None:
         """From now on requests that came before are not to be carried out."""
         self.epoch += 1
-        self._owed.append(EPOCH + EPOCHS.pack(self.epoch))
-        self._pay()
+        self._waiting.append(EPOCH + EPOCHS.pack(self.epoch))
+        self._send_waiting()
 
     def reply(self, number: int, reply: bytes) -> None:
         """Answer request ``number``."""
-        self._owed.append(REPLY + NUMBER.pack(number) + reply)
-        self._pay()
+        self._waiting.append(REPLY + NUMBER.pack(number) + reply)
+        self._send_waiting()
 
-    def _pay(self) -> None:
-        while self._owed and self._send(self._owed[0]):
-            self._owed.popleft()
+    def _send_waiting(self) -> None:
+        while self._waiting and self._send(self._waiting[0]):
+            self._waiting.popleft()
 
     def publish(self, topic: int, message: bytes, keep: bool = False) -> None:
         """One message of the stream; with ``keep`` a gateway started later is given it, too."""
@@ -225,12 +225,12 @@ class Link:
             return
         packet = PUBLISH + bytes((topic, FIRST | LAST)) + message
         if keep:
-            self._kept.append(PUBLISH + bytes((topic, FIRST | LAST | KEEP)) + message)
+            self._last_events.append(PUBLISH + bytes((topic, FIRST | LAST | KEEP)) + message)
         if not self._send(packet):
             self.lost += 1
 
     def publish_lasting(self, topic: int, message: bytes) -> None:
-        """What every subscriber is told, however late and long it is. Waits: not for a tick."""
+        """Publish what every subscriber gets, however late. Waits: not for a tick."""
         self.look()
         self.lasting = pieces(topic, message)
         if self._socket is not None:
@@ -248,7 +248,7 @@ class Link:
 
     def close(self) -> None:
         """Hang up; the gateway sends what it has and ends."""
-        self._hang_up()
+        self._disconnect()
         offered, self._offered = self._offered, None
         if offered is not None:
             with contextlib.suppress(OSError):

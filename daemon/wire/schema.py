@@ -182,7 +182,7 @@ class TactileFrame:
     centre_y: float = field("m", "and along y")
     rotation: float = field("rad", "of the sensor's axes against the finger's")
     unit: str = field("", "`count`: as the board sent it; `Pa`: as it was estimated")
-    scale: float = field("Pa", "one step of the data, as well as one factor can say")
+    scale: float = field("Pa", "one step of the data, exact for linear sensors")
     calibrated: bool = field("", "data × scale is the pressure by the calibration")
     calibration: str = field("", "name and date of the estimator's calibration, or empty")
     data: bytes = field(
@@ -266,7 +266,7 @@ class LoopStatistics(_TickMessage):
 
 @topic(
     SETTINGS,
-    "Once, and again for whoever subscribes later: what this hand is.",
+    "Once, and again for late subscribers: what this hand is.",
     "seq, wall, t, facts",
     "facts.{name}",
 )

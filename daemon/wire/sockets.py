@@ -1,4 +1,4 @@
-"""Addresses that the daemon listens on, so that a second daemon is told and nobody's is taken."""
+"""Addresses that the daemon listens on; one that another daemon has is refused with the reason."""
 
 from __future__ import annotations
 

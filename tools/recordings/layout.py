@@ -39,15 +39,15 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
     """Name and JSON schema of a topic's channels; anything is an object where we know no more."""
     if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
-    told = schema_docs.json_schema(topic)
+    described = schema_docs.json_schema(topic)
     if topic != schema.TACTILE:
-        return topic.decode().replace("/", "."), told
-    own = told["properties"]
+        return topic.decode().replace("/", "."), described
+    own = described["properties"]
     stamp = {
         "type": "object",
         "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
     }
-    told["properties"] = {
+    described["properties"] = {
         "timestamp": stamp,
         "frame_id": {"type": "string"},
         "width": {"type": "integer"},
@@ -56,7 +56,7 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
         "step": {"type": "integer"},
         **{("unix" if name == "timestamp" else name): field for name, field in own.items()},
     }
-    return _IMAGE, told
+    return _IMAGE, described
 
 
 def to_json(topic: bytes) -> Converter:
@@ -95,7 +95,7 @@ def _image(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_frame(message: dict[str, Any]) -> bool:
-    """Whether a map has what makes a frame of it: whose, when, and as many cells as it says."""
+    """Whether a map is a frame: a finger's, with a time and as many cells as rows × cols."""
     rows, cols, stamp = (message.get(name) for name in ("rows", "cols", "timestamp"))
     return (
         message.get("finger") in FINGERS

@@ -38,7 +38,7 @@ from softfinger.daemon.wire.schema import (
 HISTORY_STEP = 0.2  # s in one column of the trends
 HISTORY_LENGTH = 600
 WINDOW = 1.0  # s of statistics
-LATELY = 3.0  # s in which a busy machine is called so
+LATELY = 3.0  # s in which waiting for a busy machine is shown
 EVENTS = 200  # kept
 
 
@@ -91,7 +91,7 @@ class ShownFrame:
 class Event:
     """One line of hand/event."""
 
-    timestamp: float  # Unix s, NaN when not told
+    timestamp: float  # Unix s, NaN when unknown
     level: str
     kind: str
     text: str
@@ -106,7 +106,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class TickStatistics:
-    """Medians and worst values over the last second; NaN where nothing was told."""
+    """Medians and worst values over the last second; NaN when unknown."""
 
     messages: float = math.nan  # states a second
     rate: float = math.nan  # ticks a second
@@ -118,7 +118,7 @@ class TickStatistics:
 
 @dataclass(frozen=True, slots=True)
 class LoopTimes:
-    """What ``hand/stats`` tells of all ticks so far [s]; NaN where it doesn't."""
+    """Times of all ticks so far, from ``hand/stats`` [s]; NaN when unknown."""
 
     compute: tuple[float, ...]  # median, p99, largest
     late: tuple[float, ...]
@@ -150,8 +150,8 @@ class Feed:
         self.warm = math.inf  # °C from which a servo's temperature is warned about
         self.commanding: Commanding | None = None
         self._lease = math.nan  # s
-        self.asked = math.nan  # N that the last grasp was told, by whomever
-        self.force_default = math.nan  # N of a grasp that is told none
+        self.asked = math.nan  # N of the last grasp command, of any client
+        self.force_default = math.nan  # N of a grasp without a force
         self.force_most = math.inf  # N that a grip may be asked for
         self.skipped = 0
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
@@ -262,15 +262,15 @@ class Feed:
         self.times = LoopTimes(compute, late)
 
     def _take_command(self, record: dict[str, Any], now: float) -> None:
-        """Who commands; a refusal is an event of its own, for those who didn't send it."""
+        """Who commands; a refusal is shown as an event, for those who didn't send the command."""
         name, client = text(record, "command"), text(record, "client")
         if record.get("again") is True:
             return
         if record.get("ok") is not True:
-            said = text(record, "error")
+            why = text(record, "error")
             by = f" (to {client})" if client else ""
             when = number(record, "timestamp")
-            self._happened(Event(when, "warning", "refused", f"{said}{by}"))
+            self._happened(Event(when, "warning", "refused", f"{why}{by}"))
             return
         if name == "grasp":
             force = number(json.loads(text(record, "request") or "{}"), "force")
@@ -319,7 +319,7 @@ class Feed:
         return sum(waited for _, waited in self._waits)
 
     def statistics(self, now: float) -> TickStatistics:
-        """What the last second's states say of the tick."""
+        """Statistics of the last second's states."""
         while self._ticks and self._ticks[0][0] < now - WINDOW:
             self._ticks.popleft()
         if not self._ticks:

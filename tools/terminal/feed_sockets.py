@@ -53,7 +53,7 @@ class _Pending:
     label: str
     socket: zmq.Socket[bytes]
     sent: float
-    told: bool = False  # that it takes long
+    warned: bool = False  # that it takes long
 
 
 class Commander:
@@ -102,11 +102,11 @@ class Commander:
                 payload = each.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 overdue = now - each.sent >= PATIENCE
-                if overdue or (not each.told and now - each.sent >= SILENCE):
-                    each.told = True
+                if overdue or (not each.warned and now - each.sent >= SILENCE):
+                    each.warned = True
                     so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
-                    said = f"{each.label}: no answer from {self._address} {so_far}"
-                    self.reply = Reply(now, False, said)
+                    late = f"{each.label}: no answer from {self._address} {so_far}"
+                    self.reply = Reply(now, False, late)
                 if not overdue:
                     waiting.append(each)
                     continue
@@ -129,8 +129,8 @@ class Commander:
                 return Reply(now, False, f"{label}: {UNCONFIRMED}")
             return Reply(now, True, f"{label}: ok")
         why = text(record, "error") or "an answer that can't be read"
-        said = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
-        return Reply(now, False, why if said else f"{label}: {why}")
+        named = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
+        return Reply(now, False, why if named else f"{label}: {why}")
 
     def close(self) -> None:
         """Close what is open; commands that were not taken yet are dropped."""
