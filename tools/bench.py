@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--plot", type=Path, metavar="FILE", help="draw run time against error (extra 'plot')"
     )
     parser.add_argument(
-        "--against", type=Path, metavar="OLD.json", help="tell what is slower than in that file"
+        "--against", type=Path, metavar="OLD.json", help="show what is slower than in that file"
     )
 
 

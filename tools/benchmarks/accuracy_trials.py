@@ -1,4 +1,4 @@
-"""Trials of the estimator: many frames of one contact, and what the Cramér-Rao bound says of it.
+"""Trials of the estimator: many frames of one contact, and the Cramér-Rao bound there.
 
 Holds the contacts of the envelope, the bound with cells left out, and the loop that adds noise,
 counts as a board would, and estimates by the calls that the daemon makes.

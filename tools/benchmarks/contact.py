@@ -244,7 +244,7 @@ def _row(case: _Case, mode: str, times: dict[str, FloatArray]) -> Row:
 
 
 def _aims(built: Built, times: dict[str, FloatArray]) -> Iterator[Row]:
-    """Ratios of the same rounds, certified errors and builds, beside what they are meant to be."""
+    """Ratios of the same rounds, certified errors and builds, beside their aims."""
     names = {"table, constant E": 1.2}
     names |= {f"table to {tolerance:g}": aims[0] for tolerance, aims in _TOLERANCES.items()}
     for name, aim in names.items():

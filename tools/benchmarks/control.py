@@ -1,6 +1,6 @@
 """The control laws on the simulated hand: how fast, how exact and how firm, on virtual time.
 
-What is judged is the plant's truth, not what the daemon believes: forces on the tips' bases, the
+Judged by the plant's truth, not by the daemon's estimates: forces on the tips' bases, the
 object's angle, the friction that is left. Nothing but the last rows depends on the machine's speed.
 """
 

@@ -1,6 +1,6 @@
 """What a user would otherwise take for d and tilt from a frame: outside packages, where installed.
 
-Each takes a frame [Pa], keeps what stands above three times the noise, and turns the moments or the
+Each takes a frame [Pa], keeps what is above three times the noise, and turns the moments or the
 area that its package gives into d and the tilts by the model's own closed forms. The last one fits
 the same model to the same cells.
 """

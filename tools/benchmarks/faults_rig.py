@@ -1,7 +1,7 @@
 """The hardware-in-the-loop set-up that faults are injected into: two processes and their wires.
 
-The emulated hand and the daemon run as users run them. What reached the servos is asked of the
-emulated hand, never of the daemon.
+The emulated hand and the daemon run as users run them. What reached the servos is read
+from the emulated hand's record, never from the daemon.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class Rig:
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
         """The daemon's status, None when it does not answer.
 
-        Just after it stood still it refuses even this: then it is asked again.
+        Just after a stall it refuses even this: then it is asked again.
         """
         end = time.monotonic() + timeout
         while (left := end - time.monotonic()) > 0.0:

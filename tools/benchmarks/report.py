@@ -79,8 +79,8 @@ def yardstick() -> Row:
 def slower(old: list[Row], new: list[Row]) -> Table:
     """The times and ratios of ``new`` that rose beyond the noise of both runs.
 
-    Rows are told by measurement, table and name. Times are taken over their run's own yardstick, so
-    that a slower machine makes nothing slower.
+    Rows are matched by measurement, table and name. Times are taken over their run's own yardstick,
+    so that a slower machine makes nothing slower.
     """
 
     def by_key(rows: list[Row]) -> dict[tuple[str, str, str], Row]:

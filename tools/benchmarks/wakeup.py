@@ -162,7 +162,7 @@ def _cyclictest(priority: int) -> Turn:
 def histogram(text: str) -> Samples:
     """The samples [s] of a report of cyclictest, which counts whole µs, rounded down.
 
-    The middle of each stands for it; those beyond the histogram all count as the largest.
+    Each counts as its middle; those beyond the histogram all count as the largest.
     """
     values, counts = [], []
     for line in text.splitlines():

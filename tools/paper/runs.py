@@ -22,7 +22,7 @@ from softfinger.daemon.types import Contact
 from softfinger.tools.paper.sheets import FloatArray
 
 Sections = dict[str, dict[str, Any]]
-Row = tuple[tuple[float, float], tuple[float, ...]]  # true d and θ; estimates, as `_told` has them
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true d and θ; `_estimates`
 
 MODULUS = 0.304e6  # Pa
 RADIUS = 0.020  # m
@@ -73,8 +73,8 @@ def compression(tilt: float) -> Run:
 def rotation() -> Run:
     """Turn the finger by 11.5° about its root against a fixed object, from first touch on.
 
-    The root stands so far that d is 4 mm at the end. The joint moves by the servo, and d and θ are
-    what is predicted from it since the last frame.
+    The root is so far that d is 4 mm at the end. The servo moves the joint; d and θ are
+    predicted from it between frames.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
     sections: Sections = {
@@ -98,7 +98,7 @@ def rotation() -> Run:
             truth = float(daemon.hand.d[0]), float(daemon.hand.theta[0])
             if truth[1] > TILTED:
                 break
-            rows.append((truth, _told(loop.state.contacts[0])))
+            rows.append((truth, _estimates(loop.state.contacts[0])))
         return _collect(iter(rows), daemon)
 
 
@@ -132,11 +132,9 @@ def _daemon(sections: Sections) -> Daemon:
 
 
 def _frames(
-    daemon: Daemon,
-    count: int,
-    place: Callable[[SimulatedHand, float], None] | None = None,
+    daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
 ) -> Iterator[Row]:
-    """Truth at each frame's instant, and what the frame alone says."""
+    """Truth at each frame's instant, and the estimate from that frame alone."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
     if place is not None:
@@ -153,10 +151,10 @@ def _frames(
         last = contact.seq
         sample = hand.sample(contact.seq - 1)
         truth = float(sample.d[0]), float(sample.theta[0])
-        yield truth, _told(contact)
+        yield truth, _estimates(contact)
 
 
-def _told(contact: Contact) -> tuple[float, ...]:
+def _estimates(contact: Contact) -> tuple[float, ...]:
     if not contact.contact:
         return 0.0, math.nan, 0.0, 0.0
     return contact.d, contact.theta, contact.force, contact.energy
@@ -165,10 +163,10 @@ def _told(contact: Contact) -> tuple[float, ...]:
 def _collect(rows: Iterator[Row], daemon: Daemon) -> Run:
     found = list(rows)
     truth = np.array([each for each, _ in found])
-    told = np.array([each for _, each in found])
+    estimates = np.array([each for _, each in found])
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)
-    return Run(d, theta, contact.force, contact.energy, *told.T)
+    return Run(d, theta, contact.force, contact.energy, *estimates.T)
 
 
 def _roll(hand: SimulatedHand, d: float, angle: float) -> None:

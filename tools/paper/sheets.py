@@ -22,47 +22,36 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Column:
-    """A named column in ``unit``; texts, or numbers of which NaN is written as an empty cell."""
-
-    name: str
-    unit: str
-    values: NDArray[Any]
-
-    @property
-    def header(self) -> str:
-        """Name and unit; 1 stands for a number without one, and texts have none."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
-
-@dataclass(frozen=True)
 class Sheet:
-    """Columns of equal length under the name of their file."""
+    """Columns of equal length under the name of their file: (name, unit, values) of each.
+
+    Values are texts, or numbers of which NaN is written as an empty cell. The unit 1 is that of a
+    number without one; texts have none.
+    """
 
     name: str
-    columns: tuple[Column, ...]
+    columns: tuple[tuple[str, str, NDArray[Any]], ...]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of the column called ``name``. Raises KeyError when there is none."""
-        for column in self.columns:
-            if column.name == name:
-                return column.values
-        raise KeyError(name)
+        return {title: values for title, _, values in self.columns}[name]
 
     def write(self, folder: Path) -> Path:
         """Write ``folder``/name.csv, one header line with units; returns its path."""
         path = folder / f"{self.name}.csv"
         with write_text(path, newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow([column.header for column in self.columns])
-            for row in zip(*(column.values for column in self.columns), strict=True):
+            writer.writerow(
+                [f"{name} [{unit}]" if unit else name for name, unit, _ in self.columns]
+            )
+            for row in zip(*(values for _, _, values in self.columns), strict=True):
                 writer.writerow([_cell(value) for value in row])
         return path
 
 
 def sheet(name: str, *columns: tuple[str, str, ArrayLike]) -> Sheet:
     """A sheet from (name, unit, values) of each column."""
-    return Sheet(name, tuple(Column(title, unit, np.asarray(v)) for title, unit, v in columns))
+    return Sheet(name, tuple((title, unit, np.asarray(v)) for title, unit, v in columns))
 
 
 def summary(name: str, columns: Sequence[tuple[str, str]], rows: ArrayLike) -> Sheet:
