@@ -9,12 +9,13 @@ import os
 import platform
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from softfinger.daemon.own_files import write_text
 
 if TYPE_CHECKING:
-    from softfinger.tools.benchmarks.report import Row, Table
+    from softfinger.tools.benchmarks.framework.report import Row, Table
 
 MEASUREMENTS = {
     "contact": "the contact model, run time against error, beside SciPy",
@@ -64,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the files that were asked for."""
-    from softfinger.tools.benchmarks.report import Table, slower, yardstick
+    from softfinger.tools.benchmarks.framework.report import Table, slower, yardstick
 
     campaign = arguments.names[:1] == [_CAMPAIGN]
     texts = CAMPAIGNS if campaign else MEASUREMENTS
@@ -81,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     failed = False
     for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        module = importlib.import_module(f"softfinger.tools.benchmarks.{name}")
+        module = _module(name)
         if campaign:
             tables = module.measure(arguments.trials, arguments.only)
         else:
@@ -106,12 +107,17 @@ def run(arguments: argparse.Namespace) -> int:
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
     if arguments.plot:
-        from softfinger.tools.benchmarks.picture import draw
+        from softfinger.tools.benchmarks.framework.picture import draw
 
         draw(drawn, arguments.plot)
     if old:
         print(slower(old, rows))
     return 1 if failed else 0
+
+
+def _module(name: str) -> ModuleType:
+    room = "benchmarks.campaigns" if name in CAMPAIGNS else "benchmarks"
+    return importlib.import_module(f"softfinger.tools.{room}.{name}")
 
 
 def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
@@ -122,10 +128,8 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
         if name not in texts:
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
-        if texts is CAMPAIGNS:
-            module = importlib.import_module(f"softfinger.tools.benchmarks.{name}")
-            if not module.known(arguments.only):
-                raise ValueError(f"--only {arguments.only}: it is found in no case of {name}")
+        if texts is CAMPAIGNS and not _module(name).known(arguments.only):
+            raise ValueError(f"--only {arguments.only}: it is found in no case of {name}")
     if arguments.plot:
         from softfinger.tools.paper.style import NoMatplotlib, settings
 

@@ -12,11 +12,11 @@ import pytest
 
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.safety.limits import LIMITS
-from softfinger.tools.benchmarks import faults, faults_trials
-from softfinger.tools.benchmarks.campaign import Outcome
-from softfinger.tools.benchmarks.faults_cases import CASES, Case
-from softfinger.tools.benchmarks.faults_trials import Trial, judge_wire
-from softfinger.tools.benchmarks.rigs import HIL
+from softfinger.tools.benchmarks.campaigns import faults, faults_trials
+from softfinger.tools.benchmarks.campaigns.faults_cases import CASES, Case
+from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, judge_wire
+from softfinger.tools.benchmarks.framework.campaign import Outcome
+from softfinger.tools.benchmarks.framework.rigs import HIL
 
 BY_NAME = {case.name: case for case in CASES}
 

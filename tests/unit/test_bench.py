@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 
 from softfinger.tools import bench, cli
-from softfinger.tools.benchmarks import accuracy, interleaved, tick, wakeup
-from softfinger.tools.benchmarks.campaign import RigError, run_trials, upper_bound
-from softfinger.tools.benchmarks.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.report import Row, Table, figure, slower
+from softfinger.tools.benchmarks import tick, wakeup
+from softfinger.tools.benchmarks.campaigns import accuracy
+from softfinger.tools.benchmarks.framework import interleaved
+from softfinger.tools.benchmarks.framework.campaign import RigError, run_trials, upper_bound
+from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.framework.report import Row, Table, figure, slower
 
 REPORT = """\
 # /dev/cpu_dma_latency set to 0us

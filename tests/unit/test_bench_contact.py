@@ -13,9 +13,10 @@ from softfinger.kinematics.contact.closed_form import closed_form
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.benchmarks import contact, contact_kernels, contact_scipy, picture
+from softfinger.tools.benchmarks import contact, contact_kernels, contact_scipy
 from softfinger.tools.benchmarks.contact import CONSTANT, ERROR, LAW, MODES, TIP
-from softfinger.tools.benchmarks.report import Table
+from softfinger.tools.benchmarks.framework import picture
+from softfinger.tools.benchmarks.framework.report import Table
 
 
 @pytest.fixture(scope="module")

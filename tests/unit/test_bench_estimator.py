@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from softfinger.kinematics.estimation.estimator import ContactEstimate
-from softfinger.tools.benchmarks import (
+from softfinger.tools.benchmarks import estimator, estimator_rivals
+from softfinger.tools.benchmarks.campaigns import (
     accuracy,
     accuracy_detection,
     accuracy_envelope,
     accuracy_models,
     accuracy_trials,
-    estimator,
-    estimator_rivals,
 )
-from softfinger.tools.benchmarks.accuracy_trials import (
+from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     EIGHT_BITS,
     FLOAT,
     LINEAR,

@@ -1,4 +1,4 @@
-"""The measurements behind ``softfinger bench``: one module each, with ``measure() -> list[Table]``.
+"""The measurements of ``softfinger bench``, one module each with ``measure(brief) -> list[Table]``.
 
-`report`, `interleaved`, `campaign`, `picture` and the rigs are what they share.
+``PAGE`` names the rows that belong on the page: by a table's title, how their names begin.
 """

@@ -28,8 +28,8 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks import contact_kernels, contact_scipy
-from softfinger.tools.benchmarks.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.framework.report import Row, Table, figure
 
 FloatArray = NDArray[np.float64]
 Built = dict[float, tuple[ContactTable, list[float]]]

@@ -17,7 +17,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.tools.benchmarks.control_rig import Watched, push_along
-from softfinger.tools.benchmarks.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.report import Row, Table, figure
 
 Sections = dict[str, dict[str, Any]]
 Samples = defaultdict[str, list[float]]

@@ -29,8 +29,8 @@ from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.state import State
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks import accuracy_envelope
-from softfinger.tools.benchmarks.accuracy_trials import (
+from softfinger.tools.benchmarks.campaigns import accuracy_envelope
+from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     LINEAR,
     MODULUS,
     SIZE,
@@ -41,8 +41,8 @@ from softfinger.tools.benchmarks.accuracy_trials import (
     tilts,
 )
 from softfinger.tools.benchmarks.estimator_rivals import rivals
-from softfinger.tools.benchmarks.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.report import Table, figure
+from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.framework.report import Table, figure
 
 FloatArray = NDArray[np.float64]
 Truth: TypeAlias = tuple[float, float, float]  # d [m], tilt_x, tilt_y [rad]

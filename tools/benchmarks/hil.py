@@ -9,8 +9,8 @@ from typing import Any
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
-from softfinger.tools.benchmarks.report import Table, figure
-from softfinger.tools.benchmarks.rigs import HIL, emulator
+from softfinger.tools.benchmarks.framework.report import Table, figure
+from softfinger.tools.benchmarks.framework.rigs import HIL, emulator
 
 PAGE = {"hardware in the loop": ("tick",)}
 _SCRIPT: tuple[tuple[float, dict[str, Any]], ...] = (

@@ -21,9 +21,9 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.tools.benchmarks.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.report import Row, Table, figure
-from softfinger.tools.benchmarks.rigs import Sections, can, hold, virtual_daemon
+from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
+from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.rigs import Sections, can, hold, virtual_daemon
 
 _TICKS = 20  # of a call: whole periods of the frames, as of the published topics
 _SURE = 3.0  # times its own error that a saving must have to be called one

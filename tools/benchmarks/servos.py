@@ -22,9 +22,9 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.simulation.emulator.control_port import send_words
 from softfinger.daemon.types import Goal, Reading
-from softfinger.tools.benchmarks.interleaved import timed
-from softfinger.tools.benchmarks.report import Row, Table, figure
-from softfinger.tools.benchmarks.rigs import emulator
+from softfinger.tools.benchmarks.framework.interleaved import timed
+from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.rigs import emulator
 
 TITLE = "read + write of two servos"
 PAGE = {TITLE: ("unpaced", "2 Mbaud: cycle")}

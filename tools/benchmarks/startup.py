@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import zmq
 
-from softfinger.tools.benchmarks.report import Table, figure
+from softfinger.tools.benchmarks.framework.report import Table, figure
 
 TITLE = "start to the first state"
 PAGE = {TITLE: ("time", "daemon's peak memory")}

@@ -6,9 +6,9 @@ import time
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.wire import schema
-from softfinger.tools.benchmarks.interleaved import timed
-from softfinger.tools.benchmarks.report import Row, Table, figure
-from softfinger.tools.benchmarks.rigs import can, hold, virtual_daemon
+from softfinger.tools.benchmarks.framework.interleaved import timed
+from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.rigs import can, hold, virtual_daemon
 
 TITLE = "tick, back to back"
 PAGE = {TITLE: ("pipeline alone, nobody subscribed", "one second")}

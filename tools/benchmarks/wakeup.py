@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.benchmarks.report import Table, figure
+from softfinger.tools.benchmarks.framework.report import Table, figure
 
 TITLE = "wake-up after the deadline, at 1 kHz"
 PAGE = {TITLE: ("",)}

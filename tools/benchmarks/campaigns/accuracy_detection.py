@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import CLIPPED_MORE
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks import accuracy_trials as trials
-from softfinger.tools.benchmarks.accuracy_trials import (
+from softfinger.tools.benchmarks.campaigns import accuracy_trials as trials
+from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     EIGHT_BITS,
     FLOAT,
     LINEAR,
@@ -34,8 +34,8 @@ from softfinger.tools.benchmarks.accuracy_trials import (
     TIP,
     Board,
 )
-from softfinger.tools.benchmarks.campaign import upper_bound
-from softfinger.tools.benchmarks.report import Row, Table
+from softfinger.tools.benchmarks.framework.campaign import upper_bound
+from softfinger.tools.benchmarks.framework.report import Row, Table
 
 FloatArray = NDArray[np.float64]
 

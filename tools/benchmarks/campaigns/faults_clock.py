@@ -17,9 +17,9 @@ from unittest import mock
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.loop import Loop
-from softfinger.tools.benchmarks.campaign import RigError
-from softfinger.tools.benchmarks.faults_rig import Rig, stopped
-from softfinger.tools.benchmarks.faults_trials import Trial, judge_wire
+from softfinger.tools.benchmarks.campaigns.faults_rig import Rig, stopped
+from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, judge_wire
+from softfinger.tools.benchmarks.framework.campaign import RigError
 
 STEPS = {"clock stepped by +1 h": 3600.0, "clock stepped by -1 h": -3600.0}
 _BEFORE = 0.04  # s, at most

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from softfinger.tools.benchmarks.accuracy_detection import detection, false_alarms
-from softfinger.tools.benchmarks.accuracy_envelope import Sweep, against_the_bound, of_eight_bits
-from softfinger.tools.benchmarks.accuracy_models import flaws, mismatches
-from softfinger.tools.benchmarks.report import Table
+from softfinger.tools.benchmarks.campaigns.accuracy_detection import detection, false_alarms
+from softfinger.tools.benchmarks.campaigns.accuracy_envelope import (
+    Sweep,
+    against_the_bound,
+    of_eight_bits,
+)
+from softfinger.tools.benchmarks.campaigns.accuracy_models import flaws, mismatches
+from softfinger.tools.benchmarks.framework.report import Table
 
 _FRAMES = 2000  # of each contact
 

@@ -19,8 +19,8 @@ from typing import Any
 import msgpack
 import zmq
 
-from softfinger.tools.benchmarks.campaign import RigError
-from softfinger.tools.benchmarks.faults_rig import SOFTFINGER, Rig
+from softfinger.tools.benchmarks.campaigns.faults_rig import SOFTFINGER, Rig
+from softfinger.tools.benchmarks.framework.campaign import RigError
 
 _FLOODERS = 4
 _STUCK = 5

@@ -12,8 +12,8 @@ from functools import partial
 from typing import Literal
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.benchmarks import faults_pressures as pressures
-from softfinger.tools.benchmarks.faults_rig import Rig
+from softfinger.tools.benchmarks.campaigns import faults_pressures as pressures
+from softfinger.tools.benchmarks.campaigns.faults_rig import Rig
 
 Inject = Callable[[Rig, random.Random], AbstractContextManager[None]]
 # works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints

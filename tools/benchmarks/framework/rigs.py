@@ -21,7 +21,7 @@ from softfinger.daemon.types import Frame, Goal, Reading
 
 Sections = Mapping[str, Mapping[str, Any]]
 
-HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+HIL = Path(__file__).parents[3] / "config" / "hil.toml"
 _KEPT = 16  # frames that take turns
 
 

@@ -14,9 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.tools.benchmarks import accuracy_trials as trials
-from softfinger.tools.benchmarks.accuracy_trials import EIGHT_BITS, FLOAT, LINEAR, SIZE, TIP
-from softfinger.tools.benchmarks.report import Row, Table
+from softfinger.tools.benchmarks.campaigns import accuracy_trials as trials
+from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
+    EIGHT_BITS,
+    FLOAT,
+    LINEAR,
+    SIZE,
+    TIP,
+)
+from softfinger.tools.benchmarks.framework.report import Row, Table
 
 FloatArray = NDArray[np.float64]
 

@@ -17,12 +17,12 @@ from functools import partial
 
 import numpy as np
 
-from softfinger.tools.benchmarks.campaign import Outcome, run_trials
-from softfinger.tools.benchmarks.faults_cases import CASES
-from softfinger.tools.benchmarks.faults_clock import STEPS, clock_rig
-from softfinger.tools.benchmarks.faults_rig import Rig
-from softfinger.tools.benchmarks.faults_trials import Trial, trial
-from softfinger.tools.benchmarks.report import Row, Table
+from softfinger.tools.benchmarks.campaigns.faults_cases import CASES
+from softfinger.tools.benchmarks.campaigns.faults_clock import STEPS, clock_rig
+from softfinger.tools.benchmarks.campaigns.faults_rig import Rig
+from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, trial
+from softfinger.tools.benchmarks.framework.campaign import Outcome, run_trials
+from softfinger.tools.benchmarks.framework.report import Row, Table
 
 _TRIALS = 100
 

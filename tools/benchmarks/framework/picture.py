@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from softfinger.tools.benchmarks.report import Row, Table
+from softfinger.tools.benchmarks.framework.report import Row, Table
 from softfinger.tools.paper import style
 
 

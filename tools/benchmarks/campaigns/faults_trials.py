@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from softfinger.daemon.client.command_client import NoAnswer
-from softfinger.tools.benchmarks.campaign import RigError
-from softfinger.tools.benchmarks.faults_cases import Case
-from softfinger.tools.benchmarks.faults_rig import Rig, stopped
+from softfinger.tools.benchmarks.campaigns.faults_cases import Case
+from softfinger.tools.benchmarks.campaigns.faults_rig import Rig, stopped
+from softfinger.tools.benchmarks.framework.campaign import RigError
 
 _SLACK = 0.05  # s that a look may come after what it sees, and a process be late
 _WAITED = 0.015  # s between two looks that others took: what is late then is theirs

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks import accuracy_trials as trials
-from softfinger.tools.benchmarks.accuracy_trials import (
+from softfinger.tools.benchmarks.campaigns import accuracy_trials as trials
+from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     LINEAR,
     MODULUS,
     PITCH,
@@ -25,7 +25,7 @@ from softfinger.tools.benchmarks.accuracy_trials import (
     TIP,
     Place,
 )
-from softfinger.tools.benchmarks.report import Row, Table
+from softfinger.tools.benchmarks.framework.report import Row, Table
 
 FloatArray = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
 from softfinger.daemon.wire.schema import STATE
-from softfinger.tools.benchmarks.campaign import RigError
-from softfinger.tools.benchmarks.rigs import HIL
+from softfinger.tools.benchmarks.framework.campaign import RigError
+from softfinger.tools.benchmarks.framework.rigs import HIL
 
 SOFTFINGER = (sys.executable, "-m", "softfinger")
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new
