@@ -100,7 +100,7 @@ def _default_addresses() -> tuple[str, str]:
 
     try:
         return default_addresses()
-    except ValueError as error:
+    except SettingsError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 

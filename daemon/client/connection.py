@@ -9,6 +9,7 @@ from typing import Any
 import msgpack
 import zmq
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
 PATIENCE = 5.0  # s that an answer or a first message is waited for by default
@@ -22,7 +23,7 @@ def default_addresses() -> tuple[str, str]:
     """Where the stream and the commands are, from SOFTFINGER_ADDRESS or this machine's.
 
     It is ``tcp://HOST``, with the usual ports, or both addresses with a comma between them.
-    Raises ValueError when it is neither.
+    Raises SettingsError when it is neither.
     """
     named = os.environ.get("SOFTFINGER_ADDRESS", "").strip()
     if not named:
@@ -34,7 +35,7 @@ def default_addresses() -> tuple[str, str]:
         )
         return stream, commands
     if len(addresses) != 2 or not all("://" in address for address in addresses):
-        raise ValueError(
+        raise SettingsError(
             f"SOFTFINGER_ADDRESS: found {named!r}, expected tcp://HOST, or STREAM,COMMANDS as in "
             f"{STREAM_ADDRESS},{COMMAND_ADDRESS}"
         )

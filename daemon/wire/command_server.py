@@ -9,12 +9,15 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgpack
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.wire.loop_link import Ask, Link
+
+if TYPE_CHECKING:  # the gateway has no use for it
+    from softfinger.daemon.wire.local_stop import LocalStop
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -25,23 +28,10 @@ _A_TICK = 2  # commands carried out at one, a stop not counted
 _VALUES = (str, int, float)  # and bool, which is an int
 
 
-class Local(Protocol):
-    """Where a stop comes from past the gateway: `wire.local_stop.LocalStop`."""
-
-    def fileno(self) -> int:
-        """The descriptor at which it comes."""
-
-    def take(self) -> bool:
-        """Whether a stop has come."""
-
-    def answer(self, reply: bytes) -> None:
-        """Answer all who asked."""
-
-
 class CommandServer:
     """Answers requests that come over a link, and a stop that comes past it."""
 
-    def __init__(self, link: Link, local: Local | None = None) -> None:
+    def __init__(self, link: Link, local: LocalStop | None = None) -> None:
         self._link = link
         self._local = local
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
@@ -85,7 +75,7 @@ class CommandServer:
         """What has arrived until now is refused: a stop, or the loop could not act."""
         self._link.begin_epoch()
 
-    def _serve_local(self, local: Local, handler: Handler) -> None:
+    def _serve_local(self, local: LocalStop, handler: Handler) -> None:
         self._link.called = False
         if local.take():
             self._link.begin_epoch()

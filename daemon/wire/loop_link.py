@@ -45,6 +45,7 @@ _LOOK = 16  # packets taken in at a tick
 _WAITING = 64  # replies and epochs that wait for room
 _OURS, _OTHER = 0, 1  # of the descriptors that are looked at
 _NOTICES = 20
+_PATIENCE = 2.0  # s for room on the way to a new gateway
 _EVENTS = 50  # events that a gateway is given anew
 
 # The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
@@ -89,21 +90,21 @@ def pair() -> tuple[socket.socket, socket.socket]:
     return ends
 
 
-def send_all(end: socket.socket, packets: list[bytes], seconds: float = 2.0) -> None:
+def send_all(end: socket.socket, packets: list[bytes]) -> None:
     """Send packets, waiting for room: not for the loop. Raises OSError when there is none."""
     for packet in packets:
-        if not select.select([], [end], [], seconds)[1]:
+        if not select.select([], [end], [], _PATIENCE)[1]:
             raise TimeoutError("the gateway reads nothing")
         end.send(packet)
 
 
-def pieces(topic: int, message: bytes, flags: int = 0) -> list[bytes]:
+def pieces(topic: int, message: bytes) -> list[bytes]:
     """The packets that carry one message of the stream."""
     head = PUBLISH + bytes((topic,))
     count = max((len(message) + _PIECE - 1) // _PIECE, 1)
     return [
         head
-        + bytes((flags | (k == 0) * FIRST | (k == count - 1) * LAST,))
+        + bytes(((k == 0) * FIRST | (k == count - 1) * LAST,))
         + message[k * _PIECE : (k + 1) * _PIECE]
         for k in range(count)
     ]

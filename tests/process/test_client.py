@@ -33,7 +33,7 @@ from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.client.records import read
 from softfinger.daemon.client.stream import Gaps
-from softfinger.daemon.errors import HandClosed
+from softfinger.daemon.errors import HandClosed, SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 from tests.conftest import until
 from tests.harness import fake_daemon
@@ -347,5 +347,5 @@ def test_an_address_in_the_environment_that_is_none(
     monkeypatch: pytest.MonkeyPatch, named: str
 ) -> None:
     monkeypatch.setenv("SOFTFINGER_ADDRESS", named)
-    with pytest.raises(ValueError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://HOST"):
+    with pytest.raises(SettingsError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://HOST"):
         Hand()
