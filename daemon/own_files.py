@@ -56,6 +56,23 @@ def write_text(path: Path, append: bool = False, newline: str | None = None) -> 
     return open(path, mode, encoding="utf-8", newline=newline, opener=_open)
 
 
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file beside its place and move it there: it appears whole, or not at all.
+
+    Raises OSError as :func:`write_bytes`.
+    """
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with write_bytes(part) as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
 def write_bytes(path: Path) -> BinaryIO:
     """The same for bytes."""
     return open(path, "wb", opener=_open)

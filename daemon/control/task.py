@@ -1,11 +1,12 @@
-"""What the daemon does by itself after start: a script of commands, each waiting for its mode.
+"""Tasks: scripts of commands that the daemon gives itself after start.
 
-A task speaks through the same commands as a client; it can do nothing that a client can't.
+They are a client's commands; a task can do nothing that a client can't.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from itertools import chain, cycle
 from typing import Any
 
@@ -25,16 +26,16 @@ class TaskOver(SoftfingerError):
 
 
 class Task:
-    """Issues one command after another, each when the hand has come to where the last one led.
+    """Gives one command after another, each when the hand is in the mode that the last one led to.
 
-    ``lasting``: it can begin again after a fault. That is for simulated hands alone: metal must not
+    ``lasting``: it begins again after a fault. That is for simulated hands alone: metal must not
     start by itself when something was wrong.
     """
 
-    def __init__(self, script: Callable[[], Iterator[Step]], lasting: bool = False) -> None:
-        self._script = script
-        self.lasting = lasting
-        self._steps = script()
+    def __init__(self, settings: Settings) -> None:
+        self._script = partial(demo, settings.task.force, settings.task.angle)
+        self.lasting = settings.simulated
+        self._steps = self._script()
         self._mode: str = Mode.DISARMED  # what the present step waits for
         self._rest = 0.5
         self._left = self._rest
@@ -43,10 +44,7 @@ class Task:
     @staticmethod
     def named(settings: Settings) -> Task | None:
         """The settings' task, or None."""
-        task = settings.task
-        if task.name == "none":
-            return None
-        return Task(lambda: demo(task.force, task.angle), settings.simulated)
+        return None if settings.task.name == "none" else Task(settings)
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
         """The command that is due at this tick, if any.
@@ -70,10 +68,7 @@ class Task:
         return request
 
     def begin_again(self, state: State, reason: str) -> str:
-        """From now on: a pause, then out of the present mode, and the script from its start.
-
-        What a person is told of it.
-        """
+        """Pause, leave the present mode, and begin the script again; the text of the event."""
         way_out, says = ("clear", "clears it") if state.mode == Mode.FAULT else ("stop", "stops it")
         self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
         self._mode = state.mode

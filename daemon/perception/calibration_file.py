@@ -1,7 +1,7 @@
-"""The calibration file of one sensor: reading, checking whose it is, writing, applying.
+"""The calibration file of one sensor: read, checked against the sensor, written, applied.
 
-One JSON file a sensor, written whole or not at all. A step that was not done yet is null, and the
-settings' value stands for it. What the numbers mean is in `estimation.calibration`.
+One JSON file a sensor. A step that was not done yet is null, and the settings' value is taken
+instead. What the numbers mean is in `estimation.calibration`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.own_files import write_text
+from softfinger.daemon.own_files import write_whole
 from softfinger.daemon.profile.settings import Finite, Positive, Settings
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
@@ -28,7 +28,7 @@ _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
 _TABLE_STEPS = 8192  # of a curve's table: 64 KB
-_FAULTY = 0.2  # of the usual end: a cell whose range is less rests all but full
+_FAULTY = 0.2  # of the median range: a cell with less is nearly full without load
 
 
 class CalibrationFileError(TactileError):
@@ -119,11 +119,11 @@ class Calibration(_Part):
 
     @property
     def identity(self) -> str:
-        """Whose and of when: the sensor's name, its finger without one, and the file's date."""
+        """The sensor's name, or its finger, and the file's date."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
-        """Whose, of when, and which steps were done, in one line."""
+        """The same and the steps that were done, in one line."""
         steps = [name for name in _STEPS if getattr(self, name) is not None]
         return f"{self.identity}: {', '.join(steps) or 'no step'}"
 
@@ -181,7 +181,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """What tells the file's sensor from the one that is there; empty when they are one."""
+    """How the file's sensor differs from the one that is ``there``; empty: not at all."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "no name", there.label or "no name"),
@@ -198,15 +198,9 @@ def difference(file: Sensor, there: Sensor) -> str:
 def save_calibration(path: Path, calibration: Calibration) -> None:
     """Write the file whole, or leave the one that is there. Raises CalibrationFileError."""
     text = json.dumps(calibration.model_dump(mode="json"), ensure_ascii=False) + "\n"
-    temporary = path.with_name(path.name + ".new")
     try:
-        with write_text(temporary) as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        write_whole(path, text.encode())
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise CalibrationFileError(f"{path}: can't be written: {error.strerror}") from None
 
 
@@ -214,7 +208,7 @@ class Converter:
     """Counts → Pa of one sensor, into one array that is used again."""
 
     def __init__(self, calibration: Calibration, pascal_per_count: float) -> None:
-        """``pascal_per_count`` stands for a curve that was not measured."""
+        """``pascal_per_count`` is taken where no curve was measured."""
         sensor = calibration.sensor
         shape = (sensor.rows, sensor.cols)
         tare, gain, curve = calibration.tare, calibration.equilibrate, calibration.curve
@@ -256,7 +250,7 @@ class Converter:
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self._gain)
 
     def at(self, count: int) -> FloatArray:
-        """Pressure [Pa] of each cell when it reads ``count``, fresh."""
+        """Pressure [Pa] of each cell when it reads ``count``, a new array."""
         return self(np.full(self._out.shape, count, np.uint16)).copy()
 
     @property
@@ -279,32 +273,30 @@ class Converter:
 def least_end(ends: FloatArray) -> float:
     """The least of the readings at which cells are full, each over its own zero.
 
-    But for a cell that reads all but full where nothing presses: it would make all others full.
+    Cells that are nearly full without load are left out: they would make all others count as full.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """What can't be in a file whose single values are all right; empty when nothing."""
+    """What is wrong with a file whose single values are valid; empty: nothing."""
     sensor = calibration.sensor
-    shape = (sensor.rows, sensor.cols)
-    tables = []
+    tables = {}
     if calibration.tare:
-        tables.append(("tare.zero", calibration.tare.zero))
+        tables["tare.zero"] = calibration.tare.zero
     if calibration.equilibrate:
-        tables.append(("equilibrate.gain", calibration.equilibrate.gain))
-    for name, rows in tables:
+        tables["equilibrate.gain"] = calibration.equilibrate.gain
+    for name, rows in tables.items():
         if len(rows) != sensor.rows or any(len(row) != sensor.cols for row in rows):
-            return f"{name}: expected {shape[0]} rows of {shape[1]} numbers"
+            return f"{name}: expected {sensor.rows} rows of {sensor.cols} numbers"
         if min(min(row) for row in rows) < 0.0:
             return f"{name}: expected no number below 0"
     if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
         return "equilibrate.gain: every cell is dead"
     if calibration.curve:
         converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
-        points = min(_MONOTONE_POINTS, sensor.full_count + 1)
-        steps = np.linspace(0, sensor.full_count, points).astype(int)
-        pressures = [float(converter.at(int(count)).max()) for count in steps]
+        counts = np.linspace(0, sensor.full_count, min(_MONOTONE_POINTS, sensor.full_count + 1))
+        pressures = [converter.at(int(count)).max() for count in counts]
         if not np.isfinite(pressures).all() or (np.diff(pressures) <= 0.0).any():
             return "curve.coefficients: the pressure doesn't rise with the count"
     if calibration.modulus:

@@ -6,12 +6,10 @@ that is damaged or can't be read is replaced; where no file can be kept, the tab
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 
-from softfinger.daemon.own_files import write_bytes
+from softfinger.daemon.own_files import write_whole
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.material import Material
@@ -26,15 +24,7 @@ def table_file(folder: Path, tip: Fingertip, material: Material, tolerance: floa
 def save_table(file: Path, table: ContactTable, tip: Fingertip, material: Material) -> None:
     """Write ``file``, making its folder. Raises OSError where that is not possible."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        with write_bytes(part) as written:
-            written.write(table.to_bytes(tip, material))
-        part.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise
+    write_whole(file, table.to_bytes(tip, material))
 
 
 def load_table(file: Path, tip: Fingertip, material: Material, tolerance: float) -> ContactTable:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material
+from softfinger.daemon import own_files
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile import table_files
 from softfinger.daemon.profile.factory import make_table
@@ -56,7 +57,7 @@ def test_a_file_appears_whole_or_not_at_all(
             super().write(content[:50])
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(table_files, "write_bytes", lambda path: Full(path, "w"))
+    monkeypatch.setattr(own_files, "write_bytes", lambda path: Full(path, "w"))
     with pytest.raises(OSError, match="No space left"):
         save_table(file, ContactTable.build(TIP, CONSTANT, 1e-3), TIP, CONSTANT)
     assert [path.name for path in tmp_path.iterdir()] == ["tip.table"]
