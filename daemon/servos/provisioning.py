@@ -7,6 +7,7 @@ is no doubt which servo is meant (:func:`plan`).
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -92,15 +93,17 @@ def search(
     garbled: list[Garbled] = []
     opened, refusal = False, None
     for baud in bauds:
-        try:
-            with open_line(path, baud, PING_TIMEOUT) as line:
-                opened = True
-                answers = line.ping_all(wait)
-                asked = {*answers, *(ids if line.handler.damaged else ())}
-                found += [FoundServo(each, baud, *what) for each, what in answers.items()]
-                garbled += [Garbled(i, baud) for i in sorted(asked) if is_garbled(line, i)]
-        except ServoError as error:
-            refusal = refusal or error
+        with contextlib.ExitStack() as stack:
+            try:
+                line = stack.enter_context(open_line(path, baud, PING_TIMEOUT))
+            except ServoError as error:
+                refusal = refusal or error
+                continue
+            opened = True
+            answers = line.ping_all(wait)
+            asked = {*answers, *(ids if line.handler.damaged else ())}
+            found += [FoundServo(each, baud, *what) for each, what in answers.items()]
+            garbled += [Garbled(i, baud) for i in sorted(asked) if is_garbled(line, i)]
     if refusal is not None and not opened:
         raise refusal
     return Found(tuple(found), tuple(garbled))

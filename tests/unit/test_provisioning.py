@@ -13,6 +13,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
 from softfinger.daemon.servos.control_table import by_name
+from softfinger.daemon.servos.port import PortGone
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.provisioning import (
     Found,
@@ -155,6 +156,18 @@ def test_a_search_finds_servos_at_their_rate(wired: Callable[..., Bus]) -> None:
     assert str(found.servos[0]) == "ID 1 at 1000000 baud: XM430-W350, firmware 48"
     with pytest.raises(ServoError, match="no such rate"):
         search("line", (-1,))
+
+
+def test_a_port_that_goes_away_ends_a_search(
+    wired: Callable[..., Bus], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: object) -> None:
+        raise PortGone("the port is gone")
+
+    wired()
+    monkeypatch.setattr(ServoLine, "ping_all", gone)
+    with pytest.raises(PortGone):
+        search("line")
 
 
 def test_factory_modes_are_changed(wired: Callable[..., Bus]) -> None:
