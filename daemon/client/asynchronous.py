@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import zmq
 import zmq.asyncio
 
-from softfinger.daemon.client.command_client import HandClient, accepted, send, stands_already
+from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
 from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.stream import Subscriber, Wait
 from softfinger.daemon.errors import NoStream, Refused
@@ -136,7 +136,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         try:
             await self.command(command, **numbers)
         except Refused:
-            if not stands_already(command, await self.status()):
+            if not is_done(command, await self.status()):
                 raise
 
     async def status(self) -> dict[str, Any]:

@@ -72,17 +72,24 @@ def send(
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """The reply without ``ok``. Raises Refused with the reason when it is not ok."""
+    """The reply without ``ok``. Raises Refused with the reason when it is not ok.
+
+    A warning is logged when the servos have not confirmed that torque is off.
+    """
     if reply.get("ok") is not True:
         raise Refused(str(reply.get("error", "refused without a reason")))
+    if reply.get("torque_off") == "unconfirmed":
+        _log.warning(UNCONFIRMED)
     return {key: value for key, value in reply.items() if key != "ok"}
 
 
-def stands_already(command: str, status: dict[str, Any]) -> bool:
-    """Whether a refused command asked for what is so: arming what is armed, clearing no fault."""
-    mode = status.get("mode")
+def is_done(command: str, status: dict[str, Any]) -> bool:
+    """Whether a refused command asks for what is so already, by the daemon's status."""
+    mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
+    if command == "disarm":
+        return status.get("torque") is False
     return command == "clear" and mode != "fault"
 
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
-from softfinger.daemon.client.command_client import HandClient, accepted, send, stands_already
+from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
 from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.stream import Subscriber, Wait
 from softfinger.daemon.errors import NoStream, Refused
@@ -142,7 +142,7 @@ class Hand(HandClient[None]):
         try:
             self.command(command, **numbers)
         except Refused:
-            if not stands_already(command, self.status()):
+            if not is_done(command, self.status()):
                 raise
 
     def status(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from softfinger.daemon.client import (
     to_columns,
 )
 from softfinger.daemon.client.asynchronous import AsyncSubscription
+from softfinger.daemon.client.command_client import UNCONFIRMED
 from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.client.records import read
@@ -291,15 +292,28 @@ def test_both_hands_have_the_same_methods() -> None:
 
 def test_a_cell_may_be_run_twice(fake: FakeDaemon, hand: Hand) -> None:
     fake.replies = {
-        name: {"ok": False, "error": f"{name}: not while it is so"} for name in ("arm", "clear")
+        name: {"ok": False, "error": f"{name}: not while it is so"}
+        for name in ("arm", "disarm", "clear")
     }
-    fake.replies["status"] = {"ok": True, "mode": "holding"}
+    fake.replies["status"] = {"ok": True, "mode": "holding", "torque": True}
     hand.arm()
     hand.clear()
-    fake.replies["status"] = {"ok": True, "mode": "fault"}
-    for refused in (hand.arm, hand.clear):
+    fake.replies["status"] = {"ok": True, "mode": "fault", "torque": False}
+    hand.disarm()
+    fake.replies["status"] = {"ok": True, "mode": "fault", "torque": True}
+    for refused in (hand.arm, hand.disarm, hand.clear):
         with pytest.raises(Refused, match="not while it is so"):
             refused()
+
+
+def test_torque_that_is_not_confirmed_off_is_warned_of(
+    fake: FakeDaemon, hand: Hand, caplog: pytest.LogCaptureFixture
+) -> None:
+    hand.disarm()
+    assert not caplog.messages
+    fake.replies["disarm"] = {"ok": True, "torque_off": "unconfirmed"}
+    hand.disarm()
+    assert caplog.messages == [UNCONFIRMED]
 
 
 def test_a_closed_hand_says_so(hand: Hand) -> None:
