@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: _Signals, log: EventLog
 ) -> int:
-    # What follows imports numpy, numba and zmq: wrong settings are told without waiting for them.
+    # What follows imports numpy, numba and zmq: wrong settings are reported before.
     from softfinger.daemon.loop.realtime import RealTime, hold_collector
 
     hold_collector()
@@ -88,7 +88,7 @@ def _serve(
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
     try:
         daemon = Daemon(settings, on_event=log.line, table_cache=table_cache())
-    except SoftfingerError as error:
+    except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
         return 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
@@ -113,8 +113,11 @@ def _serve(
             log.plain(line)
         if recording.failed:
             log.plain(f"softfinger: {arguments.record} does not hold all of this run", "error")
-    _tell_times(daemon.loop, log)
-    state = daemon.loop.state
+    state, statistics = daemon.loop.state, daemon.loop.statistics
+    if statistics.ticks:
+        log.plain(f"{statistics.ticks} ticks, {state.timing.overruns} overruns")
+        for line in statistics.table():
+            log.plain(line)
     if state.fault:
         log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
@@ -136,15 +139,6 @@ def _service(loop: Any) -> Iterator[None]:
     finally:
         service.stopping()
         service.close()
-
-
-def _tell_times(loop: Any, log: EventLog) -> None:
-    statistics = loop.statistics
-    if not statistics.ticks:
-        return
-    log.plain(f"{statistics.ticks} ticks, {loop.state.timing.overruns} overruns")
-    for line in statistics.table():
-        log.plain(line)
 
 
 def _record(path: Path, settings: Settings, daemon: Any) -> Any:
@@ -205,7 +199,7 @@ class _Signals:
         signal.signal(signal.SIGUSR1, self._stop)
 
     def hand_over(self, loop: Any) -> None:
-        """From now on signals speak to the loop. Raises Interrupted when one came before."""
+        """From now on signals go to the loop. Raises Interrupted when one came before."""
         self._loop = loop
         if self._ended:
             raise Interrupted

@@ -19,39 +19,21 @@ _PATIENCE = 0.5  # s for a daemon to answer
 
 def check_addresses(settings: Settings) -> list[Result]:
     """Whether the stream's and the commands' address can be bound, and who has them if not."""
-    commands = settings.commands.address
-    results = []
-    for key, address in (
-        ("stream.address", settings.stream.address),
-        ("commands.address", commands),
-    ):
-        trouble = why_not_free(address)
-        if not trouble:
-            results.append(Result("pass", f"socket {address}", "free"))
-            continue
-        if trouble != "in use":
-            results.append(Result("FAIL", f"socket {address}", trouble, f"set {key}"))
-            continue
-        mode = daemon_mode(commands, settings.access.keys)
-        if mode:
-            results.append(
-                Result(
-                    "warn",
-                    f"socket {address}",
-                    f"a softfinger daemon runs here already ({mode}); a second one will not start",
-                    "end that one before you start another",
-                )
-            )
-        else:
-            results.append(
-                Result(
-                    "FAIL",
-                    f"socket {address}",
-                    "in use by something that is no softfinger daemon",
-                    f"end it, or set {key} to another address",
-                )
-            )
-    return results
+    return [_check(settings, "stream"), _check(settings, "commands")]
+
+
+def _check(settings: Settings, section: str) -> Result:
+    address, key = getattr(settings, section).address, f"{section}.address"
+    subject, trouble = f"socket {address}", why_not_free(address)
+    if not trouble:
+        return Result("pass", subject, "free")
+    if trouble != "in use":
+        return Result("FAIL", subject, trouble, f"set {key}")
+    if mode := daemon_mode(settings.commands.address, settings.access.keys):
+        text = f"a softfinger daemon runs here already ({mode}); a second one will not start"
+        return Result("warn", subject, text, "end that one before you start another")
+    text = "in use by something that is not a softfinger daemon"
+    return Result("FAIL", subject, text, f"end it, or set {key} to another address")
 
 
 def daemon_mode(address: str, keys: str = "") -> str:

@@ -115,21 +115,13 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
         sensor.close()
     frames = after["frames"] - before["frames"]
     rate = frames / spent
-    grid = f"{tactile.rows} × {tactile.cols} cells"
+    found = f"{tactile.rows} × {tactile.cols} cells, {rate:.0f} frames a second"
     lost = after.get("skipped_bytes", 0) - before.get("skipped_bytes", 0)
     if lost:
-        return Result(
-            "warn",
-            name,
-            f"{grid}, {rate:.0f} frames a second, but {lost} bytes were damaged or lost",
-            "check its cable and what else loads the USB hub",
-        )
+        fix = "check its cable and what else loads the USB hub"
+        return Result("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
     # One frame more or less falls into the time that was listened for.
     if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
-        return Result(
-            "warn",
-            name,
-            f"{grid}, {rate:.0f} frames a second, not {tactile.rate:g}",
-            f"set tactile.rate = {rate:.0f}",
-        )
-    return Result("pass", name, f"{grid}, {rate:.0f} frames a second")
+        text = f"{found}, not {tactile.rate:g}"
+        return Result("warn", name, text, f"set tactile.rate = {rate:.0f}")
+    return Result("pass", name, found)

@@ -13,22 +13,11 @@ def check_kernels(settings: Settings) -> list[Result]:
     try:
         folder = find_folder()
     except (OSError, RuntimeError) as error:
-        return [
-            Result(
-                "warn",
-                "kernel cache",
-                f"can't be used, so every start compiles: {error}",
-                "export NUMBA_CACHE_DIR=FOLDER, one that is yours alone",
-            )
-        ]
+        problem = f"can't be used, so every start compiles: {error}"
+        fix = "export NUMBA_CACHE_DIR=FOLDER, one that is yours alone"
+        return [Result("warn", "kernel cache", problem, fix)]
     cold = [part.name for part in parts(settings) if not is_built(part)]
     if not cold:
         return [Result("pass", "kernels", f"compiled, in {folder}")]
-    return [
-        Result(
-            "warn",
-            "kernels",
-            f"{', '.join(cold)} not compiled yet: the next start takes longer",
-            "softfinger compile, or just start it",
-        )
-    ]
+    problem = f"{', '.join(cold)} not compiled yet: the next start takes longer"
+    return [Result("warn", "kernels", problem, "softfinger compile, or just start it")]

@@ -41,12 +41,8 @@ def check_scheduling() -> Result:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     except OSError:
         soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-        return Result(
-            "warn",
-            "scheduling",
-            f"SCHED_FIFO is not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick",
-            GRANT_PRIORITY,
-        )
+        problem = f"not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick"
+        return Result("warn", "scheduling", f"SCHED_FIFO is {problem}", GRANT_PRIORITY)
     os.sched_setscheduler(0, *before)
     return Result("pass", "scheduling", "SCHED_FIFO is allowed")
 
@@ -60,12 +56,8 @@ def check_memory_lock(limit: int) -> Result:
     size = f"{limit >> 10} KiB"
     if limit >= _MEMORY:
         return Result("pass", "memory lock", size)
-    return Result(
-        "warn",
-        "memory lock",
-        f"{size} may be locked, {_MEMORY >> 20} MiB wanted: pages of the loop can be swapped out",
-        GRANT_MEMORY_LOCK,
-    )
+    problem = f"{size} of {_MEMORY >> 20} MiB may be locked: pages of the loop can be swapped out"
+    return Result("warn", "memory lock", problem, GRANT_MEMORY_LOCK)
 
 
 def check_idle_states(path: Path) -> Result:
@@ -75,32 +67,24 @@ def check_idle_states(path: Path) -> Result:
         return Result("warn", name, "this kernel has none: wake-ups take what idle states take")
     if os.access(path, os.W_OK):
         return Result("pass", name, "may be held")
-    return Result(
-        "warn",
-        name,
-        "no permission to hold it: wake-ups take what idle states take",
-        GRANT_LATENCY,
-    )
+    problem = "no permission to hold it: wake-ups take what idle states take"
+    return Result("warn", name, problem, GRANT_LATENCY)
 
 
 def check_clock_source(path: Path) -> Result:
     """Whether reading the time is cheap and fine enough."""
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     if resolution > 1e-6:
-        return Result(
-            "warn", "clock", f"monotonic time has steps of {resolution * 1e6:g} µs, not ≤ 1 µs"
-        )
+        problem = f"monotonic time has steps of {resolution * 1e6:g} µs, not ≤ 1 µs"
+        return Result("warn", "clock", problem)
     try:
         source = path.read_text().strip()
     except OSError:
         source = "unknown"
     if source in ("hpet", "acpi_pm", "jiffies"):
-        return Result(
-            "warn",
-            "clock",
-            f"the kernel reads {source}, about a microsecond each time",
-            "boot with clocksource=tsc where the processor's is stable",
-        )
+        problem = f"the kernel reads {source}, about a microsecond each time"
+        fix = "boot with clocksource=tsc where the processor's is stable"
+        return Result("warn", "clock", problem, fix)
     return Result("pass", "clock", f"monotonic, {resolution * 1e9:g} ns, source {source}")
 
 
@@ -108,12 +92,9 @@ def check_wall_clock(now: float) -> Result:
     """Whether Unix time ``now`` [s] can be one: it stands in every published message."""
     if now >= _OLDEST:
         return Result("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
-    return Result(
-        "warn",
-        "wall clock",
-        f"says {time.strftime('%Y-%m-%d', time.gmtime(now))}: published timestamps will be wrong",
-        "sudo timedatectl set-ntp true",
-    )
+    date = time.strftime("%Y-%m-%d", time.gmtime(now))
+    problem = f"says {date}: published timestamps will be wrong"
+    return Result("warn", "wall clock", problem, "sudo timedatectl set-ntp true")
 
 
 def wake_ups() -> list[float]:
@@ -134,6 +115,5 @@ def check_wake_ups(late: list[float]) -> Result:
     text = f"late by {middle * 1e6:.0f} µs, at most {worst * 1e6:.0f} µs in {len(late)} ticks"
     if middle < 0.25 * _PERIOD:
         return Result("pass", "wake-ups", text)
-    return Result(
-        "warn", "wake-ups", f"{text}: the machine is busy or slow to wake", "end what else runs"
-    )
+    problem = f"{text}: the machine is busy or slow to wake"
+    return Result("warn", "wake-ups", problem, "end what else runs")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-from softfinger.daemon.diagnosis.result import Result
+from softfinger.daemon.diagnosis.result import Result, Status
 
 _SYSFS = Path("/sys/class/tty")
 _PROC = Path("/proc")
@@ -42,11 +42,10 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
     except OSError as error:
         dangling = Path(path).is_symlink()
         why = "leads nowhere" if dangling else (error.strerror or "not found").lower()
-        return Result(
-            "FAIL", path, why, f"plug the adapter in, or set {key} to one of the ports there are"
-        )
+        fix = f"plug the adapter in, or set {key} to one of the ports there are"
+        return Result("FAIL", path, why, fix)
     if not stat.S_ISCHR(mode.st_mode):
-        return Result("FAIL", path, "is no serial port", f"set {key}")
+        return Result("FAIL", path, "is not a serial port", f"set {key}")
     if not os.access(path, os.R_OK | os.W_OK):
         return Result("FAIL", path, "no permission to open it", _permission(path, mode))
     try:
@@ -54,10 +53,12 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
     except OSError as error:
         if error.errno == errno.EBUSY:
             return _busy(path, mode_of_daemon)
-        return Result("FAIL", path, f"can't be opened: {error.strerror}", "plug it in anew")
+        return Result(
+            "FAIL", path, f"can't be opened: {error.strerror}", "plug it in again"
+        )
     try:
         if not os.isatty(descriptor):
-            return Result("FAIL", path, "is no serial port", f"set {key}")
+            return Result("FAIL", path, "is not a serial port", f"set {key}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return _busy(path, mode_of_daemon)
@@ -174,10 +175,6 @@ def check_latency_timer(path: str, reply_timeout: float, sysfs: Path = _SYSFS) -
         return Result("warn", subject, f"can't be read: {error}")
     if latency <= 1:
         return Result("pass", subject, f"{latency} ms")
-    late = latency * 1e-3 >= reply_timeout
-    return Result(
-        "FAIL" if late else "warn",
-        subject,
-        f"{latency} ms, so every read takes that long",
-        f"softfinger doctor --fix, or: echo 1 | sudo tee {place}",
-    )
+    status: Status = "FAIL" if latency * 1e-3 >= reply_timeout else "warn"
+    fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
+    return Result(status, subject, f"{latency} ms, so every read takes that long", fix)

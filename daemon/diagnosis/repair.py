@@ -25,12 +25,8 @@ def repair_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
     try:
         place.write_text("1")
     except OSError as error:
-        return Result(
-            "warn",
-            subject,
-            f"could not be set: {(error.strerror or 'refused').lower()}",
-            f"echo 1 | sudo tee {place}",
-        )
+        problem = f"could not be set: {(error.strerror or 'refused').lower()}"
+        return Result("warn", subject, problem, f"echo 1 | sudo tee {place}")
     return Result("fixed", subject, "set to 1 ms")
 
 

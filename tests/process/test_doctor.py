@@ -206,8 +206,8 @@ def test_ports_that_can_not_be_used(tmp_path):
     assert ports.check_port(str(dangling), "servos.port").text == "leads nowhere"
     plain = tmp_path / "plain"
     plain.touch()
-    assert ports.check_port(str(plain), "servos.port").text == "is no serial port"
-    assert ports.check_port("/dev/null", "servos.port").text == "is no serial port"
+    assert ports.check_port(str(plain), "servos.port").text == "is not a serial port"
+    assert ports.check_port("/dev/null", "servos.port").text == "is not a serial port"
 
 
 def test_a_port_without_permission(monkeypatch, terminal):
@@ -356,7 +356,7 @@ def test_free_and_taken_sockets(addresses, monkeypatch):
     with socket.create_server((host, int(port))):
         taken, free = check(settings)
     assert taken.status == "FAIL"
-    assert "no softfinger daemon" in taken.text
+    assert "not a softfinger daemon" in taken.text
     assert "stream.address" in taken.fix
     assert free.status == "pass"
 
