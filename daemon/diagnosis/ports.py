@@ -53,9 +53,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
     except OSError as error:
         if error.errno == errno.EBUSY:
             return _busy(path, mode_of_daemon)
-        return Result(
-            "FAIL", path, f"can't be opened: {error.strerror}", "plug it in again"
-        )
+        return Result("FAIL", path, f"can't be opened: {error.strerror}", "plug it in again")
     try:
         if not os.isatty(descriptor):
             return Result("FAIL", path, "is not a serial port", f"set {key}")
