@@ -26,7 +26,7 @@ def _pair() -> list[float]:
 
 @dataclass(slots=True)
 class Reading:
-    """What the servos said. Filled in place by ``Servos.read``."""
+    """The joints as they were read last. Filled in place by ``Servos.read``."""
 
     seq: int = 0
     t: float = -math.inf  # when the last good one was taken
@@ -35,8 +35,8 @@ class Reading:
     dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
     current: list[float] = field(default_factory=_pair)  # motor current [A], positive closes
     alert: int = 0  # bit i: servo of finger i reports a hardware error
-    lost: int = 0  # bit i: it holds none of the goals that were sent to it lately
-    frozen: int = 0  # bit i: its own clock stands still, and so does what it measures
+    lost: int = 0  # bit i: it has none of the goals that were sent lately
+    frozen: int = 0  # bit i: its clock has stopped, so what it measures is old
     hardware: list[int] = field(default_factory=lambda: [0, 0])  # its error bits, 0 if not known
     temperature: list[float] = field(default_factory=_pair)  # [°C], 0 while not known
     voltage: list[float] = field(default_factory=_pair)  # of the supply [V], likewise
@@ -69,7 +69,7 @@ class Contact:
     d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
     theta_std: float = 0.0
     gain: float = 1.0  # measured pressure over modelled pressure
-    misfit: bool = False  # the frame is no contact of the model's: d and theta may be biased
+    misfit: bool = False  # the frame fits no contact of the model: d and theta may be biased
     force: float = 0.0  # F(d, θ) [N]
     energy: float = 0.0  # U(d, θ) [J]
     inside: bool = True  # (d, θ) lies inside the model's domain
@@ -86,28 +86,28 @@ class ObjectPose:
 
 @dataclass(slots=True)
 class Goal:
-    """What the servos shall do. Filled in place by the control law, bounded by safety."""
+    """Goals of the servos. Filled in place by the control law, bounded by safety."""
 
     seq: int = 0
     t: float = 0.0
     valid: bool = False
     q: list[float] = field(default_factory=_pair)  # goal angle [rad]
     current: list[float] = field(default_factory=_pair)  # bound on the current's magnitude [A]
-    force: float = math.nan  # mean force of the tips that the grip goes to [N], NaN without a grip
-    angle: float = math.nan  # the object's angle that the grip keeps [rad], NaN where it keeps none
+    force: float = math.nan  # target of the tips' mean force [N], NaN without a grip
+    angle: float = math.nan  # target of the object's angle [rad], NaN without one
 
 
 @dataclass(slots=True)
 class Timing:
-    """What the loop knows about its own ticks, in this machine's time [s]."""
+    """The loop's own times [s], by this machine's clock."""
 
     tick_s: float = 0.0  # from this tick's start to the last one's
     compute_s: float = 0.0  # work of the last tick
     wake_late_s: float = 0.0  # this tick's start after its deadline
     overruns: int = 0  # ticks whose work outlasted the period
-    late_in_row: int = 0  # the last of them, without one in time between; 0 where time waits
-    behind_s: float = 0.0  # how long a simulated hand has waited for this machine since the start
-    busy_s: float = 0.0  # how long this machine has just kept the loop from a tick, or 0
+    late_in_row: int = 0  # consecutive late ticks; 0 where the hand's time waits
+    behind_s: float = 0.0  # that a simulated hand has waited for this machine since the start
+    busy_s: float = 0.0  # that this machine has just kept the loop from a tick, or 0
 
 
 def _contacts() -> list[Contact]:
@@ -123,10 +123,10 @@ class State:
     wall: float = 0.0  # Unix time [s]
     mode: str = "disarmed"
     fault: str = ""
-    fault_name: str = ""  # the row of `safety.limits` it stands in
+    fault_name: str = ""  # its limit in `safety.limits`
     torque: bool = False  # on, or not confirmed to be off
     torque_off: bool = False  # the servos confirmed at this tick that it is off
-    read_error: str = ""  # what the servos' bus failed with at this tick, reading and writing
+    read_error: str = ""  # of the servos' bus at this tick
     write_error: str = ""
     reading: Reading = field(default_factory=Reading)
     contacts: list[Contact] = field(default_factory=_contacts)

@@ -1,8 +1,7 @@
 """The grip laws: forces and the object's angle to joint torques, once both tips touch.
 
-What it computes each tick stands in `control.grip_kernels`; modes and limits are elsewhere. Two
-fingers have one motion that changes the grip (both close) and one that moves the object (q1 + δ, q2
-− δ), so every law has two parts:
+`control.grip_kernels` computes them. Two fingers have one motion that changes the grip (both close)
+and one that moves the object (q1 + δ, q2 − δ), so every law has two parts:
 
 1. *grip*: a bias torque, lever times force wanted, with what the joints' friction takes on the way;
    a proportional and an integral part on the force felt; damping to the stiffness of the tips;
@@ -12,8 +11,8 @@ fingers have one motion that changes the grip (both close) and one that moves th
 
 ``control.law`` says where the levers come from: ``two_phase`` takes the force's arm about the
 pivot, ``energy`` the gradient of the tables' energy along the rolling increments, in which the
-tips' moments and shear forces are counted, too. ``position`` commands angles and no torques; it is
-there to be compared with.
+tips' moments and shear forces are counted, too. ``position`` commands angles and no torques, for
+comparison.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class Grip:
     """Force control from the tactile estimate, and steering by the antisymmetric joint motion."""
 
     def __init__(self, settings: Settings, fingers: list[int], grasp: GraspState) -> None:
-        """``fingers`` take part, left first; ``grasp`` is looked at as it is at each tick."""
+        """``fingers`` take part, left first; ``grasp`` is read at each tick."""
         control = settings.control
         both, dt = len(fingers) == 2, 1.0 / settings.loop.rate
         self._control = control
@@ -43,10 +42,10 @@ class Grip:
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of the tips [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # of the object [rad]
         self.slip = state.slip
-        self.asked = 0.0  # force that was asked for [N]
-        self.given = 0.0  # force that is gone to, more where the tips would slip [N]
+        self.asked = 0.0  # force of the command [N]
+        self.given = 0.0  # target force, more where the tips would slip [N]
         self.slipped = False  # the object has turned in the grip, at this tick
-        self.kept_angle = math.nan  # of the object that is gone to, or kept [rad]
+        self.kept_angle = math.nan  # target of the object's angle [rad]; NaN: it is not steered
         set_law(state.slip.law, settings)
         law = state.law
         law.dt = dt
@@ -60,7 +59,7 @@ class Grip:
         law.torque_max = settings.safety.current_max * control.torque_constant
         law.rest = math.exp(-2.0 * dt / control.smooth_time)
         law.by_energy = control.law == "energy" and both
-        # Joints that are held to angles give whatever torque that takes: it says nothing of loads.
+        # The torques of joints that are held to angles show no load.
         law.watched = control.law != "position" and both
         state.joint_stiffness = control.joint_stiffness
 

@@ -1,4 +1,4 @@
-"""The grip laws' state and kernels; what they are for stands in `control.grip`.
+"""The grip laws' state and kernels; `control.grip` explains the laws.
 
 Kernels that Python calls take the laws' state, the grasp of this tick, and the windows of both
 setpoints. Pairs are (left, right). SI units.
@@ -55,7 +55,7 @@ class GripState(Record):
     asked: float  # force [N]
     force_rate: float  # [N/s]
     joint_stiffness: float  # [N·m/rad]
-    steering: bool  # the object's angle is gone to, or kept
+    steering: bool  # the object's angle has a target
     integral: float  # [N]
     push: float  # that the joints give, both laws' parts together [N]
     lean: float  # speed of the offset that turns the object [rad/s]
@@ -100,7 +100,7 @@ def squeeze(
     dq: tuple[float, float],
     holding: bool,
 ) -> tuple[float, float, float, bool]:
-    """Torques of both joints [N·m], the force [N] that is gone to, and whether the object slipped.
+    """Torques of both joints [N·m], the target force [N], and whether the object slipped.
 
     ``turned`` is the object's angle [rad], NaN where it is not known. ``dq``: joint velocities
     [rad/s]. ``holding``: nothing but loads moves the joints.

@@ -1,4 +1,4 @@
-"""The hand's modes, its commands, and the table of which command is heard in which mode."""
+"""The hand's modes and commands, and which command is accepted in which mode."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HELD = frozenset({Mode.HOLDING, Mode.ROTATING})
 _ON = frozenset(Mode) - {Mode.DISARMED, Mode.FAULT}
 _ANY = frozenset(Mode)
 
-# command → (modes in which it is heard, its numbers: name → required)
+# command → (modes in which it is accepted, its numbers: name → required)
 COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "arm": (frozenset({Mode.DISARMED}), {}),
     "disarm": (_ANY - {Mode.FAULT}, {}),

@@ -5,11 +5,10 @@ What these sensors show, and what they don't:
 - A pressure grid feels normal pressure only; shear does not change it.
 - The joints' currents show a load along the faces: what pressure does not explain of a torque is
   shear (`hand.external_load`). A joint's friction hides a load of its torque over W turn, 1.7 N a
-  tip at the default hand. What stands when holding begins is taken as friction up to that, and as
-  load beyond; what comes slower than a second is followed as friction up to that, too. Half of it
-  is no sign, and a load that is seen is taken as so much more as friction may hide. So a grip whose
-  friction bears less than about twice that is not guarded well, at the default hand below 7 N; one
-  that bears less than it is not guarded, below 2.8 N.
+  tip at the default hand. Up to that, what is seen when holding begins, and what changes slower
+  than in a second, is taken as friction. Less than half of it is no sign of a load; a load that is
+  seen is taken for more by what friction may hide. So a grip whose tips' friction bears less than
+  about twice that is not guarded well, at the default hand below 7 N, and below 2.8 N not at all.
 - A torque constant that is wrong by a share looks like a load in proportion to the grip: up to 10 %
   of the torque are taken out when holding begins.
 - A load towards the palm wedges the object between the tips: it shows less, and needs more to slip.
@@ -18,8 +17,8 @@ What these sensors show, and what they don't:
 - An object that slides along its parallel faces without turning changes no d, no θ and no joint:
   once it slides, nothing shows it until a tip comes to its edge. So the margin is kept before, and
   ``control.tip_friction`` must not be more than the real friction.
-- While the grip is built up or the object turns, currents also move the joints: the load of before
-  stands. A load that grows by more than about 10 N a second is too fast for the grip.
+- While the grip is built up or the object turns, currents also move the joints: the last load is
+  kept. A load that grows by more than about 10 N a second is too fast for the grip.
 """
 
 from __future__ import annotations
@@ -151,7 +150,7 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
         s.stray = grasp.stray
     # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
     spare = law.friction * (1.0 - law.margin) - grasp.shear
-    # Of a grip that bears less than the joints' friction hides their torques say nothing.
+    # A grip that bears less than the joints' friction hides is not judged by their torques.
     seen = s.load if law.friction * asked > s.friction else 0.0
     load = max(seen, 0.5 * law.object_load)
     needed = 0.0

@@ -1,8 +1,8 @@
 """The control law's modes: commands in, one goal for the servos a tick out.
 
-Holds what each mode does and when it passes into the next. Which command is heard when stands in
-`control.modes`, what else speaks against one in `loop.requests`, the grip law in `control.grip`,
-limits that must not be trusted to a control law in `safety.supervisor`.
+What each mode does, and when it passes into the next. `control.modes` lists the commands,
+`loop.requests` checks them, `control.grip` has the grip law, and `safety.supervisor` the limits,
+which are not left to a control law.
 """
 
 from __future__ import annotations
@@ -29,13 +29,10 @@ _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
 
 
 class Control:
-    """Modes and their laws. All is called from the loop's thread only.
-
-    Its commands are those of `control.modes.COMMANDS`; `loop.requests` has checked them.
-    """
+    """Modes and their laws. Only the loop's thread calls it, with commands that were checked."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
-        """``state`` and ``grasp`` are looked at as they are at each tick, and never changed."""
+        """``state`` and ``grasp`` are read at each tick, and never written."""
         self._settings = settings
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._grip = Grip(settings, self._fingers, grasp)
@@ -117,7 +114,7 @@ class Control:
         self._grip.soften(1.0 / compliance)
 
     def why_not_turn(self, angle: float) -> str:
-        """What speaks against turning the held object to ``angle`` [rad] now; empty: nothing."""
+        """Why the held object can't be turned to ``angle`` [rad] now; empty where it can."""
         if not self._pose.valid:
             return "the object's angle is not known"
         low, high = self._turns()
@@ -195,15 +192,15 @@ class Control:
             goal.force = self._force
 
     def coast(self, goal: Goal) -> None:
-        """In the place of `step` while frames are late: goals stay as they are.
+        """In place of `step` while frames are late: goals stay as they are.
 
-        Those that stand for torques do not: a grip goes on to damp its joints, and a turn rests.
+        But for a grip's, which are torques: its joints are damped, and a turn comes to rest.
         """
         if goal.valid and self._gripping and self._lost == 0.0 and not self._by_position:
             self._pull(self._grip.coast(self._reading), goal)
 
     def _rest(self, goal: Goal, current: float) -> None:
-        """Joints go with their setpoints, with so much ``current`` [A] at most."""
+        """Joints follow their setpoints, with at most ``current`` [A]."""
         for index in self._fingers:
             goal.q[index] = self._setpoints[index].value
             goal.current[index] = current

@@ -5,20 +5,20 @@ motion carries d and the object's angle φ on by the rolling constraints (`hand.
 frame is compared with what was predicted for the instant at which it was sampled, and the
 difference, weighed by both variances, corrects the present.
 
-A reading says only within which count a joint is: the tracked angle runs on with the measured
-velocity and is held inside that count, so that it is exact at each count's edge.
+An encoder reads whole counts: the tracked angle runs on with the measured velocity and is held
+inside the count that was read, so that it is exact at each count's edge.
 
 φ is the angle of the bisector of the object's faces; how much these lean towards each other, the
 taper α, is found from the frames of both tips, beginning with ``object.taper``. So each tip's θ is
-what its own sensor says, whatever is held. A shifted sensor looks the same, and is not judged here:
-the safety limit ``hand.angle`` compares the frames with ``object.taper`` alone. A disc has no faces
-and no angle: φ is the direction of the line from contact to contact, not how the disc is turned,
-and ``rotate`` goes by it. That line goes with the tips: it turns by 2 L sin q/(2R + 2a − d1 − d2)
-of what the joints lean, 0.4 instead of the predicted 1.5 for R = 20 mm and the default hand. So the
-frames have more to correct, turning takes longer, and the disc rolls further than is asked; since
-its curved contact looks less tilted than it is, φ comes out a fifth too small. Where the fingers
-stand straight or lean outwards the line does not follow the joints: a disc of R ≥ 30 mm is held,
-but turning it ends at the tips' limits.
+what its own sensor measures, whatever is held. A shifted sensor looks the same; that is not judged
+here: the safety limit ``hand.angle`` compares the frames with ``object.taper`` alone. A disc has no
+faces and no angle: φ is the direction of the line from contact to contact, not how the disc is
+turned, and ``rotate`` goes by it. That line goes with the tips: it turns by 2 L sin q/(2R + 2a − d1
+− d2) of what the joints lean, 0.4 instead of the predicted 1.5 for R = 20 mm and the default hand.
+So the frames have more to correct, turning takes longer, and the disc rolls further than is asked;
+since its curved contact looks less tilted than it is, φ comes out a fifth too small. Where the
+fingers stand straight or lean outwards the line does not follow the joints: a disc of R ≥ 30 mm is
+held, but turning it ends at the tips' limits.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class ContactFilter:
         self._sound = [False, False]  # the newest frame's estimate can be used
 
     def switch_off(self) -> None:
-        """Pass frames on as they are, late and rare: to show what prediction is worth."""
+        """Take frames as they are, late and rare, for comparison."""
         self._state.raw = True
 
     def advance(self, reading: Reading) -> None:
@@ -98,7 +98,7 @@ class ContactFilter:
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         sound = self._sound[finger] = frame.valid and estimate.valid
         if not sound:
-            return  # no news: the contact is carried on, and its age tells safety
+            return  # nothing is learnt: the contact is carried on, and grows older
         contact.t_sound = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
@@ -147,7 +147,7 @@ class ContactFilter:
 
 
 def _fill_from_frame(contact: Contact, estimate: ContactEstimate, table: FloatArray) -> None:
-    """Make ``contact`` what one frame's estimate says by itself; ``table``: its tip's data."""
+    """Fill ``contact`` from one frame's estimate alone; ``table``: its tip's data."""
     touches = estimate.contact
     contact.d = estimate.d if touches else 0.0
     contact.theta = estimate.tilt_x if touches else 0.0

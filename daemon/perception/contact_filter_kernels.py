@@ -1,4 +1,4 @@
-"""The contact filter's state and kernels; what they are for stands in `perception.contact_filter`.
+"""The contact filter's state and kernels; `perception.contact_filter` explains the filter.
 
 Pairs are (left, right). SI units.
 """
@@ -24,7 +24,7 @@ from softfinger.kinematics.hand.grasp_state import (
 )
 
 FloatArray = NDArray[np.float64]
-Tip = tuple[float, float, float, float, float, float, bool]  # as `publish` says
+Tip = tuple[float, float, float, float, float, float, bool]  # what `publish` returns of one
 
 HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps

@@ -1,4 +1,4 @@
-"""What one finger's frames and contacts are understood by, from settings and calibration files."""
+"""One finger's tip and sensor as they are modelled, from settings and calibration file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 @dataclass(frozen=True)
 class FingerModel:
-    """One finger's tip and sensor; ``calibration`` is None where there is none."""
+    """Material, contact table and grid of one finger; ``calibration`` is None without a file."""
 
     finger: int
     material: Material
@@ -65,7 +65,7 @@ def make_models(
 
 
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
-    """The sensor's cells, where the calibration says if it does. Raises SettingsError."""
+    """The sensor's cells, at the calibrated centre if there is one. Raises SettingsError."""
     if calibration is None or calibration.centre is None:
         return make_grid(settings, finger)
     return make_grid(settings, finger, calibration.centre.centre, calibration.centre.rotation)
@@ -80,7 +80,7 @@ def make_estimator(
 ) -> ContactEstimator:
     """An estimator of its own for each finger, since it starts from its last estimate.
 
-    ``live`` tells the cells that there are, beside the settings' dead ones. With a ``calibration``
+    ``live``: cells that exist, less the settings' dead ones. With a ``calibration``
     its frames are the pressures [Pa] of a `Converter`, without one they are counts.
     """
     tactile = settings.tactile

@@ -58,7 +58,7 @@ class FingerPerception:
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """A tare that fails is added to ``events``."""
+        """``events`` takes a tare that failed."""
         tactile, calibration = settings.tactile, model.calibration
         self.finger = model.finger
         self.sensor = sensor
@@ -113,7 +113,7 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """The newest frame's data [rows, cols] for subscribers, in steps as ``facts`` says."""
+        """The newest frame's data [rows, cols] for subscribers; unit and scale are in ``facts``."""
         assert self.frame is not None
         assert self._readings is not None
         if not self._as_pressure:
