@@ -4,21 +4,22 @@ Numba compiles every function that a kernel calls as if Python might call it, to
 all it calls, made into machine code, wrapped twice, kept in the cache. Their callers take the
 bitcode and do all that again. Here the bitcode is all there is, which takes a third off the time of
 compiling and leaves a quarter of the cache. The rest is done once, in the kernel that Python calls.
+And what an operation makes of its arguments' types is asked once, not at each place in the source.
 
-This module alone replaces a step of Numba's compiler; `pyproject.toml` bounds Numba for it.
+This module alone replaces steps of Numba's compiler; `pyproject.toml` bounds Numba for it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numba
 from numba import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, _LowerResult
 from numba.core.compiler_machinery import register_pass
-from numba.core.typed_passes import NativeLowering
+from numba.core.typed_passes import NativeLowering, NopythonTypeInference
 
 _njit: Any = numba.njit
 _make_function: Any = numba._dynfunc.make_function  # type: ignore[attr-defined]
@@ -91,16 +92,60 @@ class _InnerLowering(NativeLowering):
         return True
 
 
-class _InnerCompiler(Compiler):
-    """Numba's own pipeline, with that lowering."""
+_SIGNATURES: dict[Any, Any] = {}  # of operations and their arguments' types
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _QuickTyping(NopythonTypeInference):
+    """Type inference that remembers the signatures of Numba's own functions."""
+
+    _name = "quick_typing"
+
+    def run_pass(self, state: Any) -> bool:
+        context = state.typingctx
+        resolve = context.resolve_function_type
+
+        def remembered(function: Any, arguments: Any, named: Any) -> Any:
+            if named or not isinstance(function, types.Function):
+                return resolve(function, arguments, named)
+            key = function, arguments
+            if key not in _SIGNATURES:
+                found = resolve(function, arguments, named)
+                if found is None:
+                    return None
+                _SIGNATURES[key] = found
+            return _SIGNATURES[key]
+
+        within = "resolve_function_type" in vars(context)  # compiled for a kernel that calls it
+        if not within:
+            context.resolve_function_type = remembered
+        try:
+            return bool(super().run_pass(state))
+        finally:
+            if not within:
+                del context.resolve_function_type
+
+
+class OuterCompiler(Compiler):
+    """Numba's own pipeline with that type inference."""
+
+    _replaced: ClassVar[dict[Any, Any]] = {NopythonTypeInference: _QuickTyping}
 
     def define_pipelines(self) -> list[Any]:
         pipelines: list[Any] = super().define_pipelines()
         for pipeline in pipelines:
             pipeline.passes = [
-                (_InnerLowering if each is NativeLowering else each, text)
-                for each, text in pipeline.passes
+                (self._replaced.get(each, each), text) for each, text in pipeline.passes
             ]
             pipeline._finalized = False
             pipeline.finalize()
         return pipelines
+
+
+class _InnerCompiler(OuterCompiler):
+    """And with that lowering."""
+
+    _replaced: ClassVar[dict[Any, Any]] = {
+        **OuterCompiler._replaced,
+        NativeLowering: _InnerLowering,
+    }

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from softfinger.kinematics.compiled.inner_kernels import InnerKernel
+from softfinger.kinematics.compiled.inner_kernels import InnerKernel, OuterCompiler
 from softfinger.kinematics.compiled.kernel_cache import KernelFolder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -64,7 +64,12 @@ def _inner(function: Function, **options: Any) -> Function:
 
 
 def _outer(function: Function, fastmath: bool | set[str]) -> Function:
-    options = {"error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
+    options = {
+        "error_model": "numpy",
+        "fastmath": fastmath,
+        "no_cfunc_wrapper": True,
+        "pipeline_class": OuterCompiler,
+    }
     # Numba takes the setting when the decorator runs; other people's functions keep their own.
     theirs = _config.CACHE_LOCATOR_CLASSES
     _config.CACHE_LOCATOR_CLASSES = _LOCATOR

@@ -11,13 +11,17 @@ octave both are tabulated.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias, cast
 
+import numba
 import numpy as np
+from numba.core.extending import intrinsic
 from numpy.typing import NDArray
 
 from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Record
 from softfinger.kinematics.compiled.simd import SIZES, Pointer, address, polynomials
 from softfinger.kinematics.contact.closed_form import theta_limit
 
@@ -28,10 +32,7 @@ Six: TypeAlias = tuple[float, float, float, float, float, float, bool]
 HALF_PI = math.pi / 2
 _NEAR = 0.25 * math.pi
 
-# Header of a table's array, by index.
-FORMAT, FORM, RADIUS, MODULUS, INVERSE_RADIUS, CORNER = 0, 1, 2, 3, 4, 5
-TOLERANCE, MAX_ERROR, WORST_D, WORST_THETA = 6, 7, 8, 9
-START = 16  # of the coefficients: a whole number of cache lines
+START = 16  # of the coefficients in a table's array: a whole number of cache lines
 
 VERSION = 2.0
 
@@ -73,6 +74,41 @@ _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
 _ONE = 1023 << _MANTISSA  # the bits of 1.0
 _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above LOWEST
+
+
+class TableHeader(Record):
+    """What a table's array starts with."""
+
+    format: float  # VERSION
+    form: float  # number in FORMS
+    radius: float  # [m]
+    modulus: float  # at no strain [Pa]
+    inverse_radius: float
+    corner: float  # where its coefficients start
+    tolerance: float
+    max_error: float  # the certificate
+    worst_d: float  # where it is met [m]
+    worst_theta: float  # [rad]
+
+
+def header_of(data: FloatArray) -> TableHeader:
+    """The header of a table's array."""
+    size = TableHeader.dtype.itemsize // data.itemsize
+    return TableHeader(data[:size].view(TableHeader.dtype))
+
+
+def _header(context: Any, start: Any) -> Any:
+    """Signature and code generator; see :data:`header`."""
+    record = numba.from_dtype(TableHeader.dtype)
+
+    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], codegen.get_value_type(record))
+
+    return record(start), generate
+
+
+# header(address): :func:`header_of` in kernels.
+header: Callable[[Pointer], TableHeader] = cast(Any, intrinsic)(_header)
 
 
 class TableError(SoftfingerError):
@@ -176,7 +212,7 @@ def _from_corner(p: Pointer, h: float, y: float) -> Ratios:
     """The five ratios A + B log h below the lowest octave."""
     j, y = _share(y, CORNER_PIECES)
     x = (2.0 / LOWEST) * h - 1.0
-    at = int(p[CORNER]) + 2 * j * SIZES[CORNER_SHAPE]
+    at = int(header(p).corner) + 2 * j * SIZES[CORNER_SHAPE]
     a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 8, x, y)
     b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 8, x, y)
     # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
@@ -211,11 +247,11 @@ def _ratios(
 @inlined_kernel
 def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: bool) -> Six:
     """What :func:`lookup` gives, in the domain."""
-    form = int(p[FORM])
+    form = int(header(p).form)
     if form == CLOSED:
         inverse = 1.0 / c
         slope = s * inverse
-        push = math.pi * p[MODULUS] * d * inverse
+        push = math.pi * header(p).modulus * d * inverse
         force = push * d
         energy = force * inverse * d * (1.0 / 3.0)
         force_d = 2.0 * push
@@ -230,7 +266,7 @@ def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: 
         )
     inverse, (r_f, r_u, r_fd, r_ft, r_ut) = _ratios(p, form, h, s, c, gap)
     slope = s * inverse
-    push = math.pi * p[MODULUS] * d * inverse
+    push = math.pi * header(p).modulus * d * inverse
     force = push * d
     energy = force * inverse * d * (1.0 / 3.0)
     return (
@@ -247,13 +283,13 @@ def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: 
 @inner_kernel
 def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, float, float, bool]:
     """d, h, sin θ, cos θ, gap and ``inside`` at any d > 0 and θ, clamped to the domain."""
-    radius = p[RADIUS]
+    radius = header(p).radius
     inside = d <= radius
     d = min(d, radius)
-    h = (radius - d) * p[INVERSE_RADIUS]
+    h = (radius - d) * header(p).inverse_radius
     if abs(theta) <= HALF_PI:
         s, c = _sine_cosine(theta)
-        gap = c * c - d * p[INVERSE_RADIUS] * (1.0 + h)
+        gap = c * c - d * header(p).inverse_radius * (1.0 + h)
         if gap >= 0.0:
             return d, h, s, c, gap, inside
     limit = theta_limit(radius, d)
@@ -269,8 +305,8 @@ def lookup_at(p: Pointer, d: float, theta: float) -> Six:
 
     For kernels that call often: an array argument costs a reference count at each call.
     """
-    h = (p[RADIUS] - d) * p[INVERSE_RADIUS]
-    rho2 = d * p[INVERSE_RADIUS] * (1.0 + h)
+    h = (header(p).radius - d) * header(p).inverse_radius
+    rho2 = d * header(p).inverse_radius * (1.0 + h)
     s, c = _near_sine_cosine(theta)
     gap = c * c - rho2
     inside = True
@@ -301,8 +337,8 @@ def _coordinates(p: Pointer, d: FloatArray, theta: FloatArray, work: FloatArray)
     y is NaN outside the domain and in the corner, where :func:`lookup` has to be asked.
     """
     for i in range(d.shape[0]):
-        h = (p[RADIUS] - d[i]) * p[INVERSE_RADIUS]
-        rho2 = d[i] * p[INVERSE_RADIUS] * (1.0 + h)
+        h = (header(p).radius - d[i]) * header(p).inverse_radius
+        rho2 = d[i] * header(p).inverse_radius * (1.0 + h)
         s, c = _sine_cosine(theta[i])
         gap = c * c - rho2
         both = 1.0 / (c * h)
@@ -327,8 +363,8 @@ def lookups(
     In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
     """
     p = address(data)
-    form = int(p[FORM])
-    push = math.pi * p[MODULUS]
+    form = int(header(p).form)
+    push = math.pi * header(p).modulus
     work = np.empty(4 * _BLOCK)
     for start in range(0, d.shape[0], _BLOCK):
         stop = min(start + _BLOCK, d.shape[0])

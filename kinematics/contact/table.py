@@ -18,17 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import (
-    FORM,
     FORMS,
-    MAX_ERROR,
-    RADIUS,
-    TOLERANCE,
     VERSION,
-    WORST_D,
-    WORST_THETA,
     Form,
     TableError,
     aligned,
+    header_of,
     lookup,
     lookups,
 )
@@ -85,7 +80,8 @@ class ContactTable:
 
     def __init__(self, data: FloatArray) -> None:
         self.data = data
-        self.max_error = float(data[MAX_ERROR])
+        self.header = header_of(data)
+        self.max_error = self.header.max_error
 
     @classmethod
     def build(
@@ -134,22 +130,22 @@ class ContactTable:
     @property
     def tolerance(self) -> float:
         """The tolerance it was built to."""
-        return float(self.data[TOLERANCE])
+        return self.header.tolerance
 
     @property
     def certificate(self) -> Certificate:
         """Largest relative error found, and at what d and θ."""
-        return Certificate(*(float(self.data[i]) for i in (MAX_ERROR, WORST_D, WORST_THETA)))
+        return Certificate(self.max_error, self.header.worst_d, self.header.worst_theta)
 
     @property
     def form(self) -> Form:
         """Its representation."""
-        return FORMS[int(self.data[FORM])]
+        return FORMS[int(self.header.form)]
 
     @property
     def tip(self) -> Fingertip:
         """The tip that it was built for."""
-        return Fingertip(float(self.data[RADIUS]))
+        return Fingertip(self.header.radius)
 
     def __call__(self, d: ArrayLike, theta: ArrayLike) -> Contact:
         """Look up at displacement d [m] and tilt θ [rad]; they broadcast.

@@ -15,26 +15,17 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import (
     CHEAPEST_FIRST,
     CLOSED,
-    CORNER,
     CORNER_PIECES,
     CORNER_SHAPE,
-    FORM,
-    FORMAT,
     FORMS,
-    INVERSE_RADIUS,
     LOWEST,
-    MAX_ERROR,
-    MODULUS,
     OCTAVES,
-    RADIUS,
     START,
-    TOLERANCE,
     VERSION,
-    WORST_D,
-    WORST_THETA,
     Form,
     TableError,
     aligned,
+    header_of,
     lookup,
 )
 from softfinger.kinematics.contact.material import Material
@@ -108,8 +99,10 @@ def _header(tip: Fingertip, law: Law, number: int, tolerance: float) -> FloatArr
     corner = START + pieces * SIZES[number]
     corner_size = 2 * CORNER_PIECES * SIZES[CORNER_SHAPE] if number != CLOSED else 0
     data = aligned(corner + corner_size)
-    data[[FORMAT, FORM, TOLERANCE, CORNER]] = VERSION, number, tolerance, corner
-    data[[RADIUS, MODULUS, INVERSE_RADIUS]] = tip.radius, law.modulus, 1.0 / tip.radius
+    header = header_of(data)
+    header.format, header.form, header.tolerance, header.corner = VERSION, number, tolerance, corner
+    header.radius, header.modulus = tip.radius, law.modulus
+    header.inverse_radius = 1.0 / tip.radius
     return data
 
 
@@ -242,14 +235,15 @@ def certify(data: FloatArray, law: Law, points: int = 5000, seed: int | None = N
     d → 0, at d → a, at θ → 0 and at θ's limit, and at two of these at once. Returns the largest
     relative error.
     """
-    radius = float(data[RADIUS])
+    header = header_of(data)
+    radius = header.radius
     d, theta = hard_points(radius, points, np.random.default_rng(seed))
     out = _errors(data, law, d, theta)
     worst = int(np.argmax(np.where(np.isnan(out), np.inf, out)))
     error = float(out[worst])
     if math.isnan(error):
         raise TableError(f"the table gives no number at d = {d[worst]!r}, θ = {theta[worst]!r}")
-    data[[MAX_ERROR, WORST_D, WORST_THETA]] = error, d[worst], theta[worst]
+    header.max_error, header.worst_d, header.worst_theta = error, d[worst], theta[worst]
     return error
 
 
@@ -259,7 +253,7 @@ def _errors(data: FloatArray, law: Law, d: FloatArray, theta: FloatArray) -> Flo
     ∂F/∂θ may pass through zero where a law softens; it counts relative to F tan θ if that is more.
     """
     found = np.array([lookup(data, *at)[:6] for at in zip(d.tolist(), theta.tolist(), strict=True)])
-    exact = np.stack(integrate(Fingertip(float(data[RADIUS])), law.material, d, theta))
+    exact = np.stack(integrate(Fingertip(header_of(data).radius), law.material, d, theta))
     scale = np.abs(exact)
     scale[3] = np.maximum(scale[3], np.abs(exact[0] * np.tan(theta)))
     lost = np.abs(found.T - exact)

@@ -15,13 +15,11 @@ from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.lookup import (
-    FORM,
     FORMS,
-    MODULUS,
-    RADIUS,
     START,
     TableError,
     aligned,
+    header_of,
     lookup,
     lookups,
 )
@@ -103,7 +101,7 @@ def test_constant_modulus_is_the_closed_form() -> None:
 
 def twin(data: np.ndarray, d: float, theta: float) -> float:
     """The force of a slab, from the array in plain NumPy: piece by hand, powers summed."""
-    radius, form = data[RADIUS], int(data[FORM])
+    radius, form = header_of(data).radius, int(header_of(data).form)
     h = (radius - d) / radius
     edges = np.concatenate([np.linspace(low, 2 * low, 8, False) for low in (0.125, 0.25, 0.5)])
     edges = np.append(edges, 1.0)
@@ -117,7 +115,7 @@ def twin(data: np.ndarray, d: float, theta: float) -> float:
         for k in range(terms - 1, -1, -1):
             total += data[at] * x**k * y**j
             at += 8
-    return math.pi * data[MODULUS] * d * d / math.cos(theta) * total
+    return math.pi * header_of(data).modulus * d * d / math.cos(theta) * total
 
 
 def test_the_kernel_reads_what_the_layout_says(table: ContactTable) -> None:
