@@ -54,7 +54,7 @@ class InnerKernel:
         """Refused: there is no machine code for Python to call."""
         raise TypeError(
             f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
-            "what Python calls is marked @kernel or @fast_kernel"
+            "what Python calls is marked @kernel"
         )
 
 

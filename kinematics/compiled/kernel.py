@@ -1,7 +1,7 @@
 """The decorators behind every compiled kernel, and nothing else.
 
-A kernel takes arrays and scalars and is pure. One that Python calls is a ``kernel`` (or a
-``fast_kernel``): compiled by Numba at its first call, with all it calls, and kept in the folder of
+A kernel takes arrays, records and scalars and is pure. One that Python calls is a ``kernel``:
+compiled by Numba at its first call, with all it calls, and kept in the folder of
 `compiled.kernel_cache`. One that only kernels call is an ``inner_kernel`` (``fast_inner_kernel``,
 ``inlined_kernel``), which costs a fraction to compile and can't be called from Python.
 """
@@ -29,15 +29,16 @@ def kernel(function: Function) -> Function:
 
     The GIL is kept because reacquiring it in the loop can cost a whole switch interval.
     """
-    return _outer(function, fastmath=False)
-
-
-def fast_kernel(function: Function) -> Function:
-    """As :func:`kernel`, with sums reordered and fused so that they run in SIMD lanes.
-
-    For reductions over finite numbers only: NaN and infinity have no defined result there.
-    """
-    return _outer(function, fastmath=_SUMS)
+    options = {"error_model": "numpy", "no_cfunc_wrapper": True, "pipeline_class": OuterCompiler}
+    # Numba takes the setting when the decorator runs; other people's functions keep their own.
+    theirs = _config.CACHE_LOCATOR_CLASSES
+    _config.CACHE_LOCATOR_CLASSES = _LOCATOR
+    try:
+        return cast(Function, _njit(cache=True, **options)(function))
+    except RuntimeError:  # no folder: `kernel_folder` has warned
+        return cast(Function, _njit(**options)(function))
+    finally:
+        _config.CACHE_LOCATOR_CLASSES = theirs
 
 
 def inner_kernel(function: Function) -> Function:
@@ -46,7 +47,10 @@ def inner_kernel(function: Function) -> Function:
 
 
 def fast_inner_kernel(function: Function) -> Function:
-    """As :func:`fast_kernel`, for what only kernels call. A call from Python raises TypeError."""
+    """As :func:`inner_kernel`, with sums reordered and fused so that they run in SIMD lanes.
+
+    For finite numbers only: NaN and infinity have no defined result there.
+    """
     return _inner(function, fastmath=_SUMS)
 
 
@@ -61,21 +65,3 @@ def inlined_kernel(function: Function) -> Function:
 
 def _inner(function: Function, **options: Any) -> Function:
     return cast(Function, InnerKernel(function, {"error_model": "numpy", **options}))
-
-
-def _outer(function: Function, fastmath: bool | set[str]) -> Function:
-    options = {
-        "error_model": "numpy",
-        "fastmath": fastmath,
-        "no_cfunc_wrapper": True,
-        "pipeline_class": OuterCompiler,
-    }
-    # Numba takes the setting when the decorator runs; other people's functions keep their own.
-    theirs = _config.CACHE_LOCATOR_CLASSES
-    _config.CACHE_LOCATOR_CLASSES = _LOCATOR
-    try:
-        return cast(Function, _njit(cache=True, **options)(function))
-    except RuntimeError:  # no folder, which has been told
-        return cast(Function, _njit(**options)(function))
-    finally:
-        _config.CACHE_LOCATOR_CLASSES = theirs

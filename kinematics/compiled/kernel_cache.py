@@ -53,7 +53,7 @@ class KernelFolder:
         return str(kernel_folder())
 
     def ensure_cache_path(self) -> None:
-        """It was made and looked at when its name was asked for."""
+        """Nothing to do: `kernel_folder` has made and checked it."""
 
     def get_source_stamp(self) -> str:
         """The kernel's own file; what the folder's name covers is the same by its being there."""

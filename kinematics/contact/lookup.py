@@ -54,7 +54,7 @@ class Form(NamedTuple):
 
 # Forms by number, as the header has it; the number is also that of the shape. The slabs span all of
 # y, so that where their coefficients stand depends on d alone: they are read while θ's cosine is
-# being computed. Their names tell the degrees in h and in y.
+# being computed. Their names give the degrees in h and in y.
 FORMS = (
     Form("closed", 0, 0),
     Form("bilinear", 3, 16),
@@ -157,7 +157,7 @@ def _sine_cosine(theta: float) -> tuple[float, float]:
 def _piece(h: float, bits: int) -> tuple[int, float]:
     """Number of the piece of h in (LOWEST, 1], and h's place in it from −1 to 1.
 
-    The float's own bits tell: its exponent the octave, its mantissa the piece and the place. A
+    From the float's own bits: its exponent is the octave, its mantissa the piece and the place. A
     piece has its upper end, not its lower one.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST

@@ -118,9 +118,9 @@ class Material:
         """A smooth monotone law near measured points of strain (a ratio) and stress [Pa].
 
         The origin belongs to every curve and need not be given. Points beyond strain 1 are not
-        used; short of it the curve goes on with its last slope. ``fit_error`` tells how far the law
-        runs from the points. Raises MaterialError, with everything that is wrong, for points that
-        are too few, not finite, not rising, start off zero, or that no such law comes near to.
+        used; short of it the curve goes on with its last slope. ``fit_error`` is the law's largest
+        distance from the points. Raises MaterialError, with everything that is wrong, for points
+        that are too few, not finite, not rising, start off zero, or that no such law comes near to.
         """
         coefficients, misfit = fit_law(strain, stress)
         return cls(tuple(coefficients), name="points", fit_error=misfit)

@@ -124,7 +124,7 @@ def _fit(data: FloatArray, law: Law, number: int, tolerance: float) -> float:
     soon as it is too large for the tolerance.
     """
     form, columns = FORMS[number], SHAPES[number]
-    # Two more than needed in each direction, which tell what is left out.
+    # Two more than needed in each direction, to estimate what is left out.
     x, in_x = _nodes(columns[0] + 2)
     y, in_y = _nodes(len(columns) + 2)
     kept = np.zeros((x.size, y.size), dtype=np.bool_)

@@ -1,4 +1,4 @@
 """From one frame of pressures to the contact under it: displacement, tilts, gain, covariance.
 
-The stages of the estimator, mostly kernels; `estimator` is the public face.
+The estimator's stages, mostly kernels, and the calibration that uses it; `estimator` is public.
 """

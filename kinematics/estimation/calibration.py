@@ -29,12 +29,12 @@ _EXPONENTS = (0.3, 3.0)
 _RESTLESS = 8.0  # times the usual noise
 _FEW_CELLS = 4  # may be faulty
 _BINS = 24  # of strain
-_LEAST_TILT = math.radians(3.0)  # tilts that differ by less tell no direction
+_LEAST_TILT = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
 
 
 class CalibrationError(SoftfingerError, ValueError):
-    """The data don't determine what is asked for. The message says what is missing or wrong."""
+    """The data don't determine the result. The message says what is missing or wrong."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def fit_centre(
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT):
         raise CalibrationError(
             f"centre: the tilts differ by less than {math.degrees(_LEAST_TILT):g}°, so that tilt "
-            "can't be told from place; press upright alone, or upright and tilted further"
+            "can't be separated from place; press upright alone, or upright and tilted further"
         )
     centre, rotation, scale, residual = grid.centre, None, 1.0, 0.0
     for _ in range(4):
@@ -312,30 +312,30 @@ def fit_law(
     """σ(ε) from a compression run: each cell under the tip is a measured point of it.
 
     ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
-    out cells that don't tell, dead or saturated ones. A cell's strain is the model's, averaged over
-    it; points are the means over narrow bands of strain, bands that noise has put out of order
-    taken together. Raises CalibrationError when the points make no law.
+    out dead and saturated cells. A cell's strain is the model's, averaged over it; points are the
+    means over narrow bands of strain, those that noise has put out of order taken together. Raises
+    CalibrationError when the points make no law.
     """
     stack = _stack(frames, "modulus")
     unit = Material.constant(1.0)
     strains, stresses = [], []
-    told = np.ones(stack.shape, np.bool_) if used is None else used
-    for frame, tells, depth, tilt in zip(
-        stack, told, np.asarray(d, np.float64), np.asarray(theta, np.float64), strict=True
+    valid = np.ones(stack.shape, np.bool_) if used is None else used
+    for frame, usable, depth, tilt in zip(
+        stack, valid, np.asarray(d, np.float64), np.asarray(theta, np.float64), strict=True
     ):
         if depth <= 0.0:
             continue
         if depth > tip.radius:
             raise CalibrationError(f"modulus: d = {depth:g} m is more than the tip's radius")
         strain = grid.pressure(tip, unit, float(depth), float(tilt))
-        inside = tells & (strain > 0.0)
+        inside = usable & (strain > 0.0)
         strains.append(strain[inside])
         stresses.append(frame[inside])
     if not strains:
         raise CalibrationError("modulus: no frame with d above 0")
     strain, stress = np.concatenate(strains), np.concatenate(stresses)
     if not strain.size:
-        raise CalibrationError("modulus: no cell under the tip tells its pressure")
+        raise CalibrationError("modulus: no cell under the tip has a valid reading")
     edges = np.linspace(0.0, float(strain.max()) * (1 + 1e-12), _BINS + 1)
     place = np.digitize(strain, edges) - 1
     filled = np.flatnonzero(np.bincount(place, minlength=_BINS) >= 3)

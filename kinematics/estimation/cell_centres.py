@@ -49,7 +49,7 @@ def cell_centres(grid: Grid, live: NDArray[np.bool_], reach: float, found: Reach
 
 @fast_inner_kernel
 def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[float, float, float]:
-    """Σ p, which tells what is no number, Σ p² and the largest p, at least 0, of first..last."""
+    """Σ p (not finite where a cell is not), Σ p² and the largest p, at least 0, of first..last."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)

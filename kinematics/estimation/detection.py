@@ -49,7 +49,7 @@ def activity(state: State, frame: Pointer, height: Pointer) -> None:
     """Cheap test of the frame, into ``state.signal``.
 
     A contact is a cell of ``peak_level`` · noise or more whose neighbours' weighted sum, itself
-    left out, passes ``patch_level`` standard deviations: one hot cell alone is none. At levels 3
+    left out, passes ``patch_level`` standard deviations: one outlier alone is none. At levels 3
     and 4.9 white noise passes for one in 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 of the frames of 788
     cells, a cell and its neighbours being independent; d = 0.2 mm under 0.2 % of the modulus as
     noise is seen in 99.98 %, measured over 150 000 frames, all azimuths, tilts up to 30° and places

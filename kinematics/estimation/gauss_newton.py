@@ -245,7 +245,7 @@ def fit(
         if places is None:
             pack(state, further(arena, state.at.cells), frame, arena, None)
         else:
-            # Parts have no readings of their own; what stands in ``fine`` is not used.
+            # Parts have no readings of their own; those taken from ``fine`` are not used.
             parts = further(arena, state.at.parts)
             pack(state, parts, further(arena, state.at.fine), arena, address(places))
         press(state, packed)

@@ -37,7 +37,7 @@ Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 # A cell that can't read below its floor (0, or the smallest count sent) reads more than the
 # pressure on average, by E[max(z + e, 0)] − z standard deviations at a pressure of z above it,
 # e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this polynomial, within 3e-4. E[max(e − z, 0)] is
-# the same number. Cells more than CLIP_BELOW below the floor tell next to nothing.
+# the same number. Cells more than CLIP_BELOW below the floor carry next to no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)

@@ -1,4 +1,4 @@
-"""What a pressure sensor under a tip reads: the forward model, its counts, its calibration.
+"""What a pressure sensor under a tip reads: the forward model, and counts to pressures.
 
 Numbers alone: no files, no ports.
 """
