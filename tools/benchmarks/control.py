@@ -1,21 +1,18 @@
 """The control laws on the simulated hand: how fast, how exact and how firm, on virtual time.
 
 Judged by the plant's truth, not by the daemon's estimates: forces on the tips' bases, the
-object's angle, the friction that is left. Nothing but the last rows depends on the machine's speed.
+object's angle, the friction that is left. Nothing here depends on the machine's speed.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections import defaultdict
 from typing import Any
 
 import numpy as np
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.control_table import COUNTS_PER_TURN
-from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.tools.benchmarks.control_rig import Watched, push_along
 from softfinger.tools.benchmarks.framework.report import Row, Table, figure
 
@@ -91,7 +88,7 @@ def measure(brief: bool = False) -> list[Table]:
     for name, sections in {} if brief else _PROFILES.items():
         rows = [*_light(sections), *_loaded(sections), *_pushed(sections)]
         tables.append(Table(f"control under loads, {name}", rows))
-    return [*tables, Table("control, the rest", [_one_count(), *_speed()])]
+    return tables
 
 
 def _trials(
@@ -230,36 +227,4 @@ def _pushed(sections: Sections) -> list[Row]:
         figure(f"{held}, angle left after", "°", [math.degrees(abs(left[2]))], 0.2),
         figure(f"{held}, place left after", "mm", [1e3 * math.hypot(left[0], left[1])]),
         figure(f"{held}, lost", "1", [float(lost)], 0.0),
-    ]
-
-
-def _one_count() -> Row:
-    """What one count of both joints does to the force: the finest step of position control."""
-    settings = Settings.model_validate(_PAPER)
-    hand = SimulatedHand(settings)
-    contact = hand.table(np.array([4e-3]), np.array([math.radians(10.0)]))
-    arm = settings.hand.finger_length * math.cos(math.radians(10.0))
-    # Each joint presses its own tip by arm · count; the object stays in the middle.
-    step = float(contact.force_d[0]) * arm * 2.0 * math.pi / COUNTS_PER_TURN
-    return figure("paper: one count of both joints at d = 4 mm", "N", [step])
-
-
-def _speed() -> list[Row]:
-    """The plant's kernel with the sub-steps it chose, and the whole daemon, on virtual time."""
-    hand = SimulatedHand(Settings())
-    hand.advance(1.0)
-    plant, pipeline = [], []
-    with Watched({}) as watched:
-        watched.grasp(_FORCE)
-        watched.run(1.0)
-        for k in range(5):
-            before = time.perf_counter()
-            hand.advance(3.0 + 2.0 * k)
-            plant.append((time.perf_counter() - before) / 2.0)
-            before = time.perf_counter()
-            watched.run(1.0)
-            pipeline.append(1e3 * (time.perf_counter() - before))
-    return [
-        figure("the plant alone, share of real time", "1", plant, 0.005),
-        figure("the whole daemon with the plant, a virtual second", "ms", pipeline, 50.0),
     ]

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
+from functools import partial
 
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.framework.interleaved import timed
 from softfinger.tools.benchmarks.framework.report import Row, Table, figure
 from softfinger.tools.benchmarks.framework.rigs import can, hold, virtual_daemon
 
 TITLE = "tick, back to back"
-PAGE = {TITLE: ("pipeline alone, nobody subscribed", "one second")}
+PAGE = {TITLE: ("pipeline alone, nobody subscribed", "one second of the whole")}
 _SUBSCRIBERS: dict[tuple[bytes, ...], str] = {
     (): "nobody subscribed",
     (schema.STATE, schema.TACTILE): "state and frames subscribed",
@@ -27,7 +29,7 @@ def measure(brief: bool = False) -> list[Table]:
         with virtual_daemon({}, *topics) as daemon:
             hold(daemon)
             if not topics:
-                rows.append(_virtual_second(daemon, seconds))
+                rows += _virtual_seconds(daemon, seconds)
             physics = figure(f"with the simulated hand, {words}", "µs", _ticks(daemon, ticks))
             can(daemon)
             aim = 20.0 if len(topics) < 3 else None
@@ -36,14 +38,13 @@ def measure(brief: bool = False) -> list[Table]:
     return [Table(TITLE, rows)]
 
 
-def _virtual_second(daemon: Daemon, seconds: int) -> Row:
-    """The whole daemon on virtual time: physics, rendered frames, estimator, control."""
-    samples = []
-    for _ in range(seconds):
-        before = time.perf_counter()
-        daemon.loop.advance(1.0)
-        samples.append((time.perf_counter() - before) * 1e3)
-    return figure("one second of the whole daemon on virtual time", "ms", samples, aim=50.0)
+def _virtual_seconds(daemon: Daemon, seconds: int) -> Iterator[Row]:
+    """Physics, rendered frames, estimator and control; and the plant alone."""
+    whole = [1e-3 * timed(lambda: daemon.loop.advance(1.0), 1)[0] for _ in range(seconds)]
+    yield figure("one second of the whole daemon on virtual time", "ms", whole, aim=50.0)
+    plant = SimulatedHand(daemon.settings)
+    alone = [1e-3 * timed(partial(plant.advance, 1.0 + k), 1)[0] for k in range(seconds)][1:]
+    yield figure("one second of the plant alone", "ms", alone, aim=5.0)
 
 
 def _ticks(daemon: Daemon, count: int) -> list[float]:

@@ -103,7 +103,9 @@ def ready(rig: Rig, chance: random.Random) -> bool:
     """
     begin = now = time.monotonic()
     place = begin + _PLACE_AFTER
-    force = chance.uniform(4.0, 9.0)
+    grasp = {"command": "grasp", "force": chance.uniform(4.0, 9.0)}
+    requests: dict[str, dict[str, Any]]
+    requests = {"fault": {"command": "clear"}, "disarmed": {"command": "arm"}, "armed": grasp}
     while now < begin + _READY_WITHIN:
         if not rig.alive:
             return False
@@ -115,12 +117,8 @@ def ready(rig: Rig, chance: random.Random) -> bool:
             if now > place:
                 place = now + _PLACE_AFTER
                 _place(rig)
-            elif mode == "fault":
-                rig.ask({"command": "clear"}, 5.0)
-            elif mode == "disarmed":
-                rig.ask({"command": "arm"})
-            elif mode == "armed":
-                rig.ask({"command": "grasp", "force": force})
+            elif mode in requests:
+                rig.ask(requests[mode], 5.0)
         except NoAnswer:
             pass
         time.sleep(0.01)
