@@ -1,7 +1,9 @@
 """ZMTP 3.0 with the mechanism NULL: the bytes of a connection, and nothing that reads or sends.
 
-A peer of ZMTP 1.0 or 2.0, or of no ZMTP at all, as a browser is, breaks the protocol with its first
-bytes. Source: https://rfc.zeromq.org/spec/23/
+For clients without keys, on sockets of our own, since libzmq can bound neither a message's parts
+nor a client's subscriptions, and can't say what arrived before a stop. A peer of ZMTP 1.0 or 2.0,
+or of no ZMTP at all, as a browser is, breaks the protocol with its first bytes. Source:
+https://rfc.zeromq.org/spec/23/
 """
 
 from __future__ import annotations
