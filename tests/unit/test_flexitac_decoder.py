@@ -1,0 +1,305 @@
+"""FlexiTac framing as pure bytes."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from softfinger.daemon.tactile.flexitac import MARKER, FlexiTacDecoder
+
+ROWS, COLS = 4, 5
+CELLS = ROWS * COLS
+STRIDE = CELLS + 2
+
+payloads = st.binary(min_size=CELLS, max_size=CELLS)
+# Images made to contain the marker often, also split over a frame's first or last byte.
+nasty = st.lists(
+    st.sampled_from([b"\xaa", b"\x55", b"\xaa\x55", b"\x00", b"\x01"]), min_size=CELLS
+).map(lambda parts: b"".join(parts)[:CELLS])
+
+
+def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
+    """The frames handed over when all is fed a byte at a time.
+
+    A lock that took long may complete several frames at once; of these only the newest comes.
+    """
+    found = []
+    for piece in pieces:
+        for k in range(len(piece)):
+            decoded = decoder.feed(piece[k : k + 1], 0.0)
+            if decoded is not None:
+                assert decoded.data.shape == (decoder.rows, decoder.cols)
+                assert decoded.data.dtype == np.uint16
+                found.append(decoded.data.astype(np.uint8).tobytes())
+    return found
+
+
+def frame(payload: bytes) -> bytes:
+    return MARKER + payload
+
+
+def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
+    """Different images without a byte of the marker."""
+    return [bytes([(first + k) % 100]) * cells for k in range(count)]
+
+
+def balance(decoder: FlexiTacDecoder, fed: int) -> None:
+    """Every byte is part of a frame, counted as skipped, or still held."""
+    counters = decoder.counters()
+    held = len(decoder._buffer)
+    assert counters["frames"] * decoder.frame_bytes + counters["skipped_bytes"] + held == fed
+
+
+def test_a_clean_stream_gives_every_frame_as_soon_as_the_next_marker_confirms_it():
+    images = numbered(5)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decode(decoder, [frame(image) for image in images]) == images[:4]
+    assert decoder.pending
+    last = decoder.settle()
+    assert last is not None
+    assert last.data.astype(np.uint8).tobytes() == images[4]
+    assert decoder.settle() is None
+    assert decoder.counters() == {
+        "frames": 5,
+        "resyncs": 0,
+        "skipped_bytes": 0,
+        "ambiguous": 0,
+    }
+
+
+def test_on_a_line_with_gaps_a_frame_comes_at_once_unless_it_may_be_spliced():
+    decoder = FlexiTacDecoder(ROWS, COLS, byte_time=1e-4)
+    images = numbered(9)
+    spare = bytearray(numbered(1)[0])
+    spare[3:5] = MARKER
+    decoder.feed(frame(images[0]) + frame(images[1]), 0.0)
+    assert decoder.settle() is not None
+    for k in range(2, 5):
+        decoded = decoder.feed(frame(images[k]), 0.01 * k)
+        assert decoded is not None
+        assert decoded.data[0, 0] == k
+        assert decoded.t == 0.01 * k
+    # In two pieces within its time; then in two pieces with a gap between them.
+    assert decoder.feed(frame(images[5])[:7], 0.05) is None
+    assert decoder.feed(frame(images[5])[7:], 0.052) is not None
+    assert decoder.feed(frame(images[6])[:7], 0.06) is None
+    assert decoder.feed(frame(images[6])[7:], 0.07) is None
+    assert decoder.settle() is not None
+    # An image with the marker in it waits for the next frame.
+    assert decoder.feed(frame(bytes(spare)), 0.08) is None
+    assert decoder.settle() is None
+    decoded = decoder.feed(frame(images[7]), 0.09)
+    assert decoded is not None
+    assert decoded.data[0, 0] == 7
+    assert decoder.counters()["frames"] == 9
+    # A line without gaps: bytes follow at once, and tell.
+    assert decoder.feed(frame(images[8]), 0.0903) is None
+    assert decoder.feed(MARKER, 0.0904) is not None
+
+
+def test_one_marker_alone_is_never_locked_on():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decode(decoder, [frame(bytes(CELLS))]) == []
+    assert not decoder.locked
+    assert decoder.settle() is None
+    decoder.feed(MARKER, 0.0)
+    assert decoder.locked
+
+
+def test_bytes_behind_a_frame_in_the_same_read_are_told():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    one = frame(bytes(CELLS))
+    decoder.feed(one * 2 + MARKER, 1.0)
+    assert decoder.feed(one[2:] + one[:5], 2.0).behind == 5
+    late = decoder.feed(one[5:] + one, 3.0)  # the second may be torn yet
+    assert late.behind == len(one)
+
+
+def test_counts_are_row_major():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    decoded = decoder.feed(frame(bytes(range(CELLS))) + MARKER, 0.0)
+    assert decoded is not None
+    assert np.array_equal(decoded.data, np.arange(CELLS).reshape(ROWS, COLS))
+
+
+def test_a_frame_keeps_the_time_its_last_byte_was_read_and_its_own_array():
+    images = numbered(3)
+    stream = b"".join(frame(image) for image in images)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decoder.feed(stream[: STRIDE - 1], 1.0) is None
+    assert decoder.missing == 0  # no lock yet
+    assert decoder.feed(stream[STRIDE - 1 : STRIDE], 2.0) is None
+    first = decoder.feed(stream[STRIDE : STRIDE + 3], 3.0)
+    assert first is not None
+    assert first.t == 2.0
+    assert decoder.missing == STRIDE - 3
+    kept = first.data.copy()
+    assert decoder.feed(stream[STRIDE + 3 : 2 * STRIDE], 4.0) is None
+    second = decoder.settle()
+    assert second is not None
+    assert second.t == 4.0
+    decoder.feed(stream[2 * STRIDE :] + b"\xff" * 500, 5.0)
+    assert np.array_equal(first.data, kept)
+
+
+@settings(max_examples=100)
+@given(
+    images=st.lists(st.one_of(payloads, nasty), min_size=1, max_size=8),
+    start=st.integers(0, STRIDE),
+    cuts=st.lists(st.integers(0, 8 * STRIDE), max_size=12),
+)
+@example(images=[b"\xaa\x55" * 10] * 4, start=0, cuts=[])
+@example(images=[b"\x00" * 19 + b"\xaa"] * 4, start=0, cuts=[22, 44])
+def test_any_cut_of_a_stream_gives_the_same_frames(images, start, cuts):
+    stream = b"".join(frame(image) for image in images)[start:]
+    whole = FlexiTacDecoder(ROWS, COLS)
+    expected = decode(whole, [stream])
+    balance(whole, len(stream))
+
+    pieces = FlexiTacDecoder(ROWS, COLS)
+    newest = []
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    for left, right in itertools.pairwise(edges):
+        decoded = pieces.feed(stream[left:right], 0.0)
+        if decoded is not None:
+            newest.append(decoded.data.astype(np.uint8).tobytes())
+    assert pieces.counters() == whole.counters()
+    assert set(newest) <= set(expected)
+    if newest:
+        assert newest[-1] == expected[-1]
+
+
+@settings(max_examples=100)
+@given(
+    images=st.lists(nasty, min_size=2, max_size=6),
+    start=st.integers(0, STRIDE),
+)
+def test_no_wrong_frame_whatever_the_images_hold(images, start):
+    """Entered anywhere, images full of AA 55: what comes out was sent, in its order."""
+    # Afterwards two frames that share no AA 55, so that a standing image can't stay ambiguous.
+    images = [*images, *numbered(2)]
+    stream = b"".join(frame(image) for image in images)[start:]
+    found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
+    assert found == images[len(images) - len(found) :]
+    assert images[-1] in found
+
+
+@settings(max_examples=100)
+@given(
+    garbage=st.one_of(st.binary(max_size=200), nasty),
+    images=st.lists(payloads, min_size=3, max_size=5),
+)
+def test_garbage_before_a_stream_costs_at_most_its_first_frames(garbage, images):
+    images = [*images, *numbered(3)]
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    stream = [garbage, *(frame(image) for image in images), MARKER]
+    found = decode(decoder, stream)
+    assert decoder.locked
+    assert found[-1] == images[-1]
+    assert found[-3:] == images[-3:] or decoder.counters()["resyncs"] > 0
+    balance(decoder, sum(map(len, stream)))
+
+
+@settings(max_examples=100)
+@given(
+    images=st.lists(nasty, min_size=4, max_size=8),
+    torn=st.integers(2, 3),
+    keep=st.integers(0, STRIDE - 1),
+)
+def test_a_truncated_frame_is_dropped_and_the_stream_found_again(images, torn, keep):
+    images = [*numbered(2, first=50), *images, *numbered(3)]
+    frames = [frame(image) for image in images]
+    frames[torn] = frames[torn][:keep]
+    # Nothing tells a splice that happens to carry AA 55 where its frame must end.
+    rest = b"".join(frames[torn:])
+    assume(rest[STRIDE : STRIDE + 2] != MARKER)
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    found = decode(decoder, [*frames, MARKER])
+    sent = [image for k, image in enumerate(images) if k != torn]
+    # Images may repeat: what came out must be a subsequence of what was sent whole.
+    left = iter(sent)
+    assert all(image in left for image in found)
+    assert found[-1] == images[-1]
+    if keep:
+        assert decoder.counters()["resyncs"] >= 1
+
+
+@settings(max_examples=100)
+@given(st.lists(st.one_of(st.binary(max_size=300), nasty), max_size=12))
+def test_random_bytes_never_break_the_decoder(pieces):
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    for piece in pieces:
+        decoder.feed(piece, 0.0)
+        decoder.settle()
+        assert decoder.missing >= 0
+        decoder.diagnosis()
+    balance(decoder, sum(map(len, pieces)))
+    assert len(decoder._buffer) <= 15 * STRIDE
+
+
+def test_a_standing_image_with_the_marker_in_it_is_not_guessed_at():
+    image = bytearray(CELLS)
+    image[7:9] = MARKER
+    stream = frame(bytes(image)) * 30
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    assert decode(decoder, [stream[5:]]) == []
+    assert decoder.counters()["ambiguous"] > 0
+    assert "several places" in decoder.diagnosis()
+    # As soon as the image changes there is one place left.
+    found = decode(decoder, [frame(image) for image in numbered(3)])
+    assert found[-1] == numbered(3)[1]
+
+
+def test_a_lock_holds_through_a_standing_image_with_the_marker_in_it():
+    image = bytearray(CELLS)
+    image[7:9] = MARKER
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    images = [*numbered(2), *[bytes(image)] * 40]
+    assert decode(decoder, [*map(frame, images), MARKER]) == images
+    assert decoder.counters()["resyncs"] == 0
+
+
+def test_a_quiet_line_frees_no_frame_that_could_be_torn():
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    decode(decoder, [frame(image) for image in numbered(3)])
+    assert decoder.settle() is not None
+    torn = frame(bytes(CELLS))[:-1]
+    decoder.feed(torn + MARKER[:1], 0.0)  # one byte short, then the next marker's first half
+    assert decoder.pending
+    assert decoder.settle() is None
+    # A loss that swallowed the next marker: the frame is refuted by what follows at once.
+    decoder = FlexiTacDecoder(ROWS, COLS)
+    decode(decoder, [frame(image) for image in numbered(3)])
+    spliced = frame(bytes(CELLS))[:-4] + bytes([9]) * (CELLS - 3)
+    assert decode(decoder, [spliced, *map(frame, numbered(3, first=20)), MARKER]) == [
+        numbered(3)[2],
+        *numbered(3, first=20),
+    ]
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(4, 4), (5, 5), (16, 16), (44, 44), (256, 256)])
+def test_a_grid_of_another_size_is_recognised_by_its_spacing(rows, cols):
+    rng = np.random.default_rng(3)
+    decoder = FlexiTacDecoder(32, 32)
+    cells = rows * cols
+    for _ in range(max(12, 15 * 1026 // cells)):
+        image = rng.integers(0, 200, cells, dtype=np.uint8).tobytes()
+        assert decoder.feed(frame(image), 0.0) is None
+    assert decoder.found_cells == cells
+    assert f"{cells} cells" in decoder.diagnosis()
+    assert "1024 cells" in decoder.diagnosis()
+
+
+def test_another_size_is_recognised_behind_a_standing_image_with_markers_in_it():
+    image = bytes(40) + MARKER + bytes(14) + MARKER + bytes(198)
+    decoder = FlexiTacDecoder(32, 32)
+    for _ in range(12):
+        decoder.feed(frame(image), 0.0)
+    assert decoder.found_cells == 256
+
+
+# --- on a pty, through pyserial -----------------------------------------------------------------
