@@ -3,7 +3,7 @@
 Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
 ``Frame n`` (more may stand behind it) and its rows, cells separated by commas, ``B`` where the
 sensor has no cell; a line ``@@`` may end it. The export of a single frame has no ``Frame`` line.
-Keys are misspelt in the wild (``NOISE_TRESHOLD``); lengths come in mm, cm, m or in, abbreviated or
+Keys are misspelt in the wild (``SENSEL_AERA``); lengths come in mm, cm, m or in, abbreviated or
 spelt out, areas in their squares, readings raw or in a unit of pressure. Below ``COMMENTS:`` stands
 free text, in which only words in capitals are keys; a spreadsheet leaves commas at the lines' ends.
 """
@@ -52,12 +52,7 @@ _KEYS = (
     "COL_SPACING",
     "SENSEL_AREA",
     "SECONDS_PER_FRAME",
-    "NOISE_THRESHOLD",
-    "SATURATION_PRESSURE",
-    "START_FRAME",
-    "END_FRAME",
     "UNITS",
-    "SENSOR_TYPE",
 )
 
 
@@ -71,7 +66,7 @@ class Export:
 
     ``values`` float64 [frames, rows, cols]: Pa, or counts where ``raw``; 0 where ``live`` [rows,
     cols] is False. ``t`` float64 [frames] from the first frame on [s]; ``pitch`` (x, y) [m], NaN
-    where the header lacks it. ``header`` has every ``KEY value``, keys spelt right.
+    where the header lacks it.
     """
 
     values: NDArray[np.float64]
@@ -79,7 +74,6 @@ class Export:
     t: NDArray[np.float64]
     raw: bool
     pitch: tuple[float, float]
-    header: dict[str, str]
 
 
 def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
@@ -107,7 +101,7 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     raw = unit in _RAW
     if not raw:
         values *= _PRESSURES[unit]
-    return Export(values, live, t, raw, _pitch(header), header)
+    return Export(values, live, t, raw, _pitch(header))
 
 
 def _header(lines: list[str]) -> tuple[dict[str, str], int]:

@@ -42,8 +42,11 @@ def test_header_frames_times_and_missing_cells():
     assert export.t.tolist() == pytest.approx([0.0, 0.08])
     assert export.live.tolist() == [[True, True, False], [True, True, True]]
     assert export.values.tolist() == [[[0, 5, 0], [7, 255, 1]], [[1, 2, 0], [3, 4, 5]]]
-    assert export.header["NOISE_THRESHOLD"] == "3"
-    assert export.header["VERSION"] == "I-Scan 5.1"
+
+
+def test_a_misspelt_key_is_understood():
+    export = parse(EXPORT.replace("COL_SPACING 0.2 cm\n", "").replace("ROW_SPACING", "ROW_SPACIGN"))
+    assert export.pitch[1] == pytest.approx(1.27e-3)
 
 
 def test_line_ends_and_a_missing_end_mark_make_no_difference():

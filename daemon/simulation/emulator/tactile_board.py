@@ -55,11 +55,6 @@ class FrameWriter:
         """Readable when the client has written something; see :meth:`drain`."""
         return self._master
 
-    @property
-    def waiting(self) -> bool:
-        """A part of a frame is still to be written; see :meth:`flush`."""
-        return bool(self._rest)
-
     def send(self, frame: bytes) -> bool:
         """Write one frame, or drop it when the client has not read those before it."""
         if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_ROOM):
