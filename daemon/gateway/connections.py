@@ -27,6 +27,7 @@ class Connection:
     MOST_WAITING: ClassVar[float] = math.inf  # bytes that it may leave unread
 
     tired = False  # it floods: it is not to be read for a while
+    topics = 0  # that it subscribes to, as bits
 
     def __init__(self, endpoint: Any, accepted: socket.socket, limit: int, epoch: int) -> None:
         """``limit`` bounds a frame [bytes]; ``endpoint`` is one of `gateway.endpoints`."""
@@ -204,7 +205,6 @@ class StreamConnection(Connection):
         """``queue`` messages wait for it."""
         self._queue = queue
         self._prefixes: set[bytes] = set()
-        self.topics = 0  # that it wants, as bits
         super().__init__(endpoint, accepted, limit, epoch)
 
     def _control(self, body: bytes) -> None:

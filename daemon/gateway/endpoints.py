@@ -261,4 +261,5 @@ class StreamEndpoint(PlainEndpoint[StreamConnection]):
 
     def disconnect(self, connection: Connection) -> None:
         super().disconnect(connection)
-        self._update_wanted()
+        if connection.topics:
+            self._update_wanted()
