@@ -189,7 +189,7 @@ _TABLE = Part("contact table", 31, _table)
 _ESTIMATOR = Part("estimator", 69, _estimator)
 _HAND = Part("simulated hand", 61, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
-_CONTROL = Part("filter and grip", 38, _control, after=_TABLE.name)
+_CONTROL = Part("filter and grip", 53, _control, after=_TABLE.name)
 _MANY = Part("lookup of many points", 2, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _CONTROL, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
