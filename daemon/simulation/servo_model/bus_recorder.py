@@ -18,7 +18,6 @@ class BusRecorder:
     """The record of one servo."""
 
     def __init__(self, t: float) -> None:
-        self.since = t
         self._goals: dict[int, tuple[int, int]] = {}  # register → least and greatest, counts
         self._refused = 0
         self._torque_on = 0  # how often

@@ -149,12 +149,13 @@ class ControlTable:
         self.at = {item.address: item for item in self.items}
         self._modes = model.modes
         self._start: list[int | None] = [None] * self.size  # byte → its item's first address
-        self._unpack = {}
+        self._unpack, self._pack = {}, {}
         for item in self.items:
             self._start[item.address : item.address + item.size] = [item.address] * item.size
             form = _FORMATS[item.size]
-            unpack = struct.Struct(form.lower() if item.signed else form).unpack_from
-            self._unpack[item.address] = unpack
+            layout = struct.Struct(form.lower() if item.signed else form)
+            self._unpack[item.address] = layout.unpack_from
+            self._pack[item.address] = layout.pack_into
         self._indirect = {
             data + i: address + 2 * i
             for address, data, entries in model.indirect_blocks(firmware)
@@ -178,6 +179,12 @@ class ControlTable:
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
         if item.backed_up:  # indirect addresses are among these
+            self._layouts.clear()
+
+    def put(self, item: Item, value: int) -> None:
+        """Store a value that lies in the item's range."""
+        self._pack[item.address](self.memory, item.address, value)
+        if item.backed_up:
             self._layouts.clear()
 
     def reset(self, keep: tuple[int, ...] = ()) -> None:

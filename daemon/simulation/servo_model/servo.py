@@ -24,6 +24,15 @@ from softfinger.daemon.simulation.servo_model.servo_joint import STEP, ServoJoin
 REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
 _MOTION_END = reg.PRESENT_POSITION + 4
+_EFFECTIVE = frozenset(  # registers whose writing does more than change them
+    (
+        reg.TORQUE_ENABLE,
+        reg.OPERATING_MODE,
+        reg.GOAL_POSITION,
+        reg.GOAL_VELOCITY,
+        reg.BUS_WATCHDOG,
+    )
+)
 _CLEAR_FIRMWARE = 42
 _BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
 _CLEAR_KEY = b"\x01DXL\x22"
@@ -182,9 +191,10 @@ class EmulatedServo:
             return error
         limp = not self.torque_on
         for item, value in plan:
-            self.table.set(item.address, value)
+            self.table.put(item, value)
         for item, value in plan:
-            self._effect(item.address, value, t)
+            if item.address in _EFFECTIVE:
+                self._effect(item.address, value, t)
         if self.torque_on and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)
         if limp and self.torque_on:
@@ -308,15 +318,15 @@ class EmulatedServo:
 
     def _checked(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
         error, plan = self.table.plan(address, data)
+        for item, value in plan:
+            self.recorder.goal(item.address, value)
         if error:
             # Goals that were on the wire are recorded though the table would not have them.
             values = self.table.values(address, data)
             if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
                 self.recorder.refused()
-        else:
-            values = {item.address: value for item, value in plan}
-        for each, value in values.items():
-            self.recorder.goal(each, value)
+            for each, value in values.items():
+                self.recorder.goal(each, value)
         return error, plan
 
     def _effect(self, address: int, value: int, t: float) -> None:
