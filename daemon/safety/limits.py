@@ -339,7 +339,7 @@ def _warn_and_fault(
 LIMITS: tuple[Limit, ...] = (
     Limit("servos.bus", "the port is there, the servos obey and were not stopped by their watchdog",
         "fault", ("servos.watchdog",)),
-    Limit("servos.silent", "age of the last good servo reading; an error for answer is none",
+    Limit("servos.silent", "age of the last good servo reading; an error reply is not one",
         "fault", ("servos.fault_after",), _S,
         "state.t - reading.t <= {servos.fault_after}", _servos_silent),
     Limit("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",
@@ -391,7 +391,7 @@ LIMITS: tuple[Limit, ...] = (
         lambda *_: "control: a non-finite goal"),
     Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
     Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
-    Limit("goal.step", "goal angle's way in a tick, where it is far from the joint", "limit",
+    Limit("goal.step", "goal angle's step in a tick, where it is far from the joint", "limit",
         ("safety.goal_reach", "safety.goal_speed")),
     Limit("goal.slew", "goal current's rise in a tick", "limit", ("safety.current_rate",)),
     *_warn_and_fault("tip.force", "normal force of a tip", "safety.force_max",
@@ -403,7 +403,7 @@ LIMITS: tuple[Limit, ...] = (
         lambda view, state, i, share: f"{FINGERS[i]} tip at {state.contacts[i].d * 1e3:.2f} mm, "
         f"above {share * view.limits.d_max * 1e3:g} mm"),
     # |θ| ≤ share·(asin(1 − d/a) − margin): there the object's plane reaches the rim of the tip's
-    # backing plate. By its sine, which knows every number.
+    # backing plate. Written with sin, which is defined for every finite angle.
     *_warn_and_fault("tip.tilt", "|θ| against asin(1 − d/a) less a margin", "safety.theta_margin",
         "contacts[{i}].inside and " + _LEAN + " <= 1.57 and "
         "sin(" + _LEAN + ") <= 1.0 - contacts[{i}].d / {tip.radius}",
