@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"some two minutes; or '{_CAMPAIGN}' and one of {long}",
     )
     parser.add_argument(
-        "--trials", type=_count, metavar="N", help="of each case of a campaign, for its default"
+        "--trials", type=_count, metavar="N", help="trials of each case of a campaign"
     )
     parser.add_argument(
         "--only", default="", metavar="PATTERN", help="cases of a campaign with this in their name"
@@ -83,12 +83,22 @@ def run(arguments: argparse.Namespace) -> int:
     for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
         module = _module(name)
-        if campaign:
-            tables = module.measure(arguments.trials, arguments.only)
-        else:
-            tables = module.measure(brief=not arguments.names)
+        try:
+            if campaign:
+                tables = module.measure(arguments.trials, arguments.only)
+            else:
+                tables = module.measure(brief=not arguments.names)
+        except RuntimeError as error:  # on a busy machine a hand may let go
+            print(f"bench: {name}: {error}", file=sys.stderr)
+            failed = True
+            continue
         for table in [*tables, Table("", [yardstick()])]:
-            rows += [{"measurement": name, "table": table.title, **row} for row in table.rows]
+            head = {"measurement": name, "table": table.title}
+            # JSON knows no NaN, which alone differs from itself.
+            rows += [
+                head | {key: None if value != value else value for key, value in row.items()}
+                for row in table.rows
+            ]
             failed = failed or table.failed
         drawn += [table for table in tables if table.error]
         if arguments.names:

@@ -166,6 +166,21 @@ def test_figures_are_kept_and_compared(
     assert "slower than before" in printed
 
 
+def test_a_measurement_that_fails_leaves_the_others(
+    canned: Callable[[float], None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def let_go(brief: bool) -> list[Table]:
+        raise RuntimeError("the hand let go")
+
+    monkeypatch.setattr(wakeup, "measure", let_go)
+    assert cli.main(["bench", "wakeup", "tick"]) == 1
+    printed = capsys.readouterr()
+    assert "bench: wakeup: the hand let go" in printed.err
+    assert tick.TITLE in printed.out
+
+
 def test_a_failed_campaign_is_no_success(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,7 +22,7 @@ from softfinger.tools.benchmarks.framework.report import Table
 @pytest.fixture(scope="module")
 def tables() -> list[Table]:
     """The short form of the bench."""
-    return contact.measure(brief=True, rounds=2, count=64)
+    return contact.measure(brief=True, rounds=1, count=32)
 
 
 def test_errors_are_those_of_each_representation(tables: list[Table]) -> None:

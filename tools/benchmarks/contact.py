@@ -201,8 +201,9 @@ def _scipy(d: FloatArray, theta: FloatArray, expected: FloatArray) -> Iterator[_
         )
         return
     for method in contact_scipy.methods(TIP, LAW):
-        facts = {"KiB": method.nbytes / 1024, "build ms": 1e3 * method.build_s}
+        facts: Row = {}
         if method.batch:
+            facts = {"KiB": method.nbytes / 1024, "build ms": 1e3 * method.build_s}
             error = _error(method.call(d, theta), expected)
             modes = {"python": _single(method.call, d, theta)}
             modes["batch"] = _batch(method.call, d, theta)
