@@ -1,2 +1,4 @@
-"""The simulated hand's mechanics: contacts, object, joints, solver. Kernels on the plant's
-state."""
+"""The simulated hand's mechanics: `simulated_hand` is its face, `plant` its integrator.
+
+The rest are kernels on the records of `plant_state`: contacts, forces, equations, energy guard.
+"""

@@ -2,8 +2,7 @@
 
 The palm is a plane along x. A corner below it is pushed up by a spring with a viscous loss, which
 doesn't pull. Along the palm a second spring follows the corner's slide, sticks, and gives way where
-its force would exceed friction times the push, so that a resting object doesn't creep. Only kernels
-live here.
+its force would exceed friction times the push, so that a resting object doesn't creep.
 """
 
 from __future__ import annotations

@@ -17,9 +17,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from softfinger.daemon.simulation.physics.energy_guard import (
     HALVINGS,
     enter_changed,
@@ -36,7 +33,13 @@ from softfinger.daemon.simulation.physics.full_solver import (
     solve_full,
     take_extra_stiffness,
 )
-from softfinger.daemon.simulation.physics.plant_state import ALONG_SHEAR, Motion, Plant, SampleRow
+from softfinger.daemon.simulation.physics.plant_state import (
+    ALONG_SHEAR,
+    FloatArray,
+    Motion,
+    Plant,
+    SampleRow,
+)
 from softfinger.daemon.simulation.physics.samples import settle
 from softfinger.daemon.simulation.physics.servo_loop import (
     current_reference,
@@ -52,8 +55,6 @@ from softfinger.daemon.simulation.physics.solver import (
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address
-
-FloatArray = NDArray[np.float64]
 
 _GAMMA = 1.0 - math.sqrt(0.5)
 
