@@ -1,4 +1,4 @@
-"""Types of command-line arguments that several subcommands share."""
+"""Command-line arguments that several subcommands share."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from softfinger.daemon.profile.settings import Settings
 if TYPE_CHECKING:
     from softfinger.daemon.wire.keys import ClientKeys
 
+PATIENCE = 5.0  # s that `--no-wait` gives a stream to arrive
+
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
-    """``--config``, ``--set`` and ``--dir``: which hand. `profile` reads what they say."""
+    """``--config``, ``--set`` and ``--dir``: which hand. `profile` loads it."""
     add_settings(parser)
     parser.add_argument(
         "--dir",
         type=Path,
         metavar="DIR",
-        help="what {dir} in the ports stands for; without it the folder of `softfinger emulate`",
+        help="replaces {dir} in the ports' paths (default: the folder of `softfinger emulate`)",
     )
 
 
@@ -42,7 +44,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="a setting that goes over the file's, as loop.rate=1000; may be given again",
+        help="overrides a setting of the file, as loop.rate=1000; may be repeated",
     )
 
 
@@ -52,7 +54,7 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def own_runtime_folder() -> Path:
-    """Where a stand-in hand links its ports without ``--dir``.
+    """Where an emulated hand links its ports without ``--dir``.
 
     Raises SettingsError when another user has made that folder.
     """
@@ -67,7 +69,7 @@ def own_runtime_folder() -> Path:
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:
-    """``--keys``, for a subcommand that speaks with a daemon that may want them: `client_keys`."""
+    """``--keys``, for a client of a daemon that may require them. `client_keys` loads them."""
     parser.add_argument(
         "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
     )
@@ -105,49 +107,76 @@ def _default_addresses() -> tuple[str, str]:
 
 
 def waiting(address: str, folder: Path | None) -> str:
-    """What is told while nothing comes; a daemon that wants keys looks just so without them."""
+    """The line while no stream arrives; a daemon that requires keys looks the same without them."""
     return f"waiting for a stream from {address}{_hint(folder)}"
 
 
-def nothing(address: str, seconds: float, folder: Path | None) -> str:
-    """And what, when no more is waited for."""
-    return f"no stream from {address} within {seconds:g} s; is softfinger running?{_hint(folder)}"
+def no_stream(address: str, folder: Path | None) -> str:
+    """The line when no stream arrived in time."""
+    return f"no stream from {address} within {PATIENCE:g} s; is softfinger running?{_hint(folder)}"
 
 
 def _hint(folder: Path | None) -> str:
     return " (with access.keys it needs --keys FOLDER)" if folder is None else ""
 
 
-def teller(subcommand: str) -> Callable[[str], None]:
-    """What tells a person a word beside the work."""
-    return lambda said: print(f"{subcommand}: {said}", file=sys.stderr, flush=True)
+def to_stderr(subcommand: str) -> Callable[[str], None]:
+    """A function that prints a line for people on standard error."""
+    return lambda line: print(f"{subcommand}: {line}", file=sys.stderr, flush=True)
+
+
+def number(
+    text: str, what: str, low: float, high: float = 1e9, *, includes_low: bool = False
+) -> float:
+    """A number between bounds. Raises ArgumentTypeError with ``what`` was expected and found."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (low < value <= high or (includes_low and value == low)):
+        raise argparse.ArgumentTypeError(f"expected {what}, found {text!r}")
+    return value
 
 
 def seconds(text: str) -> float:
-    """A time above 0 s. Raises ArgumentTypeError with what was found."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"expected a time above 0 s, found {text!r}")
-    return value
-
-
-def moment(text: str) -> float:
-    """A time of 0 s or more. Raises ArgumentTypeError with what was found."""
-    return 0.0 if text.strip() in ("0", "0.0") else seconds(text)
+    """A time above 0 s. Raises ArgumentTypeError."""
+    return number(text, "a time above 0 s", 0.0)
 
 
 def megabytes(text: str) -> float:
-    """A size above 0 MB. Raises ArgumentTypeError with what was found."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"expected a size above 0 MB, found {text!r}")
-    return value
+    """A size above 0 MB. Raises ArgumentTypeError."""
+    return number(text, "a size above 0 MB", 0.0)
+
+
+def add_range(parser: argparse.ArgumentParser) -> None:
+    """``--from`` and ``--to``, in seconds from the first message on: ``start`` and ``end``."""
+
+    def moment(text: str) -> float:
+        return number(text, "a time of 0 s or more", 0.0, includes_low=True)
+
+    whence = "seconds after the first message"
+    parser.add_argument(
+        "--from",
+        type=moment,
+        default=-math.inf,
+        metavar="S",
+        dest="start",
+        help=f"begin S {whence}",
+    )
+    parser.add_argument(
+        "--to", type=seconds, default=math.inf, metavar="S", dest="end", help=f"end S {whence}"
+    )
+
+
+def add_stream(parser: argparse.ArgumentParser) -> None:
+    """``--address``, ``--keys`` and ``--no-wait`` of a subscriber."""
+    parser.add_argument("--address", type=stream_address, default="", help="the stream's socket")
+    add_keys(parser)
+    parser.add_argument(
+        "--no-wait",
+        action="store_true",
+        help=f"end with an error when nothing arrives within {PATIENCE:g} s",
+    )
 
 
 ALL = b"all"

@@ -141,13 +141,14 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
         if texts is CAMPAIGNS and not _module(name).known(arguments.only):
             raise ValueError(f"--only {arguments.only}: it is found in no case of {name}")
     if arguments.plot:
-        from softfinger.tools.paper.style import NoMatplotlib, settings
+        from softfinger.tools.extras import MissingExtra
+        from softfinger.tools.paper.style import settings
 
         if not {"contact", "estimator"} & set(names):
             raise ValueError("--plot: only contact and estimator have a picture")
         try:
             settings()
-        except NoMatplotlib as error:
+        except MissingExtra as error:
             raise ValueError(f"--plot: {error}") from None
 
 

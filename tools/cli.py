@@ -1,7 +1,8 @@
 """The command line: parses which subcommand is meant and hands over to its module.
 
 A subcommand's module is imported only when it is called, and has two functions:
-``add_arguments(parser)`` and ``run(arguments) -> exit status``.
+``add_arguments(parser)`` and ``run(arguments) -> exit status``. What a person can put right, it
+raises: a SettingsError (exit status 2), any other SoftfingerError or an OSError about a file (1).
 """
 
 from __future__ import annotations
@@ -12,32 +13,33 @@ import sys
 from collections.abc import Sequence
 
 from softfinger import __version__
+from softfinger.daemon.errors import SettingsError, SoftfingerError
 
 SUBCOMMANDS = {
-    "run": "run the daemon; without a config, on the built-in simulated hand",
-    "emulate": "a stand-in hand in a process of its own: servos and tactile boards on ptys",
+    "run": "run the daemon; without --config, on the built-in simulated hand",
+    "emulate": "emulate a hand in its own process: servos and tactile boards on ptys",
     "send": "send one command to the running daemon",
-    "monitor": "live terminal page of the running daemon",
-    "view": "the running hand, or a recording, in Rerun's viewer: window or browser",
+    "monitor": "live page of the running daemon in the terminal",
+    "view": "show the running hand, or a recording, in Rerun's viewer: window or browser",
     "record": "record the running daemon's stream into an MCAP file",
-    "replay": "publish a recording again, or compare it with what today's code makes of it",
-    "analyse": "contact, force and energy over time from recorded pressure frames",
-    "plot": "a recording's pictures: over time, against the model, errors, timing",
-    "export": "a recording's topics as CSV or Parquet",
-    "doctor": "check ports, servos, boards and this machine, and tell what mends them",
+    "replay": "publish a recording again, or recompute and compare it with today's code",
+    "analyse": "compute contact, force and energy over time from recorded pressure frames",
+    "plot": "draw a recording: over time, against the model, errors, timing",
+    "export": "export a recording's topics as CSV or Parquet",
+    "doctor": "check ports, servos, boards and this machine, and say what mends them",
     "scan": "find the servos on a port, at any rate",
     "calibrate": "calibrate the pressure sensor under a tip, step by step",
-    "limits": "every limit of the hand: what is judged, what follows, which setting",
-    "compile": "compile a hand's kernels now, not at its first start",
-    "keys": "make the keys that addresses off this machine need",
-    "install-service": "a systemd unit and udev rules for this machine",
-    "figures": "the paper's figures from this model, as CSV and PNG",
-    "bench": "measure run time, beside what a user would otherwise pick",
+    "limits": "list every limit: condition, consequence, setting",
+    "compile": "compile a hand's kernels ahead of its first start",
+    "keys": "make the keys that addresses outside this machine need",
+    "install-service": "print or write a systemd unit and udev rules",
+    "figures": "draw the paper's figures from this model, as CSV and PNG",
+    "bench": "measure run time, beside the usual alternatives",
 }
 
 
 def _open_standard_streams() -> None:
-    """Stand-ins for standard streams that were closed, so that no other file takes their place."""
+    """Open /dev/null for closed standard streams, so that no other file takes their place."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
@@ -67,7 +69,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND")
     module = None
     for name, text in SUBCOMMANDS.items():
-        subparser = subparsers.add_parser(name, help=text, description=text)
+        subparser = subparsers.add_parser(
+            name,
+            help=text,
+            description=text,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
         if name == called:
             module = importlib.import_module(f"softfinger.tools.{name.replace('-', '_')}")
             module.add_arguments(subparser)
@@ -85,4 +92,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Whoever read the output has seen enough, as in `| head`; nothing more can be said to it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except SettingsError as error:  # a report with a line for each key
+        print(error, file=sys.stderr)
+        return 2
+    except SoftfingerError as error:
+        print(f"{called}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"{called}: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
     return status

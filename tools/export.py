@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from pathlib import Path
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.tools.arguments import moment, seconds, teller
+from softfinger.tools.arguments import add_range, to_stderr
 
 _EPILOG = """\
 Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
@@ -18,25 +17,20 @@ which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``export``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="where to, made if missing (default: FILE.export)"
+        "--out", type=Path, metavar="DIR", help="output folder (default: FILE.export)"
     )
     parser.add_argument("--format", choices=("csv", "parquet"), default="csv")
     parser.add_argument(
-        "--topics",
-        nargs="+",
-        metavar="TOPIC",
-        help="as state or hand/state; all if none is named",
+        "--topics", nargs="+", metavar="TOPIC", help="as state or hand/state (default: all)"
     )
-    parser.add_argument("--from", type=moment, metavar="S", dest="start", help="from S seconds on")
-    parser.add_argument("--to", type=seconds, metavar="S", dest="end", help="up to S seconds")
+    add_range(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export; 1 with one line when the recording, the folder or an extra is no good."""
+    """Export; 1 when there is nothing to export. Raises RecordingError, MissingExtra, OSError."""
     from softfinger.tools.recordings.reader import Recording
     from softfinger.tools.recordings.tables import CsvTable, ParquetTable, export
     from softfinger.tools.terminal.progress import Progress
@@ -44,20 +38,11 @@ def run(arguments: argparse.Namespace) -> int:
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".export")
     kind = CsvTable if arguments.format == "csv" else ParquetTable
-    start = -math.inf if arguments.start is None else arguments.start
-    end = math.inf if arguments.end is None else arguments.end
-    try:
-        recording = Recording(path, teller("export"))
-        topics = _topics(arguments.topics, recording.topics)
-        folder.mkdir(parents=True, exist_ok=True)
-        with Progress("export", recording.size) as progress:
-            files = export(recording, folder, kind, topics, start, end, progress)
-    except (RecordingError, ValueError) as error:
-        print(f"export: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f"export: {error.filename or folder}: {error.strerror}", file=sys.stderr)
-        return 1
+    recording = Recording(path, to_stderr("export"))
+    topics = _topics(arguments.topics, recording.topics)
+    folder.mkdir(parents=True, exist_ok=True)
+    with Progress("export", recording.size) as progress:
+        files = export(recording, folder, kind, topics, arguments.start, arguments.end, progress)
     for each in files:
         print(each)
     if not files:
@@ -72,5 +57,5 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
     for topic, word in zip(wanted, words, strict=True):
         if topic not in recorded:
             known = ", ".join(each.decode() for each in recorded) or "none"
-            raise ValueError(f"found topic {word!r}, the recording has {known}")
+            raise RecordingError(f"found topic {word!r}, the recording has {known}")
     return wanted

@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def write(chosen: dict[str, Page], folder: Path) -> None:
     """Write these pages into ``folder`` and print each file's path. Raises OSError."""
+    from softfinger.tools.extras import MissingExtra
     from softfinger.tools.paper import style
     from softfinger.tools.paper.sheets import errata_sheet
 
@@ -68,5 +69,5 @@ def write(chosen: dict[str, Page], folder: Path) -> None:
                 page.draw(figure, numbers[name])
                 style.save(figure, folder / f"{name}.png")
                 print(folder / f"{name}.png")
-    except style.NoMatplotlib as error:
+    except MissingExtra as error:
         print(f"figures: only the CSV files were written; {error}", file=sys.stderr)

@@ -93,7 +93,6 @@ KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``install-service``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("--config", type=Path, metavar="PROFILE", help="the hand's profile")
     parser.add_argument("--user", default="", help="whom it runs as; root when not given")

@@ -21,14 +21,14 @@ from typing import Any
 
 import zmq
 
-from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import (
+    PATIENCE,
     add_keys,
     client_keys,
     command_address,
-    nothing,
+    no_stream,
     stream_address,
 )
 from softfinger.tools.terminal.feed import Feed, number, text
@@ -190,7 +190,7 @@ class _Ending:
         if status == "lost":
             self.why = "the stream has ended"
         elif status == "waiting" and now > self._patience:
-            self.why = nothing(address, PATIENCE, self._keys)
+            self.why = no_stream(address, self._keys)
         self.over = bool(self.why)
 
 

@@ -15,8 +15,8 @@ from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.loop.sd_notify import Service
 from softfinger.daemon.profile.settings import Settings, Task
 from softfinger.tools.arguments import add_profile, profile, seconds
+from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
 from softfinger.tools.processes.event_log import EventLog
-from softfinger.tools.processes.recorder_beside import NoRecorder
 
 _STARTED = time.monotonic()
 
@@ -145,7 +145,6 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
     """A recorder that has subscribed to everything. Raises NoRecorder."""
     from softfinger.daemon.wire import schema
     from softfinger.daemon.wire.publisher import bit
-    from softfinger.tools.processes.recorder_beside import RecorderBeside
 
     def subscribed() -> bool:
         daemon.publisher.look()
@@ -158,9 +157,7 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
-    from softfinger.tools.processes.monitor_beside import start_beside
-
-    return start_beside(
+    return MonitorBeside(
         settings.stream.address,
         settings.commands.address,
         keys=settings.access.keys,

@@ -3,8 +3,8 @@
 - ``.npz`` with ``frames`` [n, rows, cols] and optionally ``t`` [n] s, ``live`` [rows, cols] bool,
   and the true contact at each frame, where known: ``d`` [m], ``theta`` [rad], ``force`` [N], each
   [n].
-- a folder of ``.npy`` files, in the order of their names with numbers read as numbers, each one
-  frame [rows, cols] or several [n, rows, cols]; ``t.npy`` [n] s among them.
+- ``.npy``, one frame [rows, cols] or several [n, rows, cols]; or a folder of such files, in the
+  order of their names with numbers read as numbers, and ``t.npy`` [n] s among them.
 - a Tekscan-style ASCII export, any other file.
 
 Frames of whole numbers are counts; others are Pa, and become counts by ``pascal_per_count``.
@@ -53,6 +53,8 @@ def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recordin
             with np.load(path, allow_pickle=False) as archive:
                 held = {name: archive[name] for name in archive.files}
             return _checked(held, pascal_per_count, rate)
+        if path.suffix == ".npy":
+            return _checked({"frames": _frames(path)}, pascal_per_count, rate)
         return _export(path, pascal_per_count, rate)
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
@@ -67,18 +69,23 @@ def _folder(path: Path, scale: float, rate: float) -> Recording:
     parts = []
     held: dict[str, NDArray[Any]] = {}
     for file in sorted(path.glob("*.npy"), key=order):
-        array = np.load(file, allow_pickle=False)
         if file.stem in ("t", "live", *TRUTHS):
-            held[file.stem] = array
-        elif array.ndim in (2, 3):
-            parts.append(array.reshape(-1, *array.shape[-2:]))
+            held[file.stem] = np.load(file, allow_pickle=False)
         else:
-            raise ValueError(f"{file.name}: found shape {array.shape}, expected [rows, cols]")
+            parts.append(_frames(file))
     if not parts:
         raise ValueError("no .npy file with a frame in this folder")
     if len({part.shape[1:] for part in parts}) > 1:
         raise ValueError("frames of different shapes in this folder")
     return _checked({"frames": np.concatenate(parts), **held}, scale, rate)
+
+
+def _frames(path: Path) -> NDArray[Any]:
+    """The frames of one .npy file, [n, rows, cols]."""
+    array: NDArray[Any] = np.load(path, allow_pickle=False)
+    if array.ndim not in (2, 3):
+        raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
+    return array.reshape(-1, *array.shape[-2:])
 
 
 def _export(path: Path, scale: float, rate: float) -> Recording:

@@ -1,4 +1,4 @@
-"""One pass over recorded frames: d, θ, force and energy at each, by the daemon's own perception."""
+"""d, θ, force and energy of recorded frames, by the daemon's own perception."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.tactile.replay import GivenFrames
@@ -18,22 +17,22 @@ from softfinger.tools.analysis.sources import Progress, Source
 
 FloatArray = NDArray[np.float64]
 
-# Name, unit and the contact's attribute of each column; the CSV's header says name_unit.
+# The contact's fields and their units; the CSV's header says name_unit.
 COLUMNS = (
-    ("d", "m", "d"),
-    ("d_std", "m", "d_std"),
-    ("theta", "rad", "theta"),
-    ("theta_std", "rad", "theta_std"),
-    ("tilt_y", "rad", "tilt_y"),
-    ("force", "N", "force"),
-    ("energy", "J", "energy"),
-    ("gain", "", "gain"),
+    ("d", "m"),
+    ("d_std", "m"),
+    ("theta", "rad"),
+    ("theta_std", "rad"),
+    ("tilt_y", "rad"),
+    ("force", "N"),
+    ("energy", "J"),
+    ("gain", ""),
 )
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """One sensor's contacts: a row a frame. ``values`` by the names in COLUMNS, SI units."""
+    """One sensor's contacts, a row a frame. ``values`` by the names in COLUMNS, SI units."""
 
     finger: str
     t: FloatArray
@@ -44,7 +43,7 @@ class Contacts:
 
 
 class _Pass:
-    """One sensor's perception and the rows it has given."""
+    """One sensor's perception and its rows."""
 
     def __init__(self, source: Source, finger: int) -> None:
         self._sensor = GivenFrames(source.live)
@@ -52,43 +51,23 @@ class _Pass:
         self._state = State()
         self._contact = self._state.contacts[finger]
         self._rows: list[tuple[float, ...]] = []
-        shape = source.settings.tactile
-        self._shape = (shape.rows, shape.cols)
 
     def take(self, t: float, counts: NDArray[np.uint16]) -> None:
-        if counts.shape != self._shape:
-            raise RecordingError(
-                f"a frame of {counts.shape[0]} × {counts.shape[1]} cells, expected "
-                f"{self._shape[0]} × {self._shape[1]}"
-            )
         self._sensor.frame = Frame(len(self._rows) + 1, t, t, True, counts)
         self._state.t = t
         self._perception.update(self._state)
-        c = self._contact
-        self._rows.append(
-            (
-                t,
-                c.valid,
-                c.contact,
-                c.d,
-                c.d_std,
-                c.theta,
-                c.theta_std,
-                c.tilt_y,
-                c.force,
-                c.energy,
-                c.gain,
-            )
-        )
+        contact = self._contact
+        values = [getattr(contact, name) for name, _ in COLUMNS]
+        self._rows.append((t, contact.valid, contact.contact, *values))
 
     def contacts(self, finger: int, truths: dict[str, FloatArray]) -> Contacts:
         table = np.array(self._rows, np.float64).reshape(-1, 3 + len(COLUMNS)).T
-        values = {name: table[3 + k] for k, (name, _, _) in enumerate(COLUMNS)}
+        values = {name: table[3 + k] for k, (name, _) in enumerate(COLUMNS)}
         return Contacts(FINGERS[finger], table[0], table[1] > 0.0, table[2] > 0.0, values, truths)
 
 
 def analyse(source: Source, progress: Progress) -> list[Contacts]:
-    """The contacts of each sensor. Raises RecordingError for a frame that doesn't fit."""
+    """The contacts of each sensor. Raises what the source's frames raise."""
     passes = {finger: _Pass(source, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):
         passes[finger].take(t, counts)
@@ -97,15 +76,15 @@ def analyse(source: Source, progress: Progress) -> list[Contacts]:
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
     """One line a frame, sensors one after the other; names with units. Raises OSError."""
-    names = [f"{name}_{unit}" if unit else name for name, unit, _ in COLUMNS]
+    names = [f"{name}_{unit}" if unit else name for name, unit in COLUMNS]
     truths = sorted({name for each in contacts for name in each.truths})
-    units = {"d": "m", "theta": "rad", "force": "N"}
+    units = dict(COLUMNS)
     with write_text(path, newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         known = [f"{name}_true_{units[name]}" for name in truths]
         writer.writerow(["t_s", "finger", "valid", "contact", *names, *known])
         for each in contacts:
-            columns = [each.values[name] for name, _, _ in COLUMNS]
+            columns = [each.values[name] for name, _ in COLUMNS]
             columns += [each.truths[name] for name in truths]
             numbers = zip(*(column.tolist() for column in columns), strict=True)
             for t, valid, touches, row in zip(

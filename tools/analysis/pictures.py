@@ -19,7 +19,7 @@ _PANELS = (
 
 
 def draw(contacts: list[Contacts], title: str, path: Path) -> None:
-    """d and θ with two standard deviations, F and U over time. Raises style.NoMatplotlib."""
+    """d and θ with two standard deviations, F and U over time. Raises MissingExtra."""
     with style.settings():
         figure = style.new_figure(7.0, 7.5)
         axes = figure.subplots(len(_PANELS), 1, sharex=True)

@@ -1,8 +1,8 @@
-"""Where recorded frames come from, whatever wrote them: one `Source` a sensor.
+"""Reads recorded frames from any of the supported files.
 
-A recording of the stream (.mcap) brings its own settings and calibrations. A file of frames alone
-(.npz, a folder of .npy, a Tekscan-style export) is taken as the profile's left sensor, with its own
-number of cells, and its own pitch where the file tells it.
+A recording of the stream (.mcap) has its own settings and calibrations. A file of frames alone
+(.npz, .npy or a folder of these, a Tekscan-style export) is the profile's left sensor, with its own
+number of cells, and its own pitch where the file has it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.recording import load_recording
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
-from softfinger.tools.arguments import teller
+from softfinger.tools.arguments import to_stderr
 from softfinger.tools.recordings.reader import Recording
 
 Counts = NDArray[np.uint16]
@@ -32,8 +32,8 @@ Progress = Callable[[int], None]
 class Source:
     """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
 
-    ``t`` counts from the first frame; ``total`` is what ``progress`` counts up to. ``truths`` are
-    what was known of the contact at each frame, by name, where the file has one sensor alone.
+    ``t`` counts from the first frame; ``total`` is the end of ``progress``. ``truths`` is the true
+    contact at each frame, by name, where a file of one sensor has it.
     """
 
     settings: Settings
@@ -48,9 +48,8 @@ class Source:
 def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
     """Open a file of frames.
 
-    With ``own`` a recording of the stream goes by the settings it was made with, else all go by
-    ``settings``. Raises RecordingError or `tactile.recording.RecordingError` naming the
-    file, and what the settings raise.
+    With ``own`` a recording of the stream uses the settings it was made with, else ``settings``.
+    Raises RecordingError with the file's name, and SettingsError or TactileError.
     """
     if path.suffix == ".mcap":
         return _stream(path, settings, cache, own)
@@ -61,7 +60,7 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     from softfinger.daemon.loop.process_replay import with_calibrations
     from softfinger.tools.recordings.recomputed import recorded_settings
 
-    recording = Recording(path, teller("analyse"))
+    recording = Recording(path, to_stderr("analyse"))
     if not recording.count(schema.TACTILE):
         raise RecordingError(f"{path}: no tactile frames in it")
     if own:
@@ -76,6 +75,8 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
         if f"{schema.TACTILE.decode()}/{name}" in recording.counts
     )
 
+    shape = settings.tactile.rows, settings.tactile.cols
+
     def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
         first = None
         for _, message in recording.messages([schema.TACTILE], progress=progress):
@@ -83,6 +84,11 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
                 raise RecordingError(f"{path}: frames in {message.get('unit')!r}, expected counts")
             finger = FINGERS.index(message["finger"])
             counts = np.frombuffer(message["data"], "<u2").reshape(message["rows"], message["cols"])
+            if counts.shape != shape:
+                raise RecordingError(
+                    f"{path}: a frame of {counts.shape[0]} × {counts.shape[1]} cells, expected "
+                    f"{shape[0]} × {shape[1]}"
+                )
             first = message["timestamp"] if first is None else first
             yield finger, message["timestamp"] - first, counts
 

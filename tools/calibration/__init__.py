@@ -1,1 +1,1 @@
-"""Frames and pictures of `softfinger calibrate`."""
+"""Frames, steps and pictures of `softfinger calibrate`."""

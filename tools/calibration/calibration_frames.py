@@ -1,4 +1,4 @@
-"""Frames for a calibration step: load by load or in one run from the live sensor, or recorded."""
+"""Frames for a calibration step: live, load by load or in one press, or recorded."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from softfinger.kinematics.estimation.calibration import CalibrationError
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 3.0  # s without a new frame
 _WAIT = 60.0  # s for a press to begin
-_TOUCHED = 3  # cells that are clear of their noise: something touches the tip
-_CLEAR = 6.0  # standard deviations of a cell's noise, and two counts, are clear of it
+_TOUCHED = 3  # cells above their noise: something touches the tip
+_CLEAR = 6.0  # standard deviations, and two counts, from which a cell is above its noise
 _FEWEST = 5  # frames of a press
-_BACK = 0.95  # of the run's largest reading: the tip is let go
+_BACK = 0.95  # of the run's largest reading, below which the tip is released
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Loads:
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
     """The step's loads. Raises TactileError, RecordingError or CalibrationError.
 
-    ``calibration`` is what the step goes into: it tells the sensor and, live, its zero.
+    ``calibration`` has the sensor's facts and, live, its zero.
     """
     sensor = calibration.sensor
     given = {
@@ -65,7 +65,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 )
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # A run: each frame is a load of its own; only pressed ones tell something.
+            # A run: each pressed frame is a load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -78,7 +78,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
 
 
 def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
-    """Each list of values as long as there are loads; one value stands for all."""
+    """Each list of values with one for each load; a single value holds for all."""
     for name, values in given.items():
         if len(values) not in (1, count):
             raise CalibrationError(f"--{name}: found {len(values)} values for {count} loads")
@@ -104,7 +104,7 @@ def _live(
                 )
                 if not sys.stdin.readline():
                     raise CalibrationError("ended before all loads were on")
-            # What was scanned before this moment may show the last load still.
+            # A frame scanned before this moment may still show the last load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
@@ -118,16 +118,16 @@ def _live_run(
 ) -> Loads:
     """One press at constant speed, from the first touch to the deepest frame, each a load.
 
-    d counts from the last frame without a touch, so that its zero is off by up to a frame's way.
+    d counts from the last frame without a touch: its zero is off by one frame's travel at most.
     """
     clock = RealClock()
     converter = Converter(calibration, settings.tactile.pascal_per_count)
     if calibration.tare is None:
-        raise CalibrationError("--speed: tare first, which tells a touch from noise")
+        raise CalibrationError("--speed: tare first: a touch is detected by the noise it measures")
     noise = calibration.tare.noise
     speed = arguments.speed * 1e-3
     with _opened(settings, clock, calibration.sensor.finger) as backend:
-        _say(f"press at {arguments.speed:g} mm/s from clear of the tip, then let go")
+        _say(f"press at {arguments.speed:g} mm/s, beginning clear of the tip, then release")
         begin, last_free, most = clock.now(), -math.inf, 0.0
         frames: list[NDArray[np.uint16]] = []
         d: list[float] = []
@@ -135,9 +135,9 @@ def _live_run(
             readings = converter.readings(frame.data.astype(np.float64))
             total = float(readings.sum())
             if not frames and clock.now() - begin > _WAIT:
-                raise CalibrationError(f"no press from clear of the tip within {_WAIT:g} s")
+                raise CalibrationError(f"no press that begins clear of the tip within {_WAIT:g} s")
             if np.count_nonzero(readings > _CLEAR * noise + 2.0) < _TOUCHED:
-                if frames:  # let go between two frames
+                if frames:  # released between two frames
                     break
                 last_free = frame.t_sample
             elif last_free > -math.inf:
@@ -147,7 +147,7 @@ def _live_run(
                 frames.append(frame.data)
                 d.append(speed * (frame.t_sample - last_free))
     totals = [float(converter.readings(each.astype(np.float64)).sum()) for each in frames]
-    count = int(np.argmax(totals))  # the deepest itself may be past the turn
+    count = int(np.argmax(totals))  # the deepest itself may already be on the way back
     if count < _FEWEST:
         raise CalibrationError(f"{count} frames while it was pressed: press slower")
     _say(f"{count} frames of a press to {1e3 * d[count]:.2f} mm")

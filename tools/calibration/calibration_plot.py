@@ -1,4 +1,4 @@
-"""The picture of one calibration step: what was measured and what is left over."""
+"""The picture of one calibration step: its result and residuals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from softfinger.tools.paper import style
 
 
 def draw(step: str, data: dict[str, Any], path: Path) -> None:
-    """Write the picture of ``step``; ``data`` as that step hands it out."""
+    """Write the picture of ``step``; ``data`` as that step returns it."""
     with style.settings():
         figure = style.new_figure(7.5, 3.4)
         figure.suptitle(f"Calibration: {step}", fontsize=10)
@@ -46,7 +46,7 @@ def _curve(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
     left.plot(force, force, "-", color=style.GREY)
     left.set(title="forces", xlabel="known [N]", ylabel="by the sensor [N]")
     right.plot(force, 100.0 * errors, "o", color=style.KINDS[1])
-    right.set(title="left over", xlabel="known force [N]", ylabel="relative error [%]")
+    right.set(title="residuals", xlabel="known force [N]", ylabel="relative error [%]")
 
 
 def _centre(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
@@ -64,7 +64,7 @@ def _centre(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
     left.set(title="on the sensor", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
     left.legend()
     right.hist(theta, bins=20, color=style.KINDS[0])
-    right.set(title=f"presses; {found.residual * 1e6:.0f} µm rms left over", xlabel="tilt [°]")
+    right.set(title=f"presses; {found.residual * 1e6:.0f} µm rms residual", xlabel="tilt [°]")
 
 
 def _modulus(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
@@ -81,7 +81,7 @@ def _modulus(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
     else:
         right.plot(d * 1e3, data["force"] / np.maximum(model, 1e-12) * 100 - 100, "o",
                    color=style.KINDS[1])  # fmt: skip
-        right.set(title="left over", xlabel="d [mm]", ylabel="relative error [%]")
+        right.set(title="residuals", xlabel="d [mm]", ylabel="relative error [%]")
 
 
 _PANELS = {

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.own_files import write_bytes
+from softfinger.tools.extras import require
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,22 +55,11 @@ _SETTINGS: dict[Any, Any] = {
 }
 
 
-class NoMatplotlib(SoftfingerError):
-    """matplotlib is not installed. The message says what to install."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "pictures need matplotlib, the extra 'plot'; from the project's folder: "
-            "pip install '.[plot]'"
-        )
-
-
 def settings() -> AbstractContextManager[None]:
-    """A context in which figures are made in this style. Raises NoMatplotlib without it."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise NoMatplotlib from None
+    """A context in which figures are made in this style. Raises MissingExtra without matplotlib."""
+    require("plot")
+    import matplotlib
+
     return matplotlib.rc_context(_SETTINGS)
 
 

@@ -8,38 +8,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.tools.recordings.errors import require_packages
+from softfinger.tools.extras import require
 from softfinger.tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
-    from mcap.records import Chunk
+    from mcap.records import Chunk, McapRecord
     from mcap.summary import Summary
 
 _RECORD_LIMIT = 256 * 1024 * 1024  # bytes; our own chunks are a thousandth of it
 
 
 class Recording:
-    """A recording that is there. Raises RecordingError when it is none.
+    """A recording that exists. Raises RecordingError when it is none.
 
-    ``counts`` messages by channel, ``start`` and ``end`` [Unix s] (NaN when empty) and
-    ``attachments`` come from the summary at the file's end. A file without one, as a killed
-    recorder leaves it, is ``truncated``: it is read through once instead. Chunks that are damaged
-    are left out. ``tell`` is called once with what is wrong with the file, as soon as it is known.
+    ``counts`` messages by channel, and ``start`` and ``end`` [Unix s] (NaN when empty) come from
+    the summary at the file's end. A file without one, as a killed recorder leaves it, is
+    ``truncated``: it is read through once instead. Damaged chunks are left out. ``say`` is called
+    once with what is wrong with the file, as soon as it is known.
     """
 
-    def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
-        require_packages()
+    def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
+        require("record")
         self.path = path
         self.truncated = False
         self.damage = ""  # what is wrong with it, as far as it was read
-        self._tell = tell
+        self._say = say
         self.counts: dict[str, int] = {}
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
-        self.attachments: dict[str, bytes] = {}
         self._first = 0  # log time of the earliest message [ns]
-        self._names: dict[int, str] = {}  # channel's number → its name
+        self._names: dict[int, str] = {}  # of the channels, by number
         try:
             self.size = path.stat().st_size
             if self.size == 0:
@@ -83,13 +82,12 @@ class Recording:
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
         """Topic and map of each message, as it came off the wire, from ``start`` to ``end`` s.
 
-        Times count from the recording's first message. ``progress`` is told the bytes of the file
-        that are behind. A truncated file ends where its sound part ends; a damaged chunk is left
-        out, and so is what is no message of its topic.
+        Times count from the recording's first message. ``progress`` is called with the bytes read
+        so far. A truncated file ends where its sound part ends; damaged chunks and messages that
+        don't fit their topic are left out.
         """
         import orjson
         from mcap.records import Message
-        from mcap.stream_reader import breakup_chunk
 
         loads = orjson.loads
         begin = self._first + int(start * 1e9) if math.isfinite(start) else 0
@@ -102,12 +100,7 @@ class Recording:
         for chunk in self._chunks(progress):
             if chunk.message_end_time < begin or chunk.message_start_time > finish:
                 continue
-            try:
-                records = breakup_chunk(chunk, validate_crc=True)
-            except Exception as error:  # the format's, the compression's and more of their kinds
-                self._damaged(error)
-                continue
-            for record in records:
+            for record in self._records(chunk):
                 if not isinstance(record, Message) or record.channel_id not in wanted:
                     continue
                 if not begin <= record.log_time <= finish:
@@ -121,7 +114,7 @@ class Recording:
                 yield topic, message
 
     def _chunks(self, progress: Callable[[int], None] | None = None) -> Iterator[Chunk]:
-        from mcap.records import Attachment, Chunk, DataEnd
+        from mcap.records import Chunk, DataEnd
         from mcap.stream_reader import StreamReader
 
         with self.path.open("rb") as file:
@@ -132,33 +125,35 @@ class Recording:
                         if progress is not None:
                             progress(file.tell())
                         yield record
-                    elif isinstance(record, Attachment):
-                        self.attachments[record.name] = record.data
                     elif isinstance(record, DataEnd):
                         return
             except Exception as error:
                 self._damaged(error)
 
+    def _records(self, chunk: Chunk) -> list[McapRecord]:
+        """A chunk's records; none where it is damaged."""
+        from mcap.stream_reader import breakup_chunk
+
+        try:
+            return breakup_chunk(chunk, validate_crc=True)
+        except Exception as error:  # the format's, the compression's and more kinds
+            self._damaged(error)
+            return []
+
     def check(self) -> bool:
         """Read every chunk; whether the file is whole and sound."""
-        from mcap.stream_reader import get_chunk_data_stream
-
         for chunk in self._chunks():
-            try:
-                get_chunk_data_stream(chunk, validate_crc=True)
-            except Exception as error:
-                self._damaged(error)
+            self._records(chunk)
         return not self.truncated and not self.damage
 
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
-        nameless = "its end is missing" if self.truncated else "a chunk can't be read"
+        usual = "its end is missing" if self.truncated else "a chunk can't be read"
         # What the format's reader says of a wrong length or checksum helps nobody.
-        told = str(error) if type(error) is ValueError else ""
-        self.damage = self.damage or told or nameless
-        if first and self._tell is not None:
+        self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
+        if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
-            self._tell(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
+            self._say(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
 
     def _summary(self) -> Summary | None:
         from mcap.exceptions import EndOfFile, InvalidMagic
@@ -179,8 +174,6 @@ class Recording:
                     )
                 summary = reader.get_summary()
                 if summary is not None and summary.statistics is not None:
-                    for attachment in reader.iter_attachments():
-                        self.attachments[attachment.name] = attachment.data
                     return summary
             except (InvalidMagic, EndOfFile):
                 pass  # cut short: no summary
@@ -206,18 +199,12 @@ class Recording:
 
     def _scan(self) -> None:
         from mcap.records import Channel, Message
-        from mcap.stream_reader import breakup_chunk
 
         names = self._names
         start, end = 2**63, 0
         for chunk in self._chunks():
-            try:
-                records = breakup_chunk(chunk, validate_crc=True)
-            except Exception as error:
-                self._damaged(error)
-                continue
             self.chunks += 1
-            for record in records:
+            for record in self._records(chunk):
                 if isinstance(record, Message) and record.channel_id in names:
                     name = names[record.channel_id]
                     self.counts[name] = self.counts.get(name, 0) + 1

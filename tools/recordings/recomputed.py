@@ -1,4 +1,4 @@
-"""A recording's inputs through today's code, and what differs from what was recorded then."""
+"""Runs a recording's inputs through today's code and compares the states with the recorded ones."""
 
 from __future__ import annotations
 
@@ -21,16 +21,15 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import packer
 from softfinger.tools.recordings.reader import Recording
 
-# What depends on the machine and the moment, and not on what the loop took in.
-_MOMENT = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
-
+# Fields that depend on the machine and the moment, not on the loop's inputs.
+_TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
 _SETTINGS = ("settings", "calibration_left", "calibration_right")  # of hand/settings
 
 
 @dataclass(slots=True)
 class Difference:
-    """How one field of ``hand/state`` differs: how often, where first, where worst."""
+    """How one field of ``hand/state`` differs: how often, first where, worst where."""
 
     count: int = 0
     first_tick: int = 0
@@ -42,12 +41,12 @@ class Difference:
 
 @dataclass(slots=True)
 class Comparison:
-    """What became of a recording: ticks run, states compared, fields that differ."""
+    """The result: ticks run, states compared, fields that differ."""
 
     ticks: int = 0
     states: int = 0
     fields: int = 0
-    from_start: bool = False  # the first tick was recorded: nothing was remembered from before
+    from_start: bool = False  # the recording has the first tick
     missing_ticks: int = 0
     missing_frames: int = 0
     differences: dict[str, Difference] = field(default_factory=dict)
@@ -76,14 +75,17 @@ def recompute(
     cache: Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Comparison:
-    """Run the recorded inputs through the loop and compare state for state.
+    """Run the recorded inputs through the loop and compare every state.
 
-    ``settings`` stand for the recorded ones where they are given. Raises RecordingError when the
-    recording lacks what is needed.
+    ``settings`` replace the recorded ones. Raises RecordingError when the recording lacks a topic
+    or frames.
     """
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
-        raise RecordingError(f"{recording.path}: no hand/input in it: record with --topics all")
+        raise RecordingError(
+            f"{recording.path}: no hand/input in it, each tick's inputs: record with --topics all, "
+            "or by `softfinger run --record FILE`"
+        )
     used = settings or own
     machine = ProcessReplay(used, calibrations, cache)
     scene = parts(used)
@@ -91,7 +93,7 @@ def recompute(
     result = Comparison()
     newest = [0, 0]
     last = 0
-    for tick, frames, commands, state in _ticks(recording, progress, machine.fingers):
+    for tick, frames, commands, state in _ticks(recording, progress):
         if result.ticks == 0:
             result.from_start = tick["seq"] == 1
         else:
@@ -124,26 +126,20 @@ def recompute(
         result.ticks += 1
         if state is not None:
             step = state.get("seq_step", 1)
-            # Through the packer, as the recorded one went: the same types and roundings.
+            # Through the packer, as the recorded one: the same types and roundings.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
     return result
 
 
-def _ticks(
-    recording: Recording, progress: Callable[[int], None] | None, fingers: tuple[int, ...]
-) -> Iterator[
-    tuple[
-        dict[str, Any],
-        dict[tuple[int, int], Any],
-        list[dict[str, Any]],
-        dict[str, Any] | None,
-    ]
-]:
-    """Each tick's input, the frames at hand, its commands and its state if one was recorded.
+# A tick's input, the counts of recent frames by (finger, seq), its commands, and its state if any.
+_Tick = tuple[
+    dict[str, Any], dict[tuple[int, int], Any], list[dict[str, Any]], dict[str, Any] | None
+]
 
-    A tick's frames and commands come before its input, its state behind it.
-    """
+
+def _ticks(recording: Recording, progress: Callable[[int], None] | None) -> Iterator[_Tick]:
+    """Each tick: its frames and commands come before its input, its state after it."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}
@@ -204,5 +200,5 @@ def _pairs(
         after = recomputed.get(key)
         if isinstance(before, dict) and isinstance(after, dict):
             yield from _pairs(before, after, f"{outer}{key}.")
-        elif outer or key not in _MOMENT:
+        elif outer or key not in _TIMING:
             yield f"{outer}{key}", before, after

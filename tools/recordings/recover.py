@@ -1,4 +1,4 @@
-"""A recording that was cut short, closed: its sound part in a file with an end."""
+"""Repairs a recording that was cut short: its sound part goes into a file with an end."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ def recover(path: Path) -> tuple[int, str]:
     closed.unlink(missing_ok=True)
     writer = RecordingWriter(closed)
     try:
-        for name, data in recording.attachments.items():
-            writer.attach(name, "application/json", data)
         for topic, message in recording.messages():
             writer.add(topic, message)
         writer.close()

@@ -1,9 +1,8 @@
-"""A recording's messages on the daemon's wire again, by a gateway as the daemon's own."""
+"""Publishes a recording's messages on the stream's address, by a gateway as the daemon's own."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from softfinger.daemon.errors import AddressError, RecordingError
@@ -14,14 +13,14 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
 
-_QUEUE = 10_000  # messages that wait for a subscriber; what it does not take by then it misses
+_QUEUE = 10_000  # messages that wait for a subscriber; it misses further ones
 _PATIENCE = 1.0  # s for the gateway to take a message
 
 
 class Wire:
-    """Publishes on ``address``, with keys to their holders alone. A context.
+    """A context that publishes on ``address``, with ``keys`` only to their holders.
 
-    Raises RecordingError when the address can't be had, or would reach other machines without keys.
+    Raises RecordingError when the address can't be bound, or reaches other machines without keys.
     """
 
     def __init__(self, address: str, keys: Path | None = None) -> None:
@@ -40,7 +39,7 @@ class Wire:
         self._link.begin_epoch()
 
     def subscribed(self, seconds: float) -> bool:
-        """Wait that long, or until who subscribes changes; whether somebody does."""
+        """Wait so many seconds, or until the subscribers change; whether there are any."""
         self._link.wait(seconds)
         return bool(self._link.wanted)
 
@@ -57,10 +56,5 @@ class Wire:
     def __enter__(self) -> Wire:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._gateway.close()

@@ -12,8 +12,7 @@ from typing import Any
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
-from softfinger.tools.recordings.container import Container
-from softfinger.tools.recordings.errors import require_packages
+from softfinger.tools.extras import require
 from softfinger.tools.recordings.layout import (
     ENCODING,
     LIBRARY,
@@ -25,53 +24,51 @@ from softfinger.tools.recordings.layout import (
     to_json,
 )
 
-# What a killed recorder loses at most: what didn't fill a chunk yet, since the last flush.
+# A killed recorder loses at most the chunk that wasn't full yet, since the last flush.
 CHUNK = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
 
 
-class _Channel:
-    """A channel's number and its converter."""
-
-    def __init__(self, number: int, convert: Converter) -> None:
-        self.number = number
-        self.convert = convert
-
-
 class RecordingWriter:
-    """Writes one file. Raises RecordingError when it can't be opened, or is there already.
+    """Writes one file. ``messages`` and ``size`` [bytes] count what is in it: whole chunks.
 
-    After a failed write the file is closed as it is: what was written until then can be read.
+    Raises RecordingError when the file can't be opened, or exists already. After a failed write the
+    file is closed: what was written until then can be read.
     """
 
     def __init__(self, path: Path) -> None:
-        require_packages()
+        require("record")
         import orjson
+        from mcap.writer import Writer
 
         self.path = path
-        try:
-            self._file = path.open("xb")
-        except FileExistsError:
-            raise RecordingError(f"{path}: is there already; nothing is written over it") from None
-        except OSError as error:
-            raise RecordingError(f"{path}: {error.strerror}") from None
+        self.messages = 0
+        self.size = 0
         self._dumps = orjson.dumps
-        self._json_error = orjson.JSONEncodeError
-        self._channels: dict[bytes | str, _Channel] = {}  # by topic, frames' by channel
+        self._added = 0  # messages, with those of the chunk that is being filled
+        self._filled = 0  # bytes of messages in that chunk
+        self._channels: dict[bytes | str, tuple[int, Converter]] = {}  # by topic, frames' by name
         self._schemas: dict[bytes, int] = {}
         self._ended = False
         self._newest = math.nan  # time of the newest message [s]
-        self._early: list[tuple[bytes, dict[str, Any]]] = []  # told again before any other came
-        self.unfit = 0  # messages that JSON can't hold
+        self._early: list[tuple[bytes, dict[str, Any]]] = []  # repeated before any other came
         try:
-            self._container = Container(self._file, PROFILE, LIBRARY, CHUNK)
+            self._file = path.open("xb")
+        except FileExistsError:
+            raise RecordingError(f"{path}: exists already; nothing is written over it") from None
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror}") from None
+        try:
+            self._mcap = Writer(self._file, 2 * CHUNK)  # `add` ends a chunk before that
+            self._mcap.start(PROFILE, LIBRARY)
+            self._wrote()
         except OSError as error:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
         """Write one message; the map may be changed. Raises RecordingError.
 
-        What is told again has its first time in it, from before the recording: in the file it
-        stands where it came, so that the file's time is the recording's own.
+        A repeated message (``again``) has its first time in it, from before the recording. In the
+        file its log time is that of the message before it, so that the file's times are its own.
         """
         assert not self._ended
         stamp = message.get("timestamp")
@@ -87,60 +84,11 @@ class RecordingWriter:
             when = self._newest
         self._write(topic, message, when)
 
-    def _write_early(self, when: float) -> None:
-        early, self._early = self._early, []
-        for topic, message in early:
-            self._write(topic, message, when)
-
-    def _write(self, topic: bytes, message: dict[str, Any], when: float) -> None:
-        key = channel_name(topic, message) if topic == schema.TACTILE else topic
-        channel = self._channels.get(key)
-        if channel is None:
-            channel = self._channels[key] = self._open(channel_name(topic, message), topic)
-        sequence = message.get("seq")
-        if not isinstance(sequence, int):
-            sequence = 0
-        try:
-            data = self._dumps(channel.convert(message))
-        except (self._json_error, TypeError):
-            self.unfit += 1
-            return
-        try:
-            self._container.message(channel.number, int(when * 1e9), sequence & 0xFFFFFFFF, data)
-        except OSError as error:
-            raise self._failed(error) from None
-
-    def _open(self, name: str, topic: bytes) -> _Channel:
-        schema = self._schemas.get(topic)
-        if schema is None:
-            title, fields = schema_of(topic)
-            text = json.dumps(fields, ensure_ascii=False).encode()
-            schema = self._schemas[topic] = self._container.schema(title, SCHEMA_ENCODING, text)
-        return _Channel(self._container.channel(name, ENCODING, schema), to_json(topic))
-
-    def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Put a file into the recording, as the settings are. Raises RecordingError."""
-        assert not self._ended
-        try:
-            self._container.attachment(time.time_ns(), name, media_type, data)
-        except OSError as error:
-            raise self._failed(error) from None
-
-    @property
-    def messages(self) -> int:
-        """How many are in the file; a chunk's messages count once it is full."""
-        return self._container.messages
-
-    @property
-    def size(self) -> int:
-        """Bytes in the file so far; a chunk's messages count once it is full."""
-        return self._container.size
-
     def flush(self) -> None:
-        """Hand all to the system, in a short chunk: from then on a killed process loses it not."""
-        assert not self._ended
+        """End the chunk and hand it to the system: a killed process doesn't lose it."""
         try:
-            self._container.end_chunk()
+            self._mcap.flush()  # type: ignore[no-untyped-call]
+            self._wrote()
         except OSError as error:
             raise self._failed(error) from None
 
@@ -152,18 +100,56 @@ class RecordingWriter:
             self._write_early(time.time())
         self._ended = True
         try:
-            self._container.finish()
+            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._wrote()
             self._file.close()
         except OSError as error:
             raise self._failed(error) from None
+
+    def _write_early(self, when: float) -> None:
+        early, self._early = self._early, []
+        for topic, message in early:
+            self._write(topic, message, when)
+
+    def _write(self, topic: bytes, message: dict[str, Any], when: float) -> None:
+        key = channel_name(topic, message) if topic == schema.TACTILE else topic
+        try:
+            if key not in self._channels:
+                self._channels[key] = self._open(channel_name(topic, message), topic)
+            channel, convert = self._channels[key]
+            try:
+                data = self._dumps(convert(message))
+            except TypeError:  # orjson's error, too: JSON can't hold it
+                return
+            sequence = message.get("seq")
+            sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0
+            stamp = int(when * 1e9)
+            self._mcap.add_message(channel, stamp, data, stamp, sequence)
+        except OSError as error:
+            raise self._failed(error) from None
+        self._added += 1
+        self._filled += len(data)
+        if self._filled > CHUNK:
+            self.flush()
+
+    def _open(self, name: str, topic: bytes) -> tuple[int, Converter]:
+        number = self._schemas.get(topic)
+        if number is None:
+            title, fields = schema_of(topic)
+            text = json.dumps(fields, ensure_ascii=False).encode()
+            number = self._schemas[topic] = self._mcap.register_schema(title, SCHEMA_ENCODING, text)
+        return self._mcap.register_channel(name, ENCODING, number), to_json(topic)
+
+    def _wrote(self) -> None:
+        self._file.flush()
+        self.size, self.messages, self._filled = self._file.tell(), self._added, 0
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
         with contextlib.suppress(OSError):  # the buffer's rest doesn't fit either, and is dropped
             self._file.close()
-        # A record that got in half way is none.
-        with contextlib.suppress(OSError, AttributeError):
-            os.truncate(self.path, self._container.size)
+        with contextlib.suppress(OSError):
+            os.truncate(self.path, self.size)  # to the last record that is whole
         return RecordingError(
             f"{self.path}: {error.strerror}; what was written until then can be read, "
             f"`softfinger record --recover {self.path}` closes it"

@@ -28,11 +28,11 @@ _TRAIL = 160  # points in a trail on the landscape
 _ARROW = 1.6e-3  # m of a force's arrow a newton
 _ARROW_LONGEST = 0.045  # m
 _FADE = 0.995  # of the colour range with each frame, so that a single peak does not stay
-_DARKEST = 8.0  # standard deviations of the noise that the colour range has at least
+_LEAST_PEAK = 8.0  # standard deviations of the noise: the least end of the colour range
 
 
 class Drawing:
-    """One hand's pictures. ``prepare`` logs once what stands still."""
+    """One hand's pictures. Logs at once what stands still: the palm and the landscape."""
 
     def __init__(self, recording: rr.RecordingStream, hand: Hand) -> None:
         self._recording = recording
@@ -41,25 +41,22 @@ class Drawing:
         self._trails: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=_TRAIL) for name in hand.fingers
         }
-        tactile = hand.settings.tactile
-        self._floor = _DARKEST * tactile.noise
+        self._floor = _LEAST_PEAK * hand.settings.tactile.noise
         self._peak = self._floor
         self._grids: dict[str, Any] = {}
         self._height = hand.settings.simulation.object_height
-        self.landscape: Landscape | None = None
-
-    def prepare(self) -> None:
-        """Log the landscape and the palm."""
-        half = 1e3 * self._hand.geometry.half_separation
+        self.landscape = hand.landscape()
+        half = 1e3 * hand.geometry.half_separation
         self._still(
             "hand/palm",
             rr.LineStrips2D(
                 [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[layout.SPRING], radii=[1.2]
             ),
         )
-        landscape = self.landscape = self._hand.landscape()
-        if landscape is None:
-            return
+        if self.landscape is not None:
+            self._draw_landscape(self.landscape)
+
+    def _draw_landscape(self, landscape: Landscape) -> None:
         self._still("landscape/picture", rr.Image(landscape.picture()))
         contours = [each for each in landscape.contours() if len(each.line) > 1]
         self._still(
@@ -81,33 +78,26 @@ class Drawing:
                 labels=[*names, *(name for _, name in ticks)],
                 show_labels=True,
                 radii=rr.Radius.ui_points(0.0),
-                colors=[(235, 235, 235)] * len(spots) + [layout.WANTED] * len(ticks),
+                colors=[(235, 235, 235)] * len(spots) + [layout.GOAL] * len(ticks),
                 draw_order=2.0,
             ),
         )
 
     def forget(self) -> None:
-        """Another story begins: no trail leads from the old one to it."""
+        """Another daemon's states follow: no trail leads to them."""
         for trail in self._trails.values():
             trail.clear()
         self._object.lose()
         self._peak = self._floor
 
-    # The hand in its plane
-
     def state(self, state: dict[str, Any]) -> None:
-        """The hand, and its points on the landscape, as ``state`` tells them."""
+        """Draw the hand, and its points on the landscape."""
+        contacts = [_contact(state, name) for name in self._hand.fingers]
         lines: list[FingerLines] = []
-        contacts: list[Contact | None] = []
-        for index, name in enumerate(FINGERS):
-            if name not in self._hand.fingers:
-                continue
+        for name, contact in zip(self._hand.fingers, contacts, strict=True):
             q = number(state, name, "q")
-            contact = _contact(state, name)
-            contacts.append(contact)
-            lines.append(
-                finger_lines(self._hand.geometry, index, q if math.isfinite(q) else 0.0, contact)
-            )
+            q = q if math.isfinite(q) else 0.0
+            lines.append(finger_lines(self._hand.geometry, FINGERS.index(name), q, contact))
         self._fingers(lines)
         self._contacts(lines, contacts)
         self._held(state, contacts)
@@ -125,7 +115,7 @@ class Drawing:
                 strips.append(_view(spring))
                 colours.append((*_between(layout.SPRING, layout.LEVELS["error"], share), 200))
                 radii.append(0.25 + 0.35 * share)
-        self._log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
+        self._recording.log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
 
     def _contacts(self, lines: list[FingerLines], contacts: list[Contact | None]) -> None:
         faces, origins, vectors, labels, colours, normals = [], [], [], [], [], []
@@ -142,10 +132,12 @@ class Drawing:
             labels.append(f"{contact.force:.1f} N")
             colours.append(layout.COLOURS[name])
         strips = [*faces, *normals]
-        shades = [layout.OBJECT] * len(faces) + [layout.WANTED] * len(normals)
+        shades = [layout.OBJECT] * len(faces) + [layout.GOAL] * len(normals)
         radii = [1.0] * len(faces) + [0.35] * len(normals)
-        self._log("hand/contact", rr.LineStrips2D(strips, colors=shades, radii=radii, draw_order=2))
-        self._log(
+        self._recording.log(
+            "hand/contact", rr.LineStrips2D(strips, colors=shades, radii=radii, draw_order=2)
+        )
+        self._recording.log(
             "hand/force",
             rr.Arrows2D(
                 origins=origins,
@@ -174,18 +166,20 @@ class Drawing:
                 outlines.append(_view(outline))
         else:
             self._object.lose()
-        self._log("hand/object", rr.LineStrips2D(outlines, colors=[layout.OBJECT], radii=[0.7]))
+        self._recording.log(
+            "hand/object", rr.LineStrips2D(outlines, colors=[layout.OBJECT], radii=[0.7])
+        )
 
     def truth(self, truth: dict[str, Any]) -> None:
-        """The simulated object where it is, which only a simulation knows."""
+        """Draw the simulated object's true pose."""
         x, y = number(truth, "object", "x"), number(truth, "object", "y")
         angle = number(truth, "object", "angle")
         simulated = self._hand.settings.simulation
         outline = _outline(simulated.object_shape, simulated, x, y, angle)
         strips = [] if outline is None or not np.isfinite(outline).all() else [_view(outline)]
-        self._log("hand/simulated", rr.LineStrips2D(strips, colors=[layout.WANTED], radii=[0.3]))
-
-    # The landscape
+        self._recording.log(
+            "hand/simulated", rr.LineStrips2D(strips, colors=[layout.GOAL], radii=[0.3])
+        )
 
     def _points(self, contacts: list[Contact | None]) -> None:
         if self.landscape is None:
@@ -202,26 +196,25 @@ class Drawing:
             now.append(trails[-1][-1])
             colours.append(layout.COLOURS[name])
             shades.append((*layout.COLOURS[name], 170))
-        self._log(
+        self._recording.log(
             "landscape/trails",
             rr.LineStrips2D(trails, colors=shades, radii=rr.Radius.ui_points(1.4), draw_order=3.0),
         )
-        self._log(
+        self._recording.log(
             "landscape/now",
             rr.Points2D(now, colors=colours, radii=rr.Radius.ui_points(6.0), draw_order=4.0),
         )
 
-    # The pressure maps
-
     def frame(self, message: dict[str, Any], state: dict[str, Any] | None) -> None:
-        """One frame with its footprint. Raises ValueError when it is none of this hand's."""
+        """Draw a frame with its footprint. Raises ValueError when it isn't of this hand."""
         frame = read(TactileFrame, message)
         name = frame.finger
         if name not in self._hand.fingers:
             raise ValueError(f"a frame of finger {name!r}")
         scale = frame.scale if 0.0 < frame.scale < math.inf else 1.0
-        self._peak = max(_FADE * self._peak, self._floor, float(frame.counts.max()) * scale)
-        self._log(
+        peak = float(frame.counts.max()) * scale
+        self._peak = max(_FADE * self._peak, self._floor, peak)
+        self._recording.log(
             f"pressure/{name}/cells",
             rr.DepthImage(
                 frame.counts,
@@ -229,41 +222,42 @@ class Drawing:
                 depth_range=(0.0, self._peak / scale),
             ),
         )
-        grid = grid_of(message)
+        grid, radius = grid_of(message), self._hand.settings.tip.radius
         if grid is None:
             return
         if self._grids.get(name) != grid:
             self._grids[name] = grid
-            rim = tip_circle(grid, self._hand.settings.tip.radius)
-            colours = [(*layout.COLOURS[name], 120)]
             self._still(
                 f"pressure/{name}/rim",
-                rr.LineStrips2D([rim], colors=colours, radii=rr.Radius.ui_points(0.7)),
+                rr.LineStrips2D(
+                    [tip_circle(grid, radius)],
+                    colors=[(*layout.COLOURS[name], 120)],
+                    radii=rr.Radius.ui_points(0.7),
+                ),
             )
         contact = _contact(state, name)
         place = None
         if contact is not None:
             tilt_y = number(state, name, "tilt_y")
-            radius = self._hand.settings.tip.radius
             tilt_y = tilt_y if math.isfinite(tilt_y) else 0.0
             place = footprint(grid, radius, contact.d, contact.theta, tilt_y)
-        self._footprint(name, place, grid.shape, float(frame.counts.max()) * scale)
+        self._footprint(name, place, grid.shape, peak)
 
     def _footprint(
         self, name: str, place: Footprint | None, shape: tuple[int, int], peak: float
     ) -> None:
         outlines = [] if place is None else [place.outline]
-        self._log(
+        self._recording.log(
             f"pressure/{name}/footprint",
             rr.LineStrips2D(
                 outlines, colors=[(255, 255, 255)], radii=rr.Radius.ui_points(1.2), draw_order=2.0
             ),
         )
-        # Twice, with a white rim: on a hot map the right finger's orange would not be seen.
+        # With a white rim: the right finger's orange would be lost on a bright map.
         spots: list[Any] = [] if place is None else [place.centroid, place.centroid]
         sizes: list[Any] = [rr.Radius.ui_points(6.5), rr.Radius.ui_points(4.5)][: len(spots)]
         shades = [(255, 255, 255), layout.COLOURS[name]][: len(spots)]
-        self._log(
+        self._recording.log(
             f"pressure/{name}/centroid",
             rr.Points2D(
                 [*spots, (0.5 * shape[1], shape[0] - 1.5)],
@@ -275,15 +269,12 @@ class Drawing:
             ),
         )
 
-    def _log(self, entity: str, what: Any) -> None:
-        self._recording.log(entity, what)
-
     def _still(self, entity: str, what: Any) -> None:
         self._recording.log(entity, what, static=True)
 
 
 def _contact(state: dict[str, Any] | None, name: str) -> Contact | None:
-    """What ``state`` tells of one tip's contact, None where there is none."""
+    """One tip's contact, None where there is none."""
     if field(state, name, "contact") is not True:
         return None
     d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))

@@ -1,4 +1,4 @@
-"""Where a contact's footprint lies on the picture of a tactile frame: pure geometry.
+"""The geometry of a contact's footprint on the picture of a tactile frame.
 
 A picture's coordinates are cells: x along the columns, y along the rows, from the corner of the
 first cell. The footprint of displacement d and outward normal n, in the sensor's axes, is an
@@ -33,13 +33,13 @@ class Footprint:
 
 
 def grid_of(frame: dict[str, Any]) -> SensorGrid | None:
-    """The cells that a ``hand/tactile`` tells of, None where it tells no sound grid."""
+    """The grid of a ``hand/tactile``, None where its fields make none."""
     rows, cols = frame.get("rows"), frame.get("cols")
     pitch = number(frame, "pitch")
     if type(rows) is not int or type(cols) is not int:
         return None
-    told = [number(frame, key) for key in ("pitch_y", "centre_x", "centre_y", "rotation")]
-    pitch_y, x, y, rotation = (value if math.isfinite(value) else 0.0 for value in told)
+    more = [number(frame, key) for key in ("pitch_y", "centre_x", "centre_y", "rotation")]
+    pitch_y, x, y, rotation = (value if math.isfinite(value) else 0.0 for value in more)
     try:
         return SensorGrid(rows, cols, (pitch, pitch_y or pitch), (x, y), rotation)
     except ValueError:
@@ -49,7 +49,7 @@ def grid_of(frame: dict[str, Any]) -> SensorGrid | None:
 def footprint(
     grid: SensorGrid, radius: float, d: float, tilt_x: float, tilt_y: float
 ) -> Footprint | None:
-    """The footprint of a contact on ``grid``'s picture; None where these are no contact's numbers.
+    """The footprint of a contact on ``grid``'s picture; None for numbers of no contact.
 
     ``radius`` and ``d`` [m], tilts [rad] in the finger's axes.
     """

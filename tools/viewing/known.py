@@ -1,13 +1,11 @@
-"""What the viewer knows of the hand beside its states: settings and what was commanded.
+"""The hand by its settings, from ``hand/settings``.
 
-Settings come from ``hand/settings``. What this version can't read in them, since another wrote
-them, is left at its default, so that the rest is shown.
+Keys of another version that can't be read keep their defaults, so that the rest is shown.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 from pydantic import ValidationError
@@ -19,15 +17,13 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
-from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing.landscape import Landscape
 
-_PICTURE = 1e-6  # relative error of a table that is only looked at
-_GRIPPING = ("grasping", "holding", "rotating")
+_TOLERANCE = 1e-6  # relative error of a table for a picture
 
 
 class Hand:
-    """The hand by its settings: who takes part, its lengths, its landscape."""
+    """Its fingers, geometry and energy landscape."""
 
     def __init__(self, settings: Settings | None = None) -> None:
         self.settings = settings or Settings()
@@ -47,14 +43,14 @@ class Hand:
         """The energy landscape of the settings' material; None where no table can be made of it."""
         try:
             material, tip = make_material(self.settings.material), make_tip(self.settings)
-            table = ContactTable.build(tip, material, tolerance=_PICTURE)
+            table = ContactTable.build(tip, material, tolerance=_TOLERANCE)
         except (SettingsError, TableError):
             return None
         return Landscape(table, tip.radius, self.settings.safety.d_max)
 
 
 def warm_up() -> None:
-    """What takes long when it is done first, before messages wait for it."""
+    """Do what takes long the first time, before messages wait for it."""
     landscape = Hand().landscape()
     if landscape is not None:
         landscape.picture()
@@ -84,41 +80,3 @@ def _drop(sections: object, place: list[str]) -> bool:
     for section in place[:-1]:
         sections = sections.get(section) if isinstance(sections, dict) else None
     return isinstance(sections, dict) and sections.pop(place[-1] if place else "", None) is not None
-
-
-class Wanted:
-    """What the hand goes to: force [N] of the tips, angle [rad] of the object.
-
-    What the state tells; where an older daemon's does not, what was last commanded. NaN while
-    nothing is wanted.
-    """
-
-    def __init__(self) -> None:
-        self._force = math.nan
-        self._angle = math.nan
-
-    def take(self, message: dict[str, Any], hand: Hand) -> None:
-        """One more command that was answered."""
-        if message.get("ok") is not True:
-            return
-        try:
-            request = json.loads(message.get("request") or "{}")
-        except (TypeError, ValueError):
-            return
-        command = text(message, "command")
-        if command == "grasp":
-            force = number(request, "force")
-            self._force = force if math.isfinite(force) else hand.settings.control.force_default
-            self._angle = math.nan
-        elif command == "rotate":
-            self._angle = number(request, "angle")
-        elif command not in ("set", "tare", "status"):
-            self._force = self._angle = math.nan
-
-    def of(self, state: dict[str, Any]) -> tuple[float, float]:
-        """The wanted force and angle at a state."""
-        if "goal_force" in state:
-            return number(state, "goal_force"), number(state, "goal_angle")
-        if text(state, "mode") in _GRIPPING:
-            return self._force, self._angle
-        return math.nan, math.nan

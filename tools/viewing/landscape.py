@@ -44,7 +44,7 @@ class Landscape:
         self._table = table
         self._radius = radius
         self.d_end = min(d_end, 0.95 * radius)
-        # Force and energy upright, for the energy that goes with a wanted force.
+        # Force and energy upright: `energy_of` interpolates them.
         self._d = np.linspace(1e-6 * radius, self.d_end, 400)
         upright = table(self._d, np.zeros_like(self._d))
         self._force, self._energy = np.asarray(upright.force), np.asarray(upright.energy)

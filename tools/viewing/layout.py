@@ -1,6 +1,6 @@
 """The viewer's layout, and the colours and names of what is in it.
 
-The left finger is blue, the right one orange, what is wanted grey: told apart by colour-blind
+The left finger is blue, the right one orange, goals are grey: distinguishable for colour-blind
 people, on light and on dark ground.
 """
 
@@ -19,7 +19,7 @@ TIME = "time"  # the timeline: Unix time of the daemon
 SECONDS = 12.0  # of the past in the plots
 
 COLOURS = {"left": (51, 136, 221), "right": (230, 126, 0)}
-WANTED = (140, 140, 140)
+GOAL = (140, 140, 140)
 OBJECT = (0, 158, 115)
 LATE = (204, 96, 150)
 SPRING = (150, 150, 150)
@@ -40,7 +40,7 @@ Line = tuple[str, tuple[int, int, int], float]  # name, colour, width
 
 
 class Plot:
-    """One plot: its entity, its title, and its lines' names, colours and widths."""
+    """One plot: entity, title, and the lines' names, colours and widths."""
 
     def __init__(self, name: str, title: str, lines: Sequence[Line]):
         self.entity = f"plots/{name}"
@@ -48,12 +48,12 @@ class Plot:
         self._lines = lines
 
     def style(self) -> Any:
-        """What Rerun is told of the lines once."""
+        """The lines' names, colours and widths for Rerun."""
         names, colours, widths = zip(*self._lines, strict=True)
         return rr.SeriesLines(names=names, colors=colours, widths=widths)
 
     def view(self) -> rrb.TimeSeriesView:
-        """Its place in the layout: the last seconds, the axis as the data wants."""
+        """Its view: the last seconds, the axis by the data."""
         return rrb.TimeSeriesView(
             origin=self.entity,
             name=self.title,
@@ -65,17 +65,17 @@ class Plot:
 def plots(hand: Hand) -> dict[str, Plot]:
     """The plots of a hand, by name; each has a line for each finger that takes part."""
     fingers: list[Line] = [(name, COLOURS[name], 2.0) for name in hand.fingers]
-    goals: list[Line] = [(f"{name} wanted", _pale(COLOURS[name]), 1.0) for name in hand.fingers]
-    wanted: list[Line] = [("wanted", WANTED, 1.5)]
+    goals: list[Line] = [(f"{name} goal", _pale(COLOURS[name]), 1.0) for name in hand.fingers]
+    goal: list[Line] = [("goal", GOAL, 1.5)]
     shown = {
-        "force": Plot("force", "Force [N]", fingers + wanted),
-        "energy": Plot("energy", "Energy [mJ]", fingers + wanted),
+        "force": Plot("force", "Force [N]", fingers + goal),
+        "energy": Plot("energy", "Energy [mJ]", fingers + goal),
         "d": Plot("d", "Displacement d [mm]", fingers),
         "theta": Plot("theta", "Tilt θ [°]", fingers),
         "tick": Plot("tick", "Tick [µs]", [("work", OBJECT, 1.5), ("late", LATE, 1.5)]),
     }
     if len(hand.fingers) == 2:
-        shown["object"] = Plot("object", "Object's angle [°]", [("object", OBJECT, 2.0), *wanted])
+        shown["object"] = Plot("object", "Object's angle [°]", [("object", OBJECT, 2.0), *goal])
     if hand.servos:
         shown["q"] = Plot("q", "Joints [°]", fingers + goals)
         shown["current"] = Plot("current", "Currents [A]", fingers + goals)
@@ -83,7 +83,7 @@ def plots(hand: Hand) -> dict[str, Plot]:
 
 
 def blueprint(hand: Hand) -> rrb.Blueprint:
-    """The layout for a hand: what its scene lacks has no place in it."""
+    """The layout for a hand, without views for what its scene lacks."""
     shown = plots(hand)
     pictures: list[Any] = [_hand_view(hand)]
     shares = [1.9]
@@ -153,7 +153,7 @@ def _hand_view(hand: Hand) -> rrb.Spatial2DView:
 
 
 def _event_columns() -> rrb.TextLogColumns:
-    """Level and text; the time of day stands in the text, where it is not cut off."""
+    """Level and text; the time of day is in the text, where it is not cut off."""
     return rrb.TextLogColumns(
         timeline_columns=[rrb.encodings.TimelineColumn(TIME, visible=False)],
         text_log_columns=["LogLevel", "Body"],

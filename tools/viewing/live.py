@@ -1,8 +1,8 @@
-"""The stream's sockets as the viewer reads them: all that waits at once, and never the loop's time.
+"""The viewer's sockets.
 
-While a picture is drawn nothing is read, on a busy machine for seconds. What comes meanwhile waits
-in libzmq's own queues, which its own thread fills: long ones for small messages, of which every one
-counts, a shorter one for frames, of which the newest is drawn. Only what these don't hold is lost.
+While a picture is drawn nothing is read, on a busy machine for seconds. Messages wait meanwhile in
+libzmq's queues: a long one for small messages, of which every one counts, a shorter one for frames,
+of which the newest is drawn. Only what these don't hold is lost.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from softfinger.daemon.client.connection import drain, subscribe, unpack
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.daemon.wire.schema import TACTILE
 from softfinger.tools.viewing.bridge import TOPICS, Bridge
-from softfinger.tools.viewing.errors import ViewError
+from softfinger.tools.viewing.page import ViewError
 
 _QUEUE = 40_000  # messages: 40 MB, 20 s of state and truth at 1 kHz
 _FRAMES = 1_000  # frames: 4 MB, 5 s of two sensors at 100 Hz; 131 MB of the largest grid
@@ -45,7 +45,7 @@ class LiveStream:
             self._poller.register(socket, zmq.POLLIN)
 
     def drain(self, bridge: Bridge, until: float) -> int:
-        """Hand on what comes until the monotonic time ``until`` [s]; how many messages it was."""
+        """Give ``bridge`` the messages until the monotonic time ``until`` [s]; their number."""
         count = 0
         while True:
             left = until - time.monotonic()

@@ -1,8 +1,7 @@
-"""The web viewer's page on the loopback, handed on from the viewer's own server.
+"""The web viewer's page on the loopback: a proxy of the viewer's own server.
 
-Handed on, since the viewer's page asks other machines for fonts, news and usage statistics: a robot
-may have no such network, and a lab need not tell. What is handed on carries a policy by which the
-browser reaches this machine only.
+The viewer's page asks other machines for fonts, news and usage statistics. The proxy adds a policy
+by which the browser reaches this machine only.
 """
 
 from __future__ import annotations
@@ -14,12 +13,16 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import quote, urlsplit
 
-from softfinger.tools.viewing.errors import ViewError
+from softfinger.daemon.errors import SoftfingerError
 
-_LOOPBACK = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 _FILE = re.compile(r"/([\w-]+(\.[\w-]+)*)?")
 _PASSED_ON = ("Content-Type", "Content-Length", "rerun-final-length")
 _HOSTS = ("127.0.0.1", "localhost")
+
+
+class ViewError(SoftfingerError):
+    """Nothing can be shown. The message says why, and what to do."""
 
 
 class Page:
@@ -33,7 +36,7 @@ class Page:
         """
         handler = type("Handler", (_Handler,), {"source": source, "receiver": receiver})
         try:
-            self._server = ThreadingHTTPServer((_LOOPBACK, port), handler)
+            self._server = ThreadingHTTPServer((LOOPBACK, port), handler)
         except (OSError, OverflowError) as error:
             raise ViewError(f"port {port} can't be used: {error}") from None
         self._server.daemon_threads = True
@@ -46,11 +49,6 @@ class Page:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(5.0)
-
-
-def viewer_address(port: int) -> str:
-    """What a person opens."""
-    return f"http://{_LOOPBACK}:{port}/"
 
 
 def policy(receiver: int) -> str:
@@ -72,7 +70,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         target = urlsplit(self.path)
-        if host not in _HOSTS:  # a foreign page that had its name point here
+        if host not in _HOSTS:  # another site's name that points here
             self.send_error(403)
         elif not _FILE.fullmatch(target.path):
             self.send_error(404)
@@ -82,10 +80,10 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Location", f"/?url={data}&persist=0&notebook=0&hide_welcome_screen")
             self.end_headers()
         else:
-            self._hand_on(target.path)
+            self._forward(target.path)
 
-    def _hand_on(self, path: str) -> None:
-        connection = http.client.HTTPConnection(_LOOPBACK, self.source, timeout=self.timeout)
+    def _forward(self, path: str) -> None:
+        connection = http.client.HTTPConnection(LOOPBACK, self.source, timeout=self.timeout)
         try:
             connection.request("GET", path)
             answer = connection.getresponse()
@@ -104,4 +102,4 @@ class _Handler(BaseHTTPRequestHandler):
             connection.close()
 
     def log_message(self, *_: object) -> None:
-        """Nothing: the terminal is the person's."""
+        """Print nothing."""

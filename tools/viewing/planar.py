@@ -1,8 +1,8 @@
 """The planar hand as lines to draw: fingers, soft tips with their springs, object, forces.
 
-Pure geometry, in the hand's plane: m, x from the left pivot to the right one, y away from the palm.
-A tip's own axes are x along its base and z out of it; the object's face stands at
-``x sin θ + z cos θ = a − d`` in them (`hand.geometry` has where the tips are).
+In the hand's plane [m]: x from the left pivot to the right one, y away from the palm. A tip's own
+axes are x along its base and z out of it; in them the object's face is
+``x sin θ + z cos θ = a − d``. `hand.geometry` has the tips' places.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ANGLES = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 
 @dataclass(frozen=True)
 class Contact:
-    """What is felt at one tip: d [m], θ [rad], F [N]."""
+    """One tip's contact: d [m], θ [rad], F [N]."""
 
     d: float
     theta: float
@@ -99,10 +99,10 @@ def tip_axes(finger: int, q: float) -> tuple[FloatArray, FloatArray]:
 
 
 class HeldObject:
-    """Where the object between both tips is, from contact to contact.
+    """The pose of the object between both tips.
 
-    Across its faces the contacts tell it. Along them nothing does: it is taken to stand centred on
-    the contacts when both begin, and to roll on the tips without slip from then on,
+    Across its faces it follows from the contacts. Along them it is taken to be centred on the
+    contacts when both begin, and to roll on the tips without slip afterwards:
     ṡ1 = (a − d1) θ̇1, ṡ2 = −(a − d2) θ̇2, with s the tips' places along its faces.
     """
 
@@ -112,7 +112,7 @@ class HeldObject:
         self._theta = np.zeros(2)
 
     def lose(self) -> None:
-        """It is held no more."""
+        """The object is no longer held."""
         self._along = None
 
     def outline(

@@ -10,7 +10,7 @@ from softfinger.tools.paper import style
 
 
 def draw(tables: list[Table], path: Path) -> None:
-    """Draw the tables that have an error column. Raises NoMatplotlib without the extra ``plot``."""
+    """Draw the tables that have an error column. Raises MissingExtra without the extra ``plot``."""
     drawn = [table for table in tables if table.error]
     columns = min(len(drawn), 3)
     rows = math.ceil(len(drawn) / columns)

@@ -1,0 +1,268 @@
+"""The steps of a calibration: from loads to what is written into the file.
+
+The mathematics is in `kinematics.estimation.calibration`, the file in
+`daemon.perception.calibration_file`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.perception.calibration_file import (
+    Calibration,
+    CalibrationFileError,
+    CentreStep,
+    Converter,
+    CurveStep,
+    EquilibrateStep,
+    ModulusStep,
+    TareStep,
+    difference,
+    load_calibration,
+    now,
+    sensor_of,
+)
+from softfinger.daemon.perception.finger_model import calibrated_grid
+from softfinger.daemon.profile.factory import make_material, make_tip
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.estimation.calibration import (
+    CalibrationError,
+    cleared,
+    equilibrate,
+    fit_centre,
+    fit_curve,
+    fit_law,
+    fit_modulus,
+    tare,
+)
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.calibration.calibration_frames import Loads
+
+FloatArray = NDArray[np.float64]
+Done = tuple[Calibration, str, dict[str, Any]]  # with the line to print and the picture's data
+
+
+def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
+    """The file's calibration, or a new one. Raises CalibrationFileError for another sensor's."""
+    sensor = sensor_of(settings, FINGERS.index(arguments.finger))
+    if not arguments.file.exists():
+        return Calibration(sensor=sensor, date=now())
+    calibration = load_calibration(arguments.file)
+    wrong = difference(calibration.sensor, sensor)
+    if wrong:
+        raise CalibrationFileError(
+            f"{arguments.file}: this is the calibration of another sensor: {wrong}"
+        )
+    return calibration
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step's inputs, and what several steps compute from them."""
+
+    arguments: argparse.Namespace
+    settings: Settings
+    calibration: Calibration
+    loads: Loads
+
+    @cached_property
+    def converter(self) -> Converter:
+        """From counts to pressure, by the steps done so far."""
+        return Converter(self.calibration, self.settings.tactile.pascal_per_count)
+
+    @property
+    def theta(self) -> FloatArray:
+        """Each load's tilt [rad]."""
+        return self.loads.truths.get("theta", np.zeros(len(self.loads.frames)))
+
+    @cached_property
+    def readings(self) -> list[FloatArray]:
+        """Each load's mean reading, cleared of noise far from the contact."""
+        noise = self.calibration.tare.noise if self.calibration.tare else 0.0
+        spread = np.full(self.converter.zero.shape, noise)
+        return [
+            cleared(self.converter.readings(frames.mean(axis=0)), spread, len(frames))
+            for frames in self.loads.frames
+        ]
+
+    @cached_property
+    def pressures(self) -> FloatArray:
+        """Each load's mean pressure [Pa], [loads, rows, cols]."""
+        return np.stack(
+            [
+                np.mean([self.converter(frame) for frame in frames], axis=0)
+                for frames in self.loads.frames
+            ]
+        )
+
+    @property
+    def cell_area(self) -> float:
+        """[m²]"""
+        x, y = self.calibration.sensor.pitch
+        return x * y
+
+    @property
+    def plain_grid(self) -> SensorGrid:
+        """The sensor's grid, centred and not rotated."""
+        sensor = self.calibration.sensor
+        return SensorGrid(sensor.rows, sensor.cols, sensor.pitch)
+
+    def result(self, **steps: Any) -> Calibration:
+        """The calibration with these steps."""
+        return self.calibration.model_copy(update={"date": now(), **steps})
+
+
+def done(step: Step) -> Done:
+    """Do the step. Raises CalibrationError."""
+    truths = step.loads.truths
+    if not step.loads.frames:
+        raise CalibrationError("no frame with d above 0 in this run")
+    for name, values in truths.items():
+        if not np.isfinite(values).all():
+            raise CalibrationError(f"{name}: a value that is not finite")
+    radius = step.settings.tip.radius
+    if "d" in truths and (deepest := float(truths["d"].max())) > radius:
+        raise CalibrationError(
+            f"d: {deepest * 1e3:g} mm is more than the tip's radius, {radius * 1e3:g} mm"
+        )
+    if "theta" in truths and (most := float(np.abs(truths["theta"]).max())) >= 0.5 * math.pi:
+        raise CalibrationError(f"theta: {math.degrees(most):g}° is no tilt of a press")
+    return _STEPS[step.arguments.step](step)
+
+
+def _tare(step: Step) -> Done:
+    found = tare(np.concatenate(step.loads.frames))
+    noise = float(np.median(found.noise))
+    count = sum(map(len, step.loads.frames))
+    result = TareStep(date=now(), zero=found.zero.tolist(), noise=noise, frames=count)
+    line = f"{count} frames, zero up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
+    return step.result(tare=result), line, {"zero": found.zero, "noise": found.noise}
+
+
+def _equilibrate(step: Step) -> Done:
+    found = equilibrate(step.loads.frames, step.converter.zero)
+    dead = int(np.count_nonzero(found.gain == 0.0))
+    result = EquilibrateStep(
+        date=now(),
+        gain=found.gain.tolist(),
+        dead=dead,
+        spread=found.spread,
+        residual=found.residual,
+    )
+    line = (
+        f"{len(step.loads.frames)} pressures, cells differ by {found.spread:.2%} rms before and "
+        f"{found.residual:.2%} after; {dead} dead"
+    )
+    calibration = step.result(equilibrate=result, curve=None, modulus=None)
+    return calibration, line, {"gain": found.gain}
+
+
+def _curve(step: Step) -> Done:
+    truths, sensor = step.loads.truths, step.calibration.sensor
+    force = truths.get("force")
+    if force is None:
+        d = truths.get("d")
+        if d is None:
+            raise CalibrationError("curve: expected --force or --d, or a run that has them")
+        # The force by the profile's material, over the whole footprint.
+        tip, material = make_tip(step.settings), make_material(step.settings.material)
+        pressures = [
+            step.plain_grid.pressure(tip, material, float(x), float(theta))
+            for x, theta in zip(d, step.theta, strict=True)
+        ]
+        force = np.array([each.sum() * step.cell_area for each in pressures])
+    for k, frames in enumerate(step.loads.frames):
+        if (frames >= sensor.full_count).any():
+            raise CalibrationError(f"curve: load {k + 1} saturates a cell, which hides its force")
+    gains = step.calibration.equilibrate
+    full = float(sensor.full_count) * max(map(max, gains.gain) if gains else [1.0])
+    found = fit_curve(step.arguments.kind, step.readings, force, step.cell_area, full)
+    result = CurveStep(
+        date=now(), kind=found.kind, coefficients=found.coefficients, residual=found.residual
+    )
+    line = f"{found.kind} from {len(force)} loads, forces within {found.residual:.2%} rms"
+    picture = {"force": force, "errors": found.errors}
+    return step.result(curve=result, modulus=None), line, picture
+
+
+def _centre(step: Step) -> Done:
+    found = fit_centre(
+        step.pressures,
+        step.theta,
+        make_tip(step.settings),
+        make_material(step.settings.material),
+        step.plain_grid,
+        step.settings.tactile.noise,
+        step.converter.live,
+    )
+    result = CentreStep(
+        date=now(),
+        centre=found.centre,
+        rotation=found.rotation,
+        scale=found.scale,
+        residual=found.residual,
+    )
+    x, y = found.centre
+    rotation = (
+        "rotation not measured: no press was tilted"
+        if found.rotation is None
+        else f"rotation {math.degrees(found.rotation):.2f}°, travel {found.scale:.3f} of the model"
+    )
+    line = (
+        f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) mm; {rotation}; {found.residual * 1e6:.0f} µm rms"
+    )
+    return step.result(centre=result), line, {"theta": step.theta, "centre": found}
+
+
+def _modulus(step: Step) -> Done:
+    d, theta, sensor = step.loads.truths.get("d"), step.theta, step.calibration.sensor
+    if d is None:
+        raise CalibrationError("modulus: expected --d, or a run that has d")
+    pressed = zip(step.pressures, step.readings, strict=True)
+    force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
+    full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
+    whole = ~full.any(axis=(1, 2))  # a saturated cell hides a part of the force
+    found = fit_modulus(d[whole], theta[whole], force[whole])
+    line = (
+        f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} frames, zero of d at "
+        f"{found.offset * 1e3:.3f} mm, force within {found.residual:.2%} rms"
+    )
+    if not whole.all():
+        line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
+    strain: list[float] = []
+    stress: list[float] = []
+    if step.arguments.law:
+        grid = calibrated_grid(step.settings, FINGERS.index(sensor.finger), step.calibration)
+        live = step.converter.live & ~full
+        tip = make_tip(step.settings)
+        law = fit_law(step.pressures, d - found.offset, theta, tip, grid, live)
+        strain, stress = law.strain.tolist(), law.stress.tolist()
+        line += f"; law of {len(strain)} points, cells {law.residual:.0f} Pa rms from it"
+    result = ModulusStep(
+        date=now(),
+        modulus=found.modulus,
+        strain=strain,
+        stress=stress,
+        offset=found.offset,
+        residual=found.residual,
+    )
+    d, theta, force = d[whole], theta[whole], force[whole]
+    picture = {"d": d, "theta": theta, "force": force, "fit": found, "law": (strain, stress)}
+    return step.result(modulus=result), line, picture
+
+
+_STEPS = {
+    "tare": _tare,
+    "equilibrate": _equilibrate,
+    "curve": _curve,
+    "centre": _centre,
+    "modulus": _modulus,
+}

@@ -1,0 +1,186 @@
+"""Subcommands that run beside the daemon as its child processes: the monitor and the recorder.
+
+Each holds one end of a pipe whose other end is the daemon's alone: however the daemon ends, the
+child sees the pipe close and ends too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from softfinger.daemon.errors import SoftfingerError
+
+LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # what a killed page could not write
+_PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
+
+
+class NoRecorder(SoftfingerError):
+    """The recorder did not start. The message is the recorder's."""
+
+
+class _Lifeline:
+    """The pipe between this process and a child of it."""
+
+    def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
+        """Start ``softfinger`` with ``words``, as a client with ``keys`` if there are any."""
+        reads, self._ours = os.pipe()
+        # -P: a folder named tools where the daemon was started is not ours.
+        command = [sys.executable, "-P", "-m", "softfinger", *words, "--lifeline", str(reads)]
+        try:
+            return subprocess.Popen(
+                [*command, *(("--keys", keys) if keys else ())], pass_fds=(reads,), **options
+            )
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            os.close(reads)
+
+    def close(self) -> None:
+        """Let the child end."""
+        if self._ours >= 0:
+            os.close(self._ours)
+            self._ours = -1
+
+
+class MonitorBeside:
+    """The monitor on this process's terminal, which is the page's until `close`; a context.
+
+    ``on_end`` is called once, from a signal handler in the main thread, when the monitor has ended:
+    with ``on_end=loop.end`` the person's q ends the daemon.
+    """
+
+    def __init__(
+        self,
+        stream: str,
+        commands: str,
+        keys: str = "",
+        on_end: Callable[[], None] | None = None,
+    ) -> None:
+        self._attributes: list[Any] | None = None
+        # A standard output that was closed, or is no file, is no terminal either.
+        with contextlib.suppress(termios.error, AttributeError, OSError, ValueError):
+            self._terminal = sys.stdout.fileno()
+            self._attributes = termios.tcgetattr(self._terminal)
+        self._lifeline = _Lifeline()
+        words = ["monitor", "--state", stream, "--commands", commands]
+        self.process = self._lifeline.start(words, keys)
+        if on_end is not None:
+            self._call_at_end(on_end)
+
+    def _call_at_end(self, on_end: Callable[[], None]) -> None:
+        called = False
+
+        def child_changed(*_: Any) -> None:  # also when the child was stopped or continued
+            nonlocal called
+            if not called and self.process.poll() is not None:
+                called = True
+                on_end()
+
+        signal.signal(signal.SIGCHLD, child_changed)
+        child_changed()  # it may have ended before there was a handler
+
+    def close(self, patience: float = 2.0) -> None:
+        """End the monitor if it still runs, and wait until the terminal is back. Never raises."""
+        self._lifeline.close()
+        for end in (self.process.terminate, self.process.kill):
+            try:
+                self.process.wait(patience)
+                break
+            except subprocess.TimeoutExpired:
+                end()
+        if self.process.wait() < 0 and self._attributes is not None:  # killed: it left the page on
+            with contextlib.suppress(OSError, termios.error):
+                termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
+                os.write(self._terminal, LEAVE.encode())
+
+    def __enter__(self) -> MonitorBeside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class RecorderBeside:
+    """A recording of everything that ``address`` publishes, from the first message on.
+
+    ``failed`` once it is known to be incomplete.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        address: str,
+        subscribed: Callable[[], bool],
+        on_end: Callable[[str], None],
+        keys: str = "",
+    ) -> None:
+        """Start it and wait until ``subscribed()``. Raises NoRecorder.
+
+        ``on_end`` is called from a thread, with the reason, when the recorder ends before `close`.
+        """
+        self.failed = False
+        self._path = path
+        self._on_end = on_end
+        self._closing = False
+        self._said = ""
+        self._lifeline = _Lifeline()
+        # A session of its own: Ctrl-C is for the daemon, whose last messages are recorded too.
+        self._process = self._lifeline.start(
+            ["record", str(path), "--topics", "all", "--address", address],
+            keys,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        deadline = time.monotonic() + _PATIENCE
+        while not subscribed():
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self._process.kill()
+                said = " ".join(part.strip() for part in self._process.communicate())
+                raise NoRecorder(said.strip() or "the recorder did not start")
+            time.sleep(0.01)
+        self._watch = threading.Thread(target=self._wait, name="recorder", daemon=True)
+        self._watch.start()
+
+    def _wait(self) -> None:
+        """Sleep until the recorder has ended, and report it when that was not by `close`."""
+        self._said = "".join(self._process.communicate()).strip()
+        self.failed = not self._closing or self._process.returncode != 0
+        if self._closing:
+            return
+        why = self._said.splitlines()[-1:] or ["it ended"]
+        if self._process.returncode < 0:
+            name = signal.Signals(-self._process.returncode).name
+            why = [f"ended by {name}; `softfinger record --recover {self._path}` closes its file"]
+        self._on_end(f"the recorder has ended, nothing is recorded any more: {why[0]}")
+
+    def close(self) -> str:
+        """Have the file closed; the recorder's own summary."""
+        self._closing = True
+        if self._watch.is_alive():
+            self._process.send_signal(signal.SIGTERM)
+        self._lifeline.close()
+        self._watch.join(_PATIENCE)
+        if self._watch.is_alive():
+            self._process.kill()
+            self._watch.join()
+        return self._said
+
+    def __enter__(self) -> RecorderBeside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._closing:
+            self.close()
