@@ -313,9 +313,3 @@ def _clock() -> str:
 def _say(line: str) -> None:
     data = f"{line}\n".encode(sys.stdout.encoding or "utf-8", "replace")
     os.write(sys.stdout.fileno(), data)
-
-
-if __name__ == "__main__":
-    _parser = argparse.ArgumentParser(prog="softfinger monitor")
-    add_arguments(_parser)
-    sys.exit(run(_parser.parse_args()))

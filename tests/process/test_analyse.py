@@ -153,4 +153,4 @@ def test_wrong_settings_and_a_missing_extra(tmp_path: Path, counts: np.ndarray) 
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
     )
     assert told.returncode == 0  # the numbers are there
-    assert "pip install '.[plot]'" in told.stderr
+    assert "pip install 'softfinger[plot]'" in told.stderr

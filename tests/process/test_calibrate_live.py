@@ -172,7 +172,7 @@ def test_without_matplotlib_the_step_is_done_and_the_missing_picture_told(
     assert load_calibration(tmp_path / "a.json").tare.frames == 10
     picture = ["--plot", str(tmp_path / "a.png")]
     assert main(["calibrate", "tare", str(tmp_path / "b.json"), *words, *picture]) == 1
-    assert "pip install '.[plot]'" in capsys.readouterr().err
+    assert "pip install 'softfinger[plot]'" in capsys.readouterr().err
     assert not (tmp_path / "b.json").exists()
 
 

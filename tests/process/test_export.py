@@ -117,4 +117,4 @@ def test_a_missing_extra_is_named(path: Path, tmp_path: Path) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 1
-    assert "pip install '.[parquet]'" in done.stderr
+    assert "pip install 'softfinger[parquet]'" in done.stderr

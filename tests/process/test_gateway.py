@@ -26,7 +26,7 @@ from softfinger.daemon.wire.keys import make_keys
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import until
-from tests.harness.daemon_process import Running, softfinger
+from tests.harness.daemon_process import SOFTFINGER, Running, softfinger
 from tests.harness.terminal_process import TerminalProcess
 from tests.harness.zmtp_client import RawClient
 from tests.process.test_strangers import place
@@ -202,7 +202,7 @@ def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, 
 def test_the_live_page_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
     stream, commands = addresses
     where = ["--state", stream, "--commands", commands]
-    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
+    with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("DISARMED")
         send(commands, {"command": "arm"}, timeout=60.0)
         page.shows("ARMED")

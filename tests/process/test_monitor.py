@@ -17,9 +17,9 @@ import pytest
 
 from softfinger.daemon.client import Hand
 from tests.conftest import until
-from tests.harness.daemon_process import Running
+from tests.harness.daemon_process import SOFTFINGER, Running
 from tests.harness.descendants import ending
-from tests.harness.fake_daemon import FakeDaemon
+from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
 
 NOBODY = "tcp://127.0.0.1:1"  # nothing listens there
@@ -33,7 +33,7 @@ def fake() -> Iterator[FakeDaemon]:
 
 def command(fake: FakeDaemon, *more: str) -> list[str]:
     where = ["--state", fake.state_address, "--commands", fake.command_address]
-    return [sys.executable, "-m", "softfinger.tools.monitor", *where, *more]
+    return [*SOFTFINGER, "monitor", *where, *more]
 
 
 def test_page_shows_the_hand(fake: FakeDaemon) -> None:
@@ -54,7 +54,7 @@ def test_page_shows_the_hand(fake: FakeDaemon) -> None:
 def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
     call = command(fake, *(["--duration", "1.2"] if how == "duration" else []))
     if how == "exception":
-        call[1:3] = ["-c", BREAKS_AT_THE_TENTH_PAGE]
+        call[1:4] = ["-c", BREAKS_AT_THE_TENTH_PAGE]
     with TerminalProcess(call) as page:
         if how not in ("exception", "duration"):
             page.shows("HOLDING")
@@ -207,7 +207,7 @@ def test_beside_another_commander_of_a_real_daemon(
     stream, commands = addresses
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
     where = ["--state", stream, "--commands", commands]
-    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
+    with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("DISARMED", "running, disarmed")  # told before the page was there
         page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook") as hand:
@@ -243,7 +243,7 @@ def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:
 
 def test_commands_without_a_daemon() -> None:
     where = ["--state", NOBODY, "--commands", NOBODY]
-    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
+    with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("waiting for a daemon", "no stream yet", "—")
         page.type(b"a" * 12 + b" ")
         page.shows("stop: no answer")
@@ -281,6 +281,7 @@ def test_resized(fake: FakeDaemon) -> None:
 
 
 def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
+    fake.changes = {"left": finger(0.0, 0) | {"force": 12.34}}
     process = subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     with ending(process) as plain:
         assert plain.stdout is not None
@@ -291,8 +292,7 @@ def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
                 fake.send_event("mode", "grasping → holding", "warning")
         text = "".join(lines)
         assert "\x1b" not in text
-        assert "left 1" in text
-        assert "N 3.21 mm" in text
+        assert "left 12.34 N 3.21 mm" in text
         assert "goal 10.0 N  object +5.0°" in text
         assert "tick 500 Hz" in text
         assert any("warning mode: grasping → holding" in line for line in lines)
@@ -313,7 +313,7 @@ def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
 
 def test_no_wait_without_a_daemon() -> None:
     where = ["--state", NOBODY, "--commands", NOBODY, "--no-wait"]
-    with TerminalProcess([sys.executable, "-m", "softfinger.tools.monitor", *where]) as page:
+    with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         assert page.ended() == 1
         assert page.is_restored()
         assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
@@ -340,10 +340,10 @@ def test_no_wait_ends_with_the_stream(fake: FakeDaemon) -> None:
 
 DAEMON = """
 import signal, sys, threading
-from softfinger.tools.processes.monitor_beside import start_beside
+from softfinger.tools.processes.beside import MonitorBeside
 over = threading.Event()
 signal.signal(signal.SIGINT, lambda *_: over.set())
-with start_beside(sys.argv[1], sys.argv[2], on_end=over.set) as page:
+with MonitorBeside(sys.argv[1], sys.argv[2], on_end=over.set) as page:
     open(sys.argv[3], "w").write(str(page.process.pid))
     over.wait(300.0)
 print("ended", over.is_set(), flush=True)

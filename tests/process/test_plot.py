@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from softfinger.daemon.wire import schema
 from softfinger.tools import plot
 from softfinger.tools.analysis import plots, plots_model
 from softfinger.tools.analysis.plots_data import MODES, Missing, Run, load_run
+from softfinger.tools.cli import main
 from softfinger.tools.paper import style
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.writer import RecordingWriter
@@ -77,9 +77,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
     """``softfinger plot`` in this process: exit status and what it says on standard error."""
 
     def plotted(*words: object) -> tuple[int, str]:
-        parser = argparse.ArgumentParser()
-        plot.add_arguments(parser)
-        status = plot.run(parser.parse_args([str(word) for word in words]))
+        status = main(["plot", *map(str, words)])
         return status, capsys.readouterr().err
 
     return plotted
@@ -308,5 +306,5 @@ def test_without_matplotlib_it_says_what_to_install(path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
-    assert "pip install '.[plot]'" in done.stderr
+    assert "pip install 'softfinger[plot]'" in done.stderr
     assert done.stdout == ""

@@ -153,7 +153,7 @@ def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
     path.write_text("mine")
     done = softfinger("run", "--config", str(profile("")), "--record", str(path))
     assert done.returncode == 1
-    assert "is there already; nothing is written over it" in done.stderr
+    assert "exists already; nothing is written over it" in done.stderr
     assert path.read_text() == "mine"
 
 

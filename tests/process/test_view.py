@@ -28,9 +28,8 @@ from softfinger.daemon.wire.packer import pack
 from softfinger.tools import cli
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.bridge import TOPICS, Bridge
-from softfinger.tools.viewing.errors import ViewError
 from softfinger.tools.viewing.live import LiveStream
-from softfinger.tools.viewing.page import Page, policy
+from softfinger.tools.viewing.page import Page, ViewError, policy
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
@@ -364,7 +363,7 @@ def test_without_the_extra_it_names_what_to_install() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 1
-    assert "pip install '.[view]'" in done.stderr
+    assert "pip install 'softfinger[view]'" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -374,7 +373,7 @@ def test_without_the_extra_it_names_what_to_install() -> None:
         (("empty.mcap",), "empty"),
         (("text.mcap",), "not an MCAP file"),
         (("text.mcap", "--port", "0"), "expected a port"),
-        (("--save", "text.mcap"), "is there already"),
+        (("--save", "text.mcap"), "exists already"),
         (("--save", "none/a.rrd"), "No such file"),
         (("--no-wait",), "no display for a window"),
         (("--address", "tcp://nowhere", "--save", "b.rrd"), "tcp://nowhere"),

@@ -223,7 +223,7 @@ def test_a_picture_needs_matplotlib(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["bench", "contact", "--plot", "x.png"]) == 2
-    assert "pip install '.[plot]'" in capsys.readouterr().err
+    assert "pip install 'softfinger[plot]'" in capsys.readouterr().err
 
 
 def test_a_number_of_trials_is_a_whole_one(capsys: pytest.CaptureFixture[str]) -> None:

@@ -250,7 +250,7 @@ def test_without_matplotlib_the_numbers_are_written(
     assert {path.name for path in tmp_path.iterdir()} == {"fig4a.csv", "errata.csv"}
     error = capsys.readouterr().err
     assert "only the CSV files were written" in error
-    assert "pip install '.[plot]'" in error
+    assert "pip install 'softfinger[plot]'" in error
 
 
 def test_cells_of_a_sheet(tmp_path: Path) -> None:

@@ -14,11 +14,11 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.viewing.bridge import statistics_table
 from softfinger.tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
-from softfinger.tools.viewing.known import Hand, Wanted, read_settings
+from softfinger.tools.viewing.known import read_settings
 from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
 from softfinger.tools.viewing.planar import Contact, HeldObject, finger_lines, tip_axes
-from softfinger.tools.viewing.statistics import table
 from tests.harness.reference_hand import ReferenceHand
 
 TIP = Fingertip(radius=0.020)
@@ -229,33 +229,9 @@ def test_settings_of_another_version_keep_what_is_known() -> None:
         assert read_settings({"settings": text})[0] == Settings()
 
 
-def test_what_is_wanted_follows_the_commands() -> None:
-    wanted, hand = Wanted(), Hand()
-
-    def told(command: str, ok: bool = True, **numbers: float) -> tuple[float, float]:
-        request = json.dumps({"command": command, **numbers})
-        wanted.take({"command": command, "request": request, "ok": ok, "error": ""}, hand)
-        return wanted.of({"mode": "holding"})
-
-    assert np.isnan(told("arm")).all()
-    assert told("grasp") == (
-        hand.settings.control.force_default,
-        pytest.approx(math.nan, nan_ok=True),
-    )
-    assert told("grasp", force=8.0)[0] == 8.0
-    assert told("rotate", angle=0.1) == (8.0, 0.1)
-    assert told("grasp", ok=False, force=2.0) == (8.0, 0.1)
-    assert told("set", compliance=0.1) == (8.0, 0.1)
-    assert np.isnan(wanted.of({"mode": "disarmed"})).all()
-    # A state that tells it knows better: the grip raised by itself, a turn that ended early.
-    state = {"mode": "holding", "goal_force": 9.5, "goal_angle": 0.07}
-    assert wanted.of(state) == (9.5, 0.07)
-    assert np.isnan(told("release")).all()
-    wanted.take({"command": "grasp", "request": "{", "ok": True}, hand)
-    assert math.isnan(wanted.of({"mode": "holding"})[0])
-
-
 def test_statistics_as_a_table() -> None:
-    page = table({"ticks": 1000, "overruns": 2, "period_s": 0.002, "compute": {"p50": 1.234e-5}})
+    page = statistics_table(
+        {"ticks": 1000, "overruns": 2, "period_s": 0.002, "compute": {"p50": 1.234e-5}}
+    )
     assert "**1000 ticks** of 2.000 ms, **2 overruns**" in page
     assert "| work | 12.3 | — | — | — |" in page

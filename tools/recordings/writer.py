@@ -52,7 +52,7 @@ class RecordingWriter:
         self._newest = math.nan  # time of the newest message [s]
         self._early: list[tuple[bytes, dict[str, Any]]] = []  # repeated before any other came
         try:
-            self._file = path.open("xb")
+            self._file = path.open("xb", buffering=4 * CHUNK)  # a chunk goes out in one write
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; nothing is written over it") from None
         except OSError as error:
