@@ -1,6 +1,6 @@
-"""``softfinger install-service``: a systemd unit for the daemon, and udev rules for its ports.
+"""``softfinger install-service``: prints or writes a systemd unit and udev rules.
 
-Prints them, or writes them where they are asked for; nothing is enabled or started.
+Nothing is enabled or started.
 """
 
 from __future__ import annotations
@@ -95,19 +95,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``install-service``."""
     parser.epilog = _EPILOG
     parser.add_argument("--config", type=Path, metavar="PROFILE", help="the hand's profile")
-    parser.add_argument("--user", default="", help="whom it runs as; root when not given")
+    parser.add_argument("--user", default="", help="the user it runs as (default: root)")
     parser.add_argument("--udev", action="store_true", help="the udev rules instead of the unit")
     parser.add_argument(
         "--name",
         action="append",
         default=[],
         metavar="NAME=SERIAL",
-        help="with --udev: /dev/NAME stands for the adapter with this serial number",
+        help="with --udev: a link /dev/NAME to the adapter with this serial number",
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--print", action="store_true", help="print it, which is what it does alone")
+    where.add_argument("--print", action="store_true", help="print it (default)")
     where.add_argument("--to", type=Path, metavar="FOLDER", help=f"write {UNIT} or {RULES} there")
-    parser.add_argument("--force", action="store_true", help="write over a file that is there")
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
         with write_text(path) if arguments.force else path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        print(f"install-service: {path} is there already; --force writes over it", file=sys.stderr)
+        print(f"install-service: {path} exists already; --force overwrites it", file=sys.stderr)
         return 1
     except (OSError, ValueError, SettingsError) as error:
         print(f"install-service: {error}", file=sys.stderr)

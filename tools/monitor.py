@@ -1,8 +1,7 @@
-"""``softfinger monitor``: the hand on a terminal page, live, from the public wire.
+"""``softfinger monitor``: a live page of the hand in the terminal.
 
-Holds the command's arguments and its loop: keys and signals in, redraws out, or plain lines when
-the output is no terminal. A process of its own: whatever happens here, the daemon's loop doesn't
-notice. The page itself is in ``monitor_page``, what it shows in ``feed``.
+The command's arguments and its loop: keys and signals in, redraws out, or plain lines when the
+output is no terminal. The page itself is `monitor_page`, its data `feed`.
 """
 
 from __future__ import annotations
@@ -16,12 +15,11 @@ import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 import zmq
 
-from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import (
     PATIENCE,
@@ -29,7 +27,9 @@ from softfinger.tools.arguments import (
     client_keys,
     command_address,
     no_stream,
+    seconds,
     stream_address,
+    to_stderr,
 )
 from softfinger.tools.terminal.feed import Feed, number, text
 from softfinger.tools.terminal.feed_sockets import Commander, Subscriber
@@ -47,9 +47,8 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this command's arguments to ``parser``."""
     parser.description = (
-        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and "
-        "choose the force. "
-        "Prints a plain line a second when the output is not a terminal."
+        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and\n"
+        "choose the force. Prints a plain line a second when the output is not a terminal."
     )
     for name, kind, what in (
         ("--state", stream_address, "where the state stream is published"),
@@ -61,50 +60,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-wait", action="store_true", help="end when no daemon is running, or when it ends"
     )
-    parser.add_argument("--duration", type=float, metavar="S", help="end after S seconds")
+    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument("--plain", action="store_true", help="plain lines, no page")
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when it closes
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until q, a signal, the duration or the daemon's end. 1 when no stream ever came."""
+    """Run until q, a signal, the duration or the daemon's end; 1 without a stream.
+
+    Raises KeyFileError.
+    """
     state, commands = args.state, args.commands
     if args.lifeline is not None:
-        _stand_back()
+        _lower_priority()
+    keys = client_keys(args.keys)
     context: zmq.Context[Any] = zmq.Context(io_threads=1)
     feed = Feed()
     try:
-        keys = client_keys(args.keys)
         if keys is not None:
             keys.guard(context)
         subscriber = Subscriber(context, state, feed)
         commander = Commander(context, commands, args.client)
-        try:
-            with _Ending(args) as ending:
-                if _is_page(args):
-                    _run_page(
-                        Page(feed, state, guarded=keys is not None), subscriber, commander, ending
-                    )
-                else:
-                    _run_plain(state, subscriber, ending)
-        finally:
-            commander.close()
-            subscriber.close()
+        with _Ending(args) as ending:
+            if _is_page(args):
+                page = Page(feed, state, guarded=keys is not None)
+                _run_page(page, subscriber, commander, ending)
+            else:
+                _run_plain(state, subscriber, ending)
     except zmq.ZMQError as error:
-        print(f"softfinger monitor: {state}, {commands}: {error}", file=sys.stderr)
-        return 1
-    except KeyFileError as error:
-        print(f"softfinger monitor: {error}", file=sys.stderr)
+        to_stderr("monitor")(f"{state}, {commands}: {error}")
         return 1
     finally:
         context.destroy(linger=0)
     if ending.why:
-        print(f"softfinger monitor: {ending.why}", file=sys.stderr)
+        to_stderr("monitor")(ending.why)
     return 1 if args.no_wait and feed.state is None and ending.why else 0
 
 
-def _stand_back() -> None:
-    """Drop the daemon's priority, which a child inherits: a page is in no hurry."""
+def _lower_priority() -> None:
+    """Drop the daemon's priority, which a child inherits."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
@@ -118,17 +112,17 @@ def _is_page(args: argparse.Namespace) -> bool:
 
 
 class _Ending:
-    """A context that knows when to end, and wakes whoever waits in it when that changes."""
+    """A context: whether it is time to end. Signals wake `wait`."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        self.why = ""  # for the person, once the terminal is back; empty needs no word
+        self.why = ""  # to be printed once the terminal is back
         self.over = False
         self.suspend = False
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
         self._lifeline: int | None = args.lifeline
-        self.beside = args.lifeline is not None  # a daemon is in our process group
+        self.beside = args.lifeline is not None  # the daemon is in this process group
         self._deadline = math.inf if args.duration is None else time.monotonic() + args.duration
         self._patience = time.monotonic() + PATIENCE
         self._before: dict[int, Any] = {}
@@ -144,12 +138,7 @@ class _Ending:
         self._before[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._pause)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number_, handler in self._before.items():
             signal.signal(number_, handler)
         signal.set_wakeup_fd(self._wakeup_before)
@@ -183,7 +172,7 @@ class _Ending:
         return keyboard is not None and keyboard in ready
 
     def watch(self, feed: Feed, address: str, now: float) -> None:
-        """End where the stream's state asks for it."""
+        """With ``--no-wait``: end without a stream."""
         if not self._no_wait or self.over:
             return
         status = feed.status(now)
@@ -208,7 +197,7 @@ def _run_page(page: Page, subscriber: Subscriber, commander: Commander, ending: 
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
     except TerminalGone:
-        pass  # nobody looks any more
+        pass  # nobody sees the page any more
 
 
 def _page_loop(
@@ -226,7 +215,7 @@ def _page_loop(
         if ending.wait(due - time.monotonic(), keyboard) and keyboard is not None:
             typed = _read(keyboard)
             if not typed:
-                keyboard = None  # the keyboard is gone, the page may go on
+                keyboard = None  # the keyboard is gone, the page stays
             for key in keys.decode(typed):
                 if key == "q":
                     ending.over = True

@@ -119,10 +119,10 @@ def test_stream_stale_lost_and_back(fake: FakeDaemon) -> None:
         page.shows("● live")
         fake.silent.set()
         page.shows("◐ stale")
-        page.shows("○ lost", "nothing comes any more")
+        page.shows("○ lost", "the stream has stopped")
         fake.silent.clear()
         page.shows("● live", "HOLDING")
-        assert "nothing comes" not in page.text()
+        assert "has stopped" not in page.text()
 
 
 def test_keys_command_the_hand(fake: FakeDaemon) -> None:

@@ -111,7 +111,7 @@ def test_help_names_the_pages_there_are() -> None:
 
 def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: Run, path: Path) -> None:
     seq, mode = run.states["seq"], run.modes
-    force, angle = run.target_force(), run.target_angle()
+    force, angle = run.requested_force(), run.requested_angle()
     gripping = run.gripping
     assert set(np.unique(force[gripping & (seq < 1100)])) == {6.0}
     assert set(np.unique(force[gripping & (seq >= 1100)])) == {4.0}
@@ -119,10 +119,10 @@ def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: Run, path: Pat
     assert np.isnan(angle[seq < 700]).all()
     assert set(np.unique(angle[gripping & (seq >= 700)])) == {0.1}
     assert np.isnan(angle[mode == MODES.index("releasing")]).all()
-    # A part that begins in the grip knows what was asked for before.
+    # A part that begins in the grip knows what was requested before.
     part = load_run(Recording(path), 1.8, 2.0, None)
-    assert set(np.unique(part.target_force())) == {6.0}
-    assert set(np.unique(part.target_angle())) == {0.1}
+    assert set(np.unique(part.requested_force())) == {6.0}
+    assert set(np.unique(part.requested_angle())) == {0.1}
 
 
 def test_time_page_shows_force_at_its_target(run: Run) -> None:
@@ -134,24 +134,20 @@ def test_time_page_shows_force_at_its_target(run: Run) -> None:
     at = np.searchsorted(t, 1.35)
     assert force[at] == pytest.approx(6.0, rel=0.05)
     assert lines(figure, "goal")[0][1][at] == 6.0
-    assert not lines(figure, "asked for")  # it was what the hand went to
+    assert not lines(figure, "requested")  # it was what the hand went to
     assert np.isnan(force[0])  # nothing is drawn where nothing touches
 
 
 def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: Run) -> None:
     states = dict(run.states)
-    asked = run.target_force()
+    asked = run.requested_force()
     raised = (run.t > 1.3) & (run.t < 1.5)
     states["goal_force"] = np.where(raised, 1.4 * asked, asked)
     figure = drawn(replace(run, states=states), "time")
-    (t, goal), (_, wanted) = lines(figure, "goal")[0], lines(figure, "asked for")[0]
+    (t, goal), (_, wanted) = lines(figure, "goal")[0], lines(figure, "requested")[0]
     at = np.searchsorted(t, 1.4)
     assert (goal[at], wanted[at]) == (pytest.approx(8.4), 6.0)
     assert np.isnan(wanted[np.searchsorted(t, 1.2)])
-    # Recordings from before the hand told its goal show what it was asked for.
-    states["goal_force"] = np.full_like(asked, np.nan)
-    figure = drawn(replace(run, states=states), "time")
-    assert lines(figure, "asked for")[0][1][at] == 6.0
 
 
 def test_model_page_has_points_on_the_models_curves(run: Run) -> None:
@@ -201,7 +197,7 @@ def test_a_deep_landscape_marks_where_the_backing_touches(run: Run) -> None:
 def test_error_page_tells_errors_and_how_honest_the_spread_is(run: Run) -> None:
     figure = drawn(run, "error")
     said = texts(figure)
-    assert "estimate less truth" in said
+    assert "estimate minus truth" in said
     shares = [float(line.split("% within")[0].split()[-1]) for line in said.splitlines()
               if "% within 2σ" in line]  # fmt: skip
     assert len(shares) == 6  # d, θ, F of both fingers

@@ -246,7 +246,7 @@ def test_it_writes_where_it_is_asked_to_and_over_nothing(tmp_path: Path) -> None
     path.write_text("mine", encoding="utf-8")
     again = softfinger("install-service", "--to", str(tmp_path))
     assert again.returncode == 1
-    assert "is there already; --force" in again.stderr
+    assert "exists already; --force" in again.stderr
     assert path.read_text(encoding="utf-8") == "mine"
     assert softfinger("install-service", "--to", str(tmp_path), "--force").returncode == 0
     assert "[Service]" in path.read_text(encoding="utf-8")

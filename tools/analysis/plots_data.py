@@ -1,7 +1,4 @@
-"""What a recording holds, as columns for pictures: states, truth, statistics, commands, the model.
-
-Reads and orders; nothing here draws.
-"""
+"""A recording as columns for pictures: states, truth, statistics, commands, the model."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import json
 import math
 import tempfile
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,29 +31,31 @@ BoolArray = NDArray[np.bool_]
 MODES = tuple(mode.value for mode in Mode)
 GRIPS = (Mode.GRASPING.value, Mode.HOLDING.value, Mode.ROTATING.value)
 
-_TICK = ("seq", "mono_ns", "timestamp", "tick_s", "compute_s", "wake_late_s", "overruns")
+_TICK = (
+    *("seq", "mono_ns", "timestamp", "tick_s", "compute_s", "wake_late_s", "overruns"),
+    *("goal_force", "goal_angle"),
+)
 _FINGER = (
     *("valid", "contact", "q", "goal_q", "current", "goal_current", "temperature"),
     *("d", "theta", "force", "energy", "d_std", "theta_std", "gain"),
 )
 _OBJECT = ("valid", "angle")
-_SINCE = ("goal_force", "goal_angle")  # older recordings have none
 _TRUE = ("d", "theta", "force")
 _TRUE_OBJECT = ("angle",)
-_GAP = 0.1  # s without a state, at least, over which no line is drawn
+_GAP = 0.1  # s without a state, at least, that breaks a line
 
 
 class Missing(SoftfingerError):
-    """What a picture needs is not in the recording. The message says what."""
+    """The recording lacks what a picture needs. The message says what."""
 
 
 @dataclass(frozen=True)
 class Run:
     """A recording, or a part of it. SI units; ``t`` counts from the recording's first message.
 
-    ``states`` and ``truth`` hold one array a field, by the names of the stream, nested ones with a
-    dot; ``mode`` are indices into MODES. ``truth`` is empty, and ``stats`` None, where the
-    recording has none. ``commands`` were carried out, in their order.
+    ``states`` and ``truth`` are one array a field, by the names of the stream, nested ones with a
+    dot; ``modes`` are indices into MODES. ``truth`` is empty, and ``stats`` None, where the
+    recording has none. ``commands`` are those that were carried out, in order.
     """
 
     name: str
@@ -86,12 +85,12 @@ class Run:
         return tuple(name for name in FINGERS if self.states[f"{name}.valid"].any())
 
     def touching(self, finger: str) -> BoolArray:
-        """Where the finger's numbers are sound and something touches it."""
+        """Where the finger's state is valid and in contact."""
         sound = (self.states[f"{finger}.valid"] > 0.0) & (self.states[f"{finger}.contact"] > 0.0)
         return sound & np.isfinite(self.states[f"{finger}.d"])
 
     def gapped(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """t and ``values`` with a NaN in each gap of the stream, where a line shall break."""
+        """t and ``values`` with a NaN in each gap of the stream, which breaks the line."""
         t = self.t
         steps = np.diff(t)
         longest = max(_GAP, 10.0 * float(np.median(steps))) if steps.size else math.inf
@@ -100,43 +99,38 @@ class Run:
 
     @cached_property
     def gripping(self) -> BoolArray:
-        """Where the hand closes on, holds or turns an object."""
+        """Where the hand grasps, holds or rotates an object."""
         return np.isin(self.modes, [MODES.index(mode) for mode in GRIPS])
 
-    def goal_force(self) -> FloatArray:
-        """What the grip went to [N]: what was asked for, or more where the tips would slip."""
-        return self.states["goal_force"]
+    def requested_force(self) -> FloatArray:
+        """The force of the last ``grasp`` while its grip lasts [N], else NaN.
 
-    def goal_angle(self) -> FloatArray:
-        """The angle that the grip turned to or kept [rad], as the hand went by it."""
-        return self.states["goal_angle"]
-
-    def target_force(self) -> FloatArray:
-        """The force asked for by the last ``grasp`` while its grip lasts [N], else NaN."""
+        The grip's goal is more where the tips would slip.
+        """
         default = math.nan if self.settings is None else self.settings.control.force_default
-        return self._asked("grasp", "force", default)
+        return self._requested("grasp", "force", default)
 
-    def target_angle(self) -> FloatArray:
-        """The angle asked for by the last ``rotate`` while the grip lasts [rad], else NaN."""
-        return self._asked("rotate", "angle", math.nan)
+    def requested_angle(self) -> FloatArray:
+        """The angle of the last ``rotate`` while the grip lasts [rad], else NaN."""
+        return self._requested("rotate", "angle", math.nan)
 
-    def _asked(self, command: str, key: str, default: float) -> FloatArray:
-        """Of the last such command in the same grip, at each state."""
+    def _requested(self, command: str, key: str, default: float) -> FloatArray:
+        """The value in the last such command of the same grip, at each state."""
         seq = self.states["seq"]
-        asked = np.full(seq.size, np.nan)
+        requested = np.full(seq.size, np.nan)
         edges = np.flatnonzero(np.diff(self.gripping)) + 1
         for first, last in zip([0, *edges], [*edges, seq.size], strict=True):
             if not self.gripping[first:last].any():
                 continue
-            began = seq[first - 1] if first else -math.inf  # the grip's own command is later
+            began = seq[first - 1] if first else -math.inf
             for each in self.commands:
                 if each["command"] == command and began <= each["tick"] <= seq[last - 1]:
                     value = json.loads(each["request"]).get(key, default)
-                    asked[first:last][seq[first:last] >= each["tick"]] = value
-        return asked
+                    requested[first:last][seq[first:last] >= each["tick"]] = value
+        return requested
 
     def matched(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices of the states, and of the truths, that are of the same tick."""
+        """Indices of the states and the truths of the same ticks."""
         pair: tuple[Any, NDArray[np.intp], NDArray[np.intp]] = np.intersect1d(
             self.states["mono_ns"], self.truth["mono_ns"], return_indices=True
         )
@@ -148,7 +142,7 @@ class Run:
             raise Missing("no hand/state in it")
 
     def need_model(self) -> tuple[FingerModel, FingerModel]:
-        """Both fingers' models. Raises Missing when the recording doesn't tell them."""
+        """Both fingers' models. Raises Missing without them."""
         if self.models is None:
             raise Missing(self.why_no_model)
         return self.models
@@ -170,7 +164,7 @@ def load_run(
     progress: Callable[[int], None] | None = None,
 ) -> Run:
     """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
-    states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT}, _SINCE)
+    states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT})
     truth = _Columns(("seq", "mono_ns"), {**dict.fromkeys(FINGERS, _TRUE), "object": _TRUE_OBJECT})
     modes, faults, commands = array("q"), [], []
     stats: dict[str, Any] | None = None
@@ -184,11 +178,10 @@ def load_run(
         elif states.take(message):
             mode = message.get("mode")
             modes.append(MODES.index(mode) if mode in MODES else -1)
-            said = str(message.get("fault") or "")
-            if said and said != fault:
-                faults.append((message["timestamp"] - recording.start, said))
-            fault = said
-    # From the file's start on: what was asked for before a part begins still holds in it.
+            before, fault = fault, str(message.get("fault") or "")
+            if fault and fault != before:
+                faults.append((message["timestamp"] - recording.start, fault))
+    # From the file's start on: a request from before the part may still hold in it.
     for _, message in recording.messages({schema.COMMAND}, end=end):
         if message.get("ok") is True and isinstance(message.get("tick"), int):
             commands.append(message)
@@ -224,28 +217,22 @@ def _model(
 
 
 class _Columns:
-    """Maps of one kind into one array a field. A map that is not of that kind is passed over."""
+    """Maps of one kind into one array a field. Maps that lack a field are skipped."""
 
-    def __init__(
-        self, own: Iterable[str], nested: dict[str, tuple[str, ...]], since: tuple[str, ...] = ()
-    ) -> None:
-        """``since`` are fields that older recordings lack: NaN there."""
-        self._own = tuple(own)
+    def __init__(self, own: tuple[str, ...], nested: dict[str, tuple[str, ...]]) -> None:
+        self._own = own
         self._nested = nested
-        self._since = since
-        self.names = [*self._own, *(f"{part}.{name}" for part in nested for name in nested[part])]
-        self.names += since
+        self.names = [*own, *(f"{part}.{name}" for part in nested for name in nested[part])]
         self._values = array("d")
         self.count = 0
 
     def take(self, message: dict[str, Any]) -> bool:
-        """One more row; False when it is none."""
+        """One more row; False for a map that is none."""
         try:
             row = [float(message[name]) for name in self._own]
             for part, names in self._nested.items():
                 inner = message[part]
                 row += [float(inner[name]) for name in names]
-            row += [float(message.get(name, math.nan)) for name in self._since]
         except (KeyError, TypeError, ValueError):
             return False
         self._values.extend(row)
@@ -255,7 +242,5 @@ class _Columns:
     def arrays(self) -> dict[str, FloatArray]:
         """By name, float64 [rows]."""
         table = np.array(self._values, np.float64).reshape(-1, len(self.names)).T
-        return {
-            name: np.ascontiguousarray(column)
-            for name, column in zip(self.names, table, strict=True)
-        }
+        columns = map(np.ascontiguousarray, table)
+        return dict(zip(self.names, columns, strict=True))

@@ -1,4 +1,4 @@
-"""The page of errors: estimates of a simulated hand beside what it really did."""
+"""The page of errors: estimates of a simulated hand minus the truth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, Run
-from softfinger.tools.analysis.plots_time import DEGREES, LINES
+from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
 from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
@@ -26,10 +26,10 @@ _ROWS = (
 
 
 def draw_error(run: Run) -> Figure:
-    """Estimate less truth over time within ± 2σ as reported, and their histograms."""
+    """Estimate minus truth over time within ± 2σ as reported, and histograms."""
     run.need_states()
     if not run.truth:
-        raise Missing("no hand/truth in it: only a simulated hand knows it")
+        raise Missing("no hand/truth in it: only simulated hands publish it")
     at, true = run.matched()
     both = {
         name: run.touching(name)[at] & (run.truth[f"{name}.d"][true] > 0.0) for name in run.fingers
@@ -50,15 +50,14 @@ def draw_error(run: Run) -> Figure:
     error = (run.states["object.angle"][at] - run.truth["object.angle"][true]) * DEGREES
     sound = (run.states["object.valid"][at] > 0.0) & np.all(list(both.values()), axis=0)
     _row(axes[3], t, [("object", error, np.full(t.size, np.nan), sound)])
-    axes[3, 0].set(ylabel="error of φ [°]", xlabel="time [s]")
+    axes[3, 0].set_ylabel("error of φ [°]")
     axes[3, 1].set_xlabel("share [%]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     more, names = axes[3, 0].get_legend_handles_labels()
     figure.legend(handles + more, labels + names, loc="outside lower center", ncols=5)
-    title = f"{run.name}: estimate less truth; thin lines: ± 2σ as reported"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
+    titled(figure, run, "estimate minus truth; thin lines: ± 2σ as reported")
     figure.align_ylabels()
-    axes[3, 0].set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
+    time_axis(axes[3, 0], t)
     return figure
 
 
@@ -82,7 +81,7 @@ def _row(
     t: FloatArray,
     entries: list[tuple[str, FloatArray, FloatArray, BoolArray]],
 ) -> None:
-    """One quantity: name, error, reported σ and where both are sound, of each finger."""
+    """One quantity: name, error, reported σ and where both are valid, of each finger."""
     panel, side = panels
     known = [error[sound & np.isfinite(error)] for _, error, _, sound in entries]
     together = np.concatenate(known)
@@ -124,7 +123,7 @@ def _row(
 
 
 def _envelope(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The largest of each few values, for a band that grows between frames; NaN where one is."""
+    """The largest of every few values, for a band that grows between frames; NaN where one is."""
     step = -(-t.size // _BAND)
     starts = np.arange(0, t.size, step)
     return t[starts], np.maximum.reduceat(values, starts)

@@ -1,7 +1,7 @@
-"""Pages that set what was measured against the contact model: over θ, and on the energy landscape.
+"""Pages that compare measurements with the contact model: over θ, and on the energy landscape.
 
 The model is that of the recording's own settings and calibrations; force and energy are those of
-the state, which follow the measured pressure: the model times the gain.
+the state: the model times the gain measured from the pressure.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.analysis.plots_data import FloatArray, Run
-from softfinger.tools.analysis.plots_time import DEGREES, LINES
+from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
 from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _GRID = 241  # of the landscape along each axis
 
 
 def _some(indices: NDArray[np.intp], count: int = _POINTS) -> NDArray[np.intp]:
-    """At most ``count`` of these, evenly."""
+    """At most ``count`` of these, evenly spaced."""
     if indices.size <= count:
         return indices
     return indices[np.linspace(0, indices.size - 1, count).astype(np.intp)]
@@ -91,14 +91,14 @@ def draw_angle(run: Run) -> Figure:
     if beyond > 0.0:
         gain.set_title(f"{100.0 * beyond:.2g} % beyond the frame", loc="right", fontsize=7.0)
     gain.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.1)
-    figure.suptitle(f"{run.name}: force and energy against θ", x=0.01, ha="left", fontsize=9.0)
+    titled(figure, run, "force and energy against θ")
     return figure
 
 
 def _against_angle(
     panel: Axes, run: Run, names: list[str], table: ContactTable, field: str, factor: float
 ) -> Any:
-    """Points coloured by d over curves in the same colours; returns what a colour bar needs."""
+    """Points coloured by d over the model's curves; returns the colour bar's mappable."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -110,7 +110,7 @@ def _against_angle(
     widest = max(float(np.abs(each).max()) for each in theta.values())
     widest = max(1.1 * widest, 5.0 / DEGREES)
     colours = matplotlib.colormaps["viridis"]
-    scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)  # the scheme's yellow end is too faint in print
+    scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)  # the yellow end is too faint in print
     ends = []
     for depth in depths:
         limit = float(table.tip.theta_limit(depth))
@@ -152,7 +152,7 @@ def _against_angle(
 
 
 def _depths(d: FloatArray) -> FloatArray:
-    """A few round displacements [m] that span what was measured, at least one."""
+    """A few round displacements [m] that span the measured ones, at least one."""
     most = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
     rough = most / _CURVES
     decade = 10.0 ** np.floor(np.log10(rough))
@@ -162,7 +162,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: Run) -> Figure:
-    """Paths over U(d, θ) with its minimum over θ, and how far above it they are over time."""
+    """Paths over U(d, θ) with its minimum over θ, and their height above it over time."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(groups))
@@ -182,10 +182,10 @@ def draw_landscape(run: Run) -> Figure:
         for marker, what in (("^", "begins"), ("s", "ends")):
             panel.plot([], [], marker, color=style.GREY, markersize=4, label=what)
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
-    above.set(xlabel="time [s]", ylabel="U above its minimum\nat the same d [mJ]")
+    above.set_ylabel("U above its minimum\nat the same d [mJ]")
     above.set_ylim(bottom=0.0)
-    above.set_xlim(float(run.t[0]), float(max(run.t[-1], run.t[0] + 1e-3)))
-    figure.suptitle(f"{run.name}: path on the energy landscape", x=0.01, ha="left", fontsize=9.0)
+    time_axis(above, run.t)
+    titled(figure, run, "path on the energy landscape")
     return figure
 
 

@@ -19,9 +19,9 @@ LINES: dict[str, dict[str, Any]] = {
     "left": {"color": style.KINDS[0], "linestyle": "-"},
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
-TARGET: dict[str, Any] = {"color": style.INK, "linestyle": (0, (1, 1.2)), "linewidth": 1.2}
+GOAL: dict[str, Any] = {"color": style.INK, "linestyle": (0, (1, 1.2)), "linewidth": 1.2}
 
-# Shade and hatch of each mode, told apart in print; what the hand does most is plain.
+# Shade and hatch of each mode, distinguishable in print.
 _LOOKS = {
     "disarmed": ("#ffffff", ""),
     "armed": ("#e3e3e3", ""),
@@ -45,13 +45,11 @@ _JOINT = (
     ("current", "current", "goal_current", 1.0, "A"),
     ("temperature", "temperature", "", 1.0, "°C"),
 )
-
-
-_OTHER = 0.01  # of what was asked for: a goal that differs by more is another one
+_RAISED = 0.01  # of the request: by more than that the goal differs from it
 
 
 def draw_time(run: Run) -> Figure:
-    """Force, energy, displacement and the object's angle over time, with the targets."""
+    """Force, energy, displacement and the object's angle over time, with their goals."""
     run.need_contact()
     figure, strip, panels = _sheet(run, 4, 7.6)
     for panel, (name, field, factor, unit) in zip(panels, _CONTACT, strict=False):
@@ -60,26 +58,24 @@ def draw_time(run: Run) -> Figure:
             _line(panel, run, shown, label=finger, **LINES[finger])
         panel.set_ylabel(f"{name} [{unit}]")
         panel.set_ylim(bottom=0.0)
-    _targets(panels[0], run, run.goal_force(), run.target_force())
+    _goals(panels[0], run, run.states["goal_force"], run.requested_force())
     sound = run.states["object.valid"] > 0.0
     angle = np.where(sound, run.states["object.angle"] * DEGREES, np.nan)
     _line(panels[3], run, angle, color=style.KINDS[2], label="object")
-    _targets(panels[3], run, run.goal_angle() * DEGREES, run.target_angle() * DEGREES)
+    goal = run.states["goal_angle"] * DEGREES
+    _goals(panels[3], run, goal, run.requested_angle() * DEGREES)
     panels[3].set_ylabel("object's angle φ [°]")
     _finish(figure, run, strip, panels)
     return figure
 
 
-def _targets(panel: Axes, run: Run, goal: FloatArray, asked: FloatArray) -> None:
-    """What the hand went to, and where that is not what it was asked for, that as well."""
-    if not np.isfinite(goal).any():
-        _line(panel, run, asked, label="asked for", **TARGET)
-        return
-    _line(panel, run, goal, label="goal", **TARGET)
-    other = np.where(np.abs(asked - goal) > _OTHER * np.abs(asked), asked, np.nan)
+def _goals(panel: Axes, run: Run, goal: FloatArray, requested: FloatArray) -> None:
+    """The hand's goal, and the request where it differs."""
+    _line(panel, run, goal, label="goal", **GOAL)
+    other = np.where(np.abs(requested - goal) > _RAISED * np.abs(requested), requested, np.nan)
     if np.isfinite(other).any():
         look = {"color": style.GREY, "linestyle": (0, (6, 2)), "linewidth": 0.9}
-        _line(panel, run, other, label="asked for", **look)
+        _line(panel, run, other, label="requested", **look)
 
 
 def draw_joints(run: Run) -> Figure:
@@ -96,7 +92,7 @@ def draw_joints(run: Run) -> Figure:
                 look = {**LINES[finger], "linestyle": (0, (1, 1.2)), "linewidth": 0.9}
                 _line(panel, run, run.states[f"{finger}.{goal}"] * factor, **look)
         panel.set_ylabel(f"{name} [{unit}]")
-    panels[0].plot([], [], color=style.GREY, linestyle=(0, (1, 1.2)), label="goal, or bound of it")
+    panels[0].plot([], [], color=style.GREY, linestyle=(0, (1, 1.2)), label="goal or limit")
     panels[2].margins(y=0.3)
     _finish(figure, run, strip, panels)
     return figure
@@ -132,8 +128,7 @@ def _finish(figure: Figure, run: Run, strip: Axes, panels: list[Axes]) -> None:
             fontsize=7.0,
         )
     strip.set_title(run.name, loc="left")
-    panels[-1].set_xlabel("time [s]")
-    panels[-1].set_xlim(float(run.t[0]), float(max(run.t[-1], run.t[0] + 1e-3)))
+    time_axis(panels[-1], run.t)
     figure.align_ylabels()
     used = [name for k, name in enumerate(MODES) if (run.modes == k).any()]
     handles: list[Any] = [
@@ -147,6 +142,17 @@ def _finish(figure: Figure, run: Run, strip: Axes, panels: list[Axes]) -> None:
                 handles.append(handle)
                 names.append(label)
     figure.legend(handles, names, loc="outside lower center", ncols=6)
+
+
+def time_axis(panel: Axes, t: FloatArray) -> None:
+    """Label and limits of the time axis."""
+    panel.set_xlabel("time [s]")
+    panel.set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
+
+
+def titled(figure: Figure, run: Run, text: str) -> None:
+    """The recording's name and ``text`` above a figure."""
+    figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
 def _draw_modes(strip: Axes, run: Run) -> None:

@@ -1,4 +1,4 @@
-"""The page of the loop's own times: histograms from the states, quantiles as the loop told them."""
+"""The page of the loop's times: histograms from the states, quantiles from ``hand/stats``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softfinger.tools.analysis.plots_data import FloatArray, Run
+from softfinger.tools.analysis.plots_time import titled
 from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
@@ -22,9 +23,9 @@ _SHARES = (("p50", "median"), ("p99", "p99"), ("p999", "p99.9"), ("max", "max"))
 def draw_timing(run: Run) -> Figure:
     """Tick, compute and wake-up times, and the last ``hand/stats``."""
     run.need_states()
-    told = run.stats is not None
-    figure = style.new_figure(7.2, 4.6 if told else 3.2)
-    grid = figure.add_gridspec(2 if told else 1, 3, height_ratios=[1.0, 0.42] if told else [1.0])
+    heights = [1.0] if run.stats is None else [1.0, 0.42]
+    figure = style.new_figure(7.2, 3.2 if run.stats is None else 4.6)
+    grid = figure.add_gridspec(len(heights), 3, height_ratios=heights)
     for column, (title, field) in enumerate(_TIMES):
         panel = figure.add_subplot(grid[0, column])
         _histogram(panel, run.states[field] * 1e6)
@@ -38,12 +39,8 @@ def draw_timing(run: Run) -> Figure:
     every = int(np.median(step)) if step.size else 1
     of = "every tick" if every <= 1 else f"one tick of {every}"
     overruns = run.states["overruns"]
-    figure.suptitle(
-        f"{run.name}: {run.t.size} states, of {of}; {int(overruns[-1] - overruns[0])} overruns",
-        x=0.01,
-        ha="left",
-        fontsize=9.0,
-    )
+    overrun = int(overruns[-1] - overruns[0])
+    titled(figure, run, f"{run.t.size} states, of {of}; {overrun} overruns")
     return figure
 
 
@@ -63,7 +60,7 @@ def _histogram(panel: Axes, values: FloatArray) -> None:
     else:
         reach = max(high - low, 0.02 * high)
         edges = np.linspace(low - 0.02 * reach, high + 0.02 * reach, _BINS + 1)
-    panel.ticklabel_format(axis="x", useOffset=False) if not wide else None
+        panel.ticklabel_format(axis="x", useOffset=False)
     panel.hist(values, edges.tolist(), color=style.KINDS[4], edgecolor="none")
     panel.set_yscale("log")  # the tail is what matters, and is a thousandth of the whole
     panel.set_ylim(bottom=0.7)

@@ -1,7 +1,7 @@
-"""Events of the daemon as lines on standard error or in a file, written by a thread of their own.
+"""The daemon's log: events as lines on standard error or in a file, written by its own thread.
 
-A terminal that is held (Ctrl-S), a full pipe or a full disk stops a writer. The tick hands its
-lines over and never writes itself; what can't be written is dropped.
+A stopped terminal (Ctrl-S), a full pipe or a full disk blocks a writer: the tick never writes, and
+lines that can't be written are dropped.
 
 Plain lines are for people. With ``form="json"`` each line is an object: ``timestamp`` (Unix s, when
 it was handed over), ``level`` (``info``, ``warning``, ``error``), ``kind`` and ``text``, as in
@@ -55,7 +55,7 @@ class EventLog:
         self._news.set()
 
     def take_over_logging(self) -> None:
-        """What modules of ours and others log goes the same way, from warnings upward."""
+        """Take all modules' warnings and errors from Python's logging."""
         handler = _Handler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
@@ -97,5 +97,5 @@ class _Handler(logging.Handler):
         level = _LEVELS.get(record.levelno, "error")
         try:
             self._log.line(level, record.name.rpartition(".")[2], record.getMessage())
-        except Exception:  # a log call must not end what it tells about
+        except Exception:  # a log call must not end its caller
             self.handleError(record)

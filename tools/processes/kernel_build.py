@@ -1,7 +1,7 @@
-"""Compiles the kernels that a scene needs and that are not kept yet, in processes on all cores.
+"""Compiles the kernels of a scene that are not in the cache yet, in processes on all cores.
 
-The daemon then only loads them and stays small. Each process takes one part
-of the pipeline after another (`loop.warm_up`); parts that need the contact table wait for it.
+The daemon then only loads them and stays small. Each process takes one part of the pipeline after
+another (`loop.warm_up`); parts that need the contact table wait for it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LOOK = 0.2  # s between two looks at the time
 
 
 def table_cache() -> Path | None:
-    """Where built contact tables are kept between runs; None where there is no home for it."""
+    """The folder of built contact tables; None without a home folder."""
     try:
         return user_cache()
     except RuntimeError:
@@ -36,25 +36,25 @@ def table_cache() -> Path | None:
 
 
 class Built(NamedTuple):
-    """What was done: how many parts were missing, and whether one could not be built."""
+    """The result: how many parts were missing, and whether one could not be built."""
 
     parts: int
     failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
-    """For tools without a log: what is told goes to standard error."""
+    """Print an event on standard error, for tools without a log."""
     print(text, file=sys.stderr, flush=True)
 
 
 def build_kernels(
     settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
 ) -> Built:
-    """Build what is missing of ``wanted``, all parts of the scene by default.
+    """Build the missing parts of ``wanted``, by default of the whole scene.
 
-    Silent and quick when nothing is. A bar goes to standard error if that is a terminal and ``bar``
-    allows it, else ``tell`` hears of each part, as (level, kind, text). What fails is told, too;
-    whoever needs it then meets the reason. Nothing is left running when it is interrupted.
+    Silent and quick when none is missing. Progress is a bar on standard error if that is a
+    terminal and ``bar`` allows it, else a call of ``tell`` for each part, as (level, kind, text);
+    failures go to ``tell``, too. When interrupted it ends every process.
     """
     missing = [part for part in wanted or parts(settings) if not is_built(part)]
     if not missing:
@@ -88,7 +88,7 @@ def _available() -> float:
 
 
 class _Workers:
-    """The processes, what each is at, and what is left."""
+    """The processes and the parts that are left."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: bool) -> None:
         self._waiting = list(missing)
@@ -110,7 +110,7 @@ class _Workers:
             raise
 
     def close(self) -> None:
-        """End every process, whatever it is at."""
+        """End every process."""
         for worker in self._workers.values():
             worker.close()
         self._selector.close()
@@ -198,7 +198,7 @@ class _Worker:
 
     @property
     def at(self) -> str:
-        """What it is compiling."""
+        """Part and kernel that it is compiling."""
         return "" if self.part is None else f"{self.part.name}: {self.kernel}"
 
     def build(self, part: Part) -> None:
@@ -211,7 +211,7 @@ class _Worker:
             self._input.write(text.encode())
             self._input.flush()
         except BrokenPipeError:
-            pass  # it has died, which reading tells
+            pass  # it has died, which `read` finds
 
     def read(self) -> list[str] | None:
         """The lines that have come; None when it has ended."""

@@ -14,7 +14,7 @@ from typing import Any
 
 
 def main() -> None:
-    """Build what is asked for until standard input ends."""
+    """Build parts until standard input ends."""
     gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
     out = sys.stdout
     sys.stdout = sys.stderr  # whatever else prints, prints there
@@ -39,7 +39,7 @@ def main() -> None:
     events.register("numba:compile", Compiling())
     head = sys.stdin.readline()
     if not head:
-        return  # who asked has gone
+        return
     settings = Settings.model_validate_json(head)
     cache = sys.stdin.readline().rstrip("\n")
     scene = Scene(settings, Path(cache) if cache else None)

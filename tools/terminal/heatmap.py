@@ -1,8 +1,7 @@
 """Pressure maps in a terminal: colour scale, resampling to fit, rows of half-block characters.
 
-Holds pictures of grids and nothing that knows of the stream or the page. A half-block character
-carries two pixels, one above the other, and a character cell is about twice as tall as wide, so
-the pixels come out square.
+A half-block character carries two pixels, one above the other, and a character cell is about twice
+as tall as wide, so the pixels come out square.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ from rich.style import Style
 
 FloatArray = NDArray[np.float64]
 
-LEVELS = 32  # colours told apart; fewer make longer runs of one style and lighter redraws
-SHADES = " ·░▒▓█"  # where the terminal has no colours to speak of
+LEVELS = 32  # colours; fewer make longer runs of one style and lighter redraws
+SHADES = " ·░▒▓█"  # for terminals with too few colours
 
-# From dark to bright in even steps of lightness, blue to yellow: it reads the same in grey and
-# for people who don't tell red from green.
+# From dark to bright in even steps of lightness, blue to yellow: the same order in grey and for
+# colour-blind people.
 _ANCHORS = (
     (24, 18, 56),
     (50, 46, 110),
@@ -35,7 +34,7 @@ _ANCHORS = (
 )
 
 
-# The same course through the 256 fixed colours: the nearest ones would jump in lightness.
+# The same scale in the 256 fixed colours: the nearest ones would jump in lightness.
 _FIXED = (17, 18, 24, 30, 36, 72, 77, 113, 149, 185, 227)
 
 # What a terminal can show: any colour, 256 fixed ones, or too few for a map.

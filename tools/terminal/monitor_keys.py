@@ -1,7 +1,4 @@
-"""The keys of the monitor's page: what they do to the hand, and the line that names them.
-
-Holds what a key means, and nothing of terminals or of the page around that line.
-"""
+"""The keys of the monitor's page: their commands, and the line that names them."""
 
 from __future__ import annotations
 
@@ -30,17 +27,17 @@ _GRIPPING = ("grasping", "holding", "rotating")
 
 
 class HandKeys:
-    """What the keys do to the hand."""
+    """Turns keys into commands."""
 
     def __init__(self, feed: Feed, commander: Commander) -> None:
         self._feed = feed
         self._commander = commander
-        self._target: float | None = None  # of the object's angle [rad]
-        self._chosen = math.nan  # N to grasp with
-        self._pressed = -math.inf  # when it was last changed here
+        self._target: float | None = None  # object angle [rad]
+        self._chosen = math.nan  # grasp force [N]
+        self._pressed = -math.inf  # time of its last change here
 
     def press(self, key: str, now: float) -> None:
-        """Send what ``key`` stands for; other keys do nothing."""
+        """Send the key's command; other keys do nothing."""
         if key in ("left", "right"):
             self._rotate(STEP_ANGLE if key == "right" else -STEP_ANGLE, now)
         elif key in "+=":
@@ -55,13 +52,13 @@ class HandKeys:
             self._commander.send(now, label, command)
 
     def force(self, now: float) -> float:
-        """What the next grasp presses with [N]: in a grip, what it was told; NaN: not known."""
+        """Force of the next grasp [N]; in a grip, its requested force; NaN: not known."""
         feed = self._feed
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
         if not math.isnan(feed.asked):
             return feed.asked
-        goal = number(feed.state, "goal_force")  # of a grip from before this page was there
+        goal = number(feed.state, "goal_force")  # of a grip older than this page
         return self._chosen if math.isnan(goal) else goal
 
     @property
@@ -69,20 +66,20 @@ class HandKeys:
         return text(self._feed.state, "mode") in _GRIPPING
 
     def _adding(self, now: float) -> bool:
-        """A press came just now: what it asked for counts, which the daemon may not have told."""
+        """A key was pressed just now: its force counts before the daemon publishes it."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _BETWEEN and not refused
 
     def _change_force(self, way: float, now: float) -> None:
-        """Up or down to the next step; a grip follows at once, as the object does the arrows."""
+        """Up or down to the next step; a grip follows at once."""
         present = self.force(now)
         if not math.isfinite(present):
             self._commander.refuse(now, "grasp: the hand's settings are not known yet")
             return
         step = next(step for most, step in _STEPS if present + 0.01 * way <= most)
         wanted = round(step * (round(present / step) + way), 3)
-        # What of that it may grasp with, the daemon says.
+        # The daemon checks it.
         self._chosen = min(max(wanted, step), self._feed.force_most)
         self._pressed = now
         if self._gripping:
@@ -97,7 +94,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Several presses add up: they count from the last target, not from where it turns."""
+        """Several presses add up: they count from the last target, not from the present angle."""
         state, reply = self._feed.state, self._commander.reply
         refused = reply is not None and not reply.ok
         turning = text(state, "mode") in ("rotating", "holding")
@@ -115,7 +112,7 @@ class HandKeys:
 
 
 def key_line(width: int, force: float, fault: bool) -> Line:
-    """The keys by name. Where the room ends, what is of no use at present is left out first."""
+    """The keys by name; in a narrow terminal without those that are useless at present."""
     pressed = f"{force:.3g} N" if math.isfinite(force) else "N"
     entries = [
         ("a", "arm"),

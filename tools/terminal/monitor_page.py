@@ -1,10 +1,7 @@
-"""The page of ``softfinger monitor``: from what the feed knows to lines of styled text.
+"""The page of ``softfinger monitor`` as lines of styled text: layout, wording and colours.
 
-Holds layout, wording and colours; pure apart from the scales that follow the pressure and the
-force. Lengths are shown in mm, angles in degrees, energies in mJ, pressures in kPa.
-
-The page has the hand's own shape: the left finger's map to the left, the right one's to the
-right, the numbers of both between them, then the object they hold.
+Lengths are in mm, angles in degrees, energies in mJ, pressures in kPa. The left finger's map is on
+the left, the right one's on the right, the numbers of both between them, with the object's.
 """
 
 from __future__ import annotations
@@ -45,10 +42,10 @@ from softfinger.tools.terminal.typeset import (
 WIDTH, HEIGHT = 80, 24  # the least that everything fits into
 CENTRE = 34  # columns of the numbers
 MAP_LINES = 11  # of each map at the least size
-OLD = 1.0  # s after which a frame on the page is called old
+OLD = 1.0  # s after which a frame is marked as old
 REPLY_TIME = 12.0  # s a reply stays
-LATE = 0.05  # s behind from which it is told
-_RAISED = 1.01  # of what was asked for: told as raised
+LATE = 0.05  # s behind from which a line says so
+_RAISED = 1.01  # share of the requested force above which the grip is reported as raised
 
 BOLD = Style(bold=True)
 GOOD = Style(color="#1fa883")
@@ -84,14 +81,14 @@ _ROWS = (
 
 @dataclass
 class Page:
-    """What a page needs beside the feed. ``now`` is monotonic seconds."""
+    """The page of a feed. ``now`` is monotonic seconds."""
 
     feed: Feed
     address: str
     depth: heatmap.Depth = "any"
     keys: bool = True  # a keyboard is there
-    guarded: bool = False  # the stream is asked for with keys
-    force: float = math.nan  # N that the key for it grasps with
+    guarded: bool = False  # subscribed with keys
+    force: float = math.nan  # N of the grasp key
     _pressure: heatmap.FullScale = field(
         default_factory=lambda: heatmap.FullScale(least=5e3, patience=3.0)
     )
@@ -105,7 +102,7 @@ class Page:
         """The page as ``height`` lines of exactly ``width`` columns."""
         if width < WIDTH or height < HEIGHT:
             return _too_small(width, height)
-        if now - self._statistics_at >= 0.5:  # numbers that change faster can't be read
+        if now - self._statistics_at >= 0.5:  # so that the numbers can be read
             self._statistics = self.feed.statistics(now)
             self._statistics_at = now
         status = self.feed.status(now)
@@ -155,19 +152,19 @@ class Page:
 
     def _notice(self, width: int, now: float, status: str) -> Line:
         if status == "lost":
-            return [Segment(" nothing comes any more; what stands below is old", BAD)]
+            return [Segment(" the stream has stopped; everything below is old", BAD)]
         fault = text(self.feed.state, "fault")
         if fault:
             line = [Segment(f" FAULT {cut(fault, width - len(self._way_out) - 8)}", ALARM)]
             return apart(line, [Segment(self._way_out, ALARM)], width, ALARM)
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
-            what += "" if self.guarded else " (or it wants --keys)"
+            what += "" if self.guarded else " (or it requires --keys)"
             return [Segment(cut(what, width), WARN)]
         schema = value_at(self.feed.state, "schema")
         if self.feed.state is not None and schema != SCHEMA:
             what = f" the stream has schema {schema!r:.12}, this page knows {SCHEMA}"
-            return [Segment(what + ": it shows the fields that it knows", WARN)]
+            return [Segment(what + " and shows the fields it knows", WARN)]
         lately = self.feed.waited(now)
         if lately > LATE:
             total = short(number(self.feed.state, "behind_s"), 2)
@@ -265,7 +262,7 @@ class Page:
 
     def _object(self) -> Line:
         pose = value_at(self.feed.state, "object")
-        if value_at(pose, "valid") is False:  # what it says then is old or never was
+        if value_at(pose, "valid") is False:
             pose = None
         angle = math.degrees(number(pose, "angle"))
         width = 1e3 * number(pose, "width")
@@ -278,7 +275,7 @@ class Page:
         ]
 
     def _goal(self) -> str:
-        """What the grip goes to, in words; empty without a grip."""
+        """The grip's goal in words; empty without a grip."""
         force = number(self.feed.state, "goal_force")
         angle = math.degrees(number(self.feed.state, "goal_angle"))
         if not math.isfinite(force):
@@ -290,7 +287,7 @@ class Page:
         return said + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
 
     def _trends(self, width: int, lines: int) -> list[Line]:
-        """Both forces over the last while, ``lines`` of bars each."""
+        """The recent history of both forces, ``lines`` of bars each."""
         columns = width - 30
         recent = list(self.feed.history)[-columns:]
         peak = max((v for pair in recent for v in pair if math.isfinite(v)), default=0.0)
@@ -309,9 +306,11 @@ class Page:
         return result
 
     def _ticks(self, width: int) -> Line:
-        """Rate and overruns, then median, tail and worst of all ticks; of the last second until
-        the daemon has told them. Shorter words where there is less room."""
-        now, told = self._statistics, self.feed.times
+        """Rate and overruns, then median, tail and largest times of all ticks.
+
+        Until ``hand/stats`` arrives, those of the last second. Shorter in a narrow terminal.
+        """
+        now, all_ticks = self._statistics, self.feed.times
         overruns = number(self.feed.state, "overruns")
         head = [
             Segment(f" tick {short(now.rate, 0)} Hz"),
@@ -320,14 +319,14 @@ class Page:
         ]
         times: tuple[tuple[str, tuple[float, ...]], ...]
         words: tuple[str, ...]
-        if told is None:
+        if all_ticks is None:
             times = (
                 ("compute", (now.compute, now.compute_max)),
                 ("late", (now.late, now.late_max)),
             )
             words = ("µs", "max")
         else:
-            times = (("compute", told.compute), ("late", told.late))
+            times = (("compute", all_ticks.compute), ("late", all_ticks.late))
             words = ("µs", "p99", "max")
         full, slim = [*head], [*head]
         for label, values in times:
@@ -342,7 +341,7 @@ class Page:
         return next((line for line in (full, named) if length(line) <= width), slim)
 
     def _messages(self, width: int, count: int, now: float, reply: Reply | None) -> list[Line]:
-        """A rule with who commands and the last reply, what had no room so far, then events."""
+        """A rule with the commander and the last reply, texts cut above in full, then events."""
         who = self.feed.commander(now)
         title = "events" if not who else f"events ─ {cut(who, 16)} commands the hand"
         said = _reply(reply, now)

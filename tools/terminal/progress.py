@@ -1,13 +1,12 @@
-"""A progress bar on the terminal, and nothing where there is none."""
+"""A progress bar on standard error, if that is a terminal."""
 
 from __future__ import annotations
 
 import shutil
 import sys
 import time
-from types import TracebackType
 
-_STEP = 0.1  # s between two pictures
+_STEP = 0.1  # s between two redraws
 _WIDTH = 20
 
 
@@ -21,7 +20,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """So much of the total is behind; ``note`` says more than the share does."""
+        """Show that ``done`` of the total is done, with ``note`` instead of the percentage."""
         if not self.on or time.monotonic() - self._shown < _STEP:
             return
         self._shown = time.monotonic()
@@ -35,11 +34,6 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.on:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)

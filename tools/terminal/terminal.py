@@ -1,7 +1,7 @@
-"""The terminal of a full-screen page: taken over, written line by line, given back as it was.
+"""The terminal of a full-screen page: screen modes, key decoding, output, and their restoring.
 
-Holds screen modes, key decoding and output, and nothing of what is shown. Only lines that changed
-are written, in one write a redraw: that is light over ssh and doesn't flicker.
+Only lines that changed are written, in one write a redraw: that is light over ssh and doesn't
+flicker.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import shutil
 import termios
 import tty
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any
 
 from rich.color import ColorSystem
@@ -42,11 +41,11 @@ _PASTE, _PASTE_END = b"\x1b[200~", b"\x1b[201~"
 
 
 class TerminalGone(SoftfingerError):
-    """The terminal can't be written to any more, or a signal ended a write that was stuck."""
+    """The terminal can't be written to any more, or a signal ended a blocked write."""
 
 
 class Keys:
-    """Bytes from a terminal in, names of keys out. Pasted text is no key."""
+    """Decodes a terminal's bytes to names of keys. Pasted text is ignored."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -104,7 +103,7 @@ def _length(data: bytes, at: int) -> int:
 
 
 class Terminal:
-    """A context: inside it the page owns the terminal, after it everything is as before."""
+    """A context in which the page owns the terminal; it is restored afterwards."""
 
     def __init__(self, output: int, keyboard: int | None, suspendable: bool = True) -> None:
         self._output = output
@@ -126,7 +125,7 @@ class Terminal:
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # drops what was typed ahead: no key by accident
+            tty.setcbreak(self._keyboard)  # also drops keys typed ahead
             if not self._suspendable:  # Ctrl-Z would stop the daemon too, torque on
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"
@@ -136,33 +135,28 @@ class Terminal:
         try:
             self._write(_ENTER)
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError, termios.error, TerminalGone):
             if self._attributes is not None and self._keyboard is not None:
-                # At once and not after the output has drained: a stuck line would hold us here.
+                # At once, not after the output has drained: a stopped terminal would block here.
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
         with contextlib.suppress(OSError, termios.error, TerminalGone):
-            if self._stuck:  # what it did not take shall not stand before what follows
+            if self._stuck:  # drop the page's rest
                 termios.tcflush(self._output, termios.TCOFLUSH)
             termios.tcflow(self._output, termios.TCOON)  # as Ctrl-Q, or the next write hangs
             self._write(_LEAVE)
 
     def size(self) -> tuple[int, int]:
-        """(columns, lines) of now."""
+        """(columns, lines)"""
         try:
             size = os.get_terminal_size(self._output)
         except OSError:
             size = shutil.get_terminal_size()
-        # A serial console may say 0 × 0: then as a terminal of old.
+        # A serial console may say 0 × 0.
         return size.columns or 80, size.lines or 24
 
     def draw(self, lines: Sequence[Sequence[Segment]]) -> None:

@@ -1,7 +1,6 @@
-"""Lines of a fixed-width page: styled text cut, padded and set apart to exact columns.
+"""Typesetting of numbers and lines for a page of fixed width.
 
-Holds the typesetting of numbers and lines, and nothing of what they mean. Widths are terminal
-columns: a wide character takes two.
+Widths are terminal columns: a wide character takes two.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ BARS = " ▁▂▃▄▅▆▇█"
 
 
 def bars(values: list[float], full: float, lines: int) -> list[str]:
-    """Values as bars of eighths of a line, highest line first; nothing where there is no value."""
+    """Values as bars of eighths of a line, highest line first; blank for NaN."""
     steps = [
         -1 if math.isnan(v) else round(min(max(v / full, 0.0), 1.0) * 8 * lines) for v in values
     ]
@@ -112,5 +111,5 @@ def rule(width: int, title: str = "", note: Line | None = None) -> Line:
 
 
 def faded(line: Line) -> Line:
-    """``line`` as something that is no longer true: colourless, but for the maps."""
+    """``line`` without colours, except the maps: it is out of date."""
     return [s if "▀" in s.text else Segment(s.text, FADED) for s in line]
