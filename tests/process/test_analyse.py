@@ -76,7 +76,8 @@ def test_every_kind_of_file_gives_the_same_contacts(counts: np.ndarray, tmp_path
         lines += [f"Frame {k + 1}", *(",".join(map(str, row)) for row in frame), ""]
     (tmp_path / "export.asf").write_text("\n".join(lines))
     save_stream(tmp_path / "run.mcap", counts, Settings())
-    for name in ("press.npz", "frames", "export.asf", "run.mcap"):
+    np.save(tmp_path / "press.npy", counts)
+    for name in ("press.npz", "press.npy", "frames", "export.asf", "run.mcap"):
         # The export tells its pitch: a wrong one in the settings must not matter there.
         pitch = 0.002 if name == "export.asf" else PITCH
         tactile = Settings().tactile.model_copy(update={"rows": 10, "cols": 10, "pitch": pitch})

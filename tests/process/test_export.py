@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -104,17 +102,3 @@ def test_what_can_not_be_exported(tmp_path: Path) -> None:
     done = softfinger("export", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "file"))
     assert done.returncode == 1
     assert str(tmp_path / "file") in done.stderr
-
-
-def test_a_missing_extra_is_named(path: Path, tmp_path: Path) -> None:
-    code = (
-        "import sys; sys.modules['pyarrow'] = None\n"
-        "from softfinger.tools.cli import main\n"
-        f"sys.exit(main(['export', {str(path)!r}, '--format', 'parquet', '--out', "
-        f"{str(tmp_path / 'out')!r}]))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 1
-    assert "pip install 'softfinger[parquet]'" in done.stderr

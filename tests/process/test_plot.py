@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -292,15 +290,3 @@ def test_files_that_are_no_good(tmp_path: Path, path: Path, call: Call) -> None:
     status, said = call(path, *time, tmp_path / "file")
     assert status == 1
     assert "File exists" in said
-
-
-def test_without_matplotlib_it_says_what_to_install(path: Path) -> None:
-    code = (
-        "import sys; sys.modules['matplotlib'] = None\n"
-        "from softfinger.tools.cli import main\n"
-        f"sys.exit(main(['plot', {str(path)!r}]))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1
-    assert "pip install 'softfinger[plot]'" in done.stderr
-    assert done.stdout == ""

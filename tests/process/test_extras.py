@@ -1,0 +1,43 @@
+"""A subcommand whose optional package is missing says in one line what to install."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.process.test_record import written
+
+
+@pytest.mark.parametrize(
+    ("missing", "words", "extra"),
+    [
+        ("matplotlib", "plot run.mcap", "plot"),
+        ("mcap", "record new.mcap", "record"),
+        ("orjson", "record new.mcap", "record"),
+        ("zstandard", "record new.mcap", "record"),
+        ("rerun", "view", "view"),
+        ("pyarrow", "export run.mcap --format parquet", "parquet"),
+    ],
+)
+def test_a_missing_extra_is_named(tmp_path: Path, missing: str, words: str, extra: str) -> None:
+    written(tmp_path / "run.mcap", 20)
+    code = (
+        f"import sys; sys.modules[{missing!r}] = None\n"
+        "from softfinger.tools.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words.split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1
+    assert f"pip install 'softfinger[{extra}]'" in done.stderr
+    assert not (tmp_path / "new.mcap").exists()
