@@ -44,7 +44,7 @@ class Case:
     names: tuple[str, ...] = ()  # of the fault that may latch
     within: float = 0.0  # s in which no motor must be driven any more, where it faults
     lasts: float = 3.0  # s, at most, that it is looked at
-    held_only: bool = False  # the hand must hold; else it may be closing or turning, too
+    holding_only: bool = False  # the hand must hold; else it may be closing or turning, too
 
 
 def sent(words: Callable[[random.Random], tuple[str, str]]) -> Inject:
@@ -145,7 +145,7 @@ CASES: tuple[Case, ...] = (
          ("servos.bus",), _WATCHDOG),
     _blind("board silent", inject=_board("{}:silent")),
     Case("board frozen", "fault", _board("{}:frozen"), ("tactile.frozen",), _FROZEN,
-         held_only=True),
+         holding_only=True),
     Case("board noisy, 10%", "either", _board("{}:noisy=0.1"),
          ("tactile.silent", "tip.force", "tip.displacement", "tip.tilt", "hand.angle",
           "hand.width"), 0.5, 0.5, True),
@@ -155,7 +155,7 @@ CASES: tuple[Case, ...] = (
     _blind("board of the wrong size", inject=_board("{}:wrong-size")),
     Case("board saturated", "fault", _board("{}:saturated"),
          ("tactile.silent", "tip.force", "tip.displacement"), _FRAMES + _AT_ONCE),
-    Case("board zero", "lets go", _board("{}:zero"), lasts=0.4, held_only=True),
+    Case("board zero", "lets go", _board("{}:zero"), lasts=0.4, holding_only=True),
     Case("board's port gone and back", "fault", _board("{}:unplug", "{}:plug"),
          ("tactile.silent",), _FRAMES + _AT_ONCE),
     Case("daemon killed", "dies", _killed, within=_WATCHDOG),

@@ -157,7 +157,7 @@ def _start_anew(rig: Rig) -> None:
 
 def _phase(rig: Rig, case: Case, chance: random.Random) -> str:
     """Bring the hand into one of the states in which it grips."""
-    phase = "holding" if case.held_only else chance.choice(("holding", "grasping", "rotating"))
+    phase = "holding" if case.holding_only else chance.choice(("holding", "grasping", "rotating"))
     if phase == "grasping":
         rig.ask({"command": "grasp", "force": chance.uniform(4.0, 9.0)})
     elif phase == "rotating":
