@@ -185,8 +185,8 @@ def _many(scene: Scene) -> None:
     scene.models[0].table(np.zeros(2), np.zeros(2))
 
 
-_TABLE = Part("contact table", 31, _table)
-_ESTIMATOR = Part("estimator", 69, _estimator)
+_TABLE = Part("contact table", 24, _table)
+_ESTIMATOR = Part("estimator", 61, _estimator)
 _HAND = Part("simulated hand", 61, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
 _CONTROL = Part("filter and grip", 53, _control, after=_TABLE.name)
