@@ -12,6 +12,7 @@ This module alone replaces steps of Numba's compiler; `pyproject.toml` bounds Nu
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numba
@@ -92,38 +93,40 @@ class _InnerLowering(NativeLowering):
         return True
 
 
-_SIGNATURES: dict[Any, Any] = {}  # of operations and their arguments' types
+_operation: Any = types.Function
+_SIGNATURES: dict[Any, Any] = {}  # of operations, by their arguments' types and the arithmetic
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _QuickTyping(NopythonTypeInference):
-    """Type inference that remembers the signatures of Numba's own functions."""
+    """Type inference that remembers what Numba's own functions make of their arguments' types."""
 
     _name = "quick_typing"
 
     def run_pass(self, state: Any) -> bool:
         context = state.typingctx
-        resolve = context.resolve_function_type
+        resolve = type(context).resolve_function_type
+        arithmetic = frozenset(state.flags.fastmath.flags), state.flags.error_model
 
         def remembered(function: Any, arguments: Any, named: Any) -> Any:
-            if named or not isinstance(function, types.Function):
-                return resolve(function, arguments, named)
-            key = function, arguments
+            if named or not isinstance(function, _operation):
+                return resolve(context, function, arguments, named)
+            key = function, arguments, arithmetic
             if key not in _SIGNATURES:
-                found = resolve(function, arguments, named)
+                found = resolve(context, function, arguments, named)
                 if found is None:
                     return None
-                _SIGNATURES[key] = found
-            return _SIGNATURES[key]
+                _SIGNATURES[key] = found, function._impl_keys[found.args]
+            found, body = _SIGNATURES[key]
+            function._impl_keys[found.args] = body  # by which Numba finds what to compile
+            return found
 
-        within = "resolve_function_type" in vars(context)  # compiled for a kernel that calls it
-        if not within:
-            context.resolve_function_type = remembered
+        outer = vars(context).get("resolve_function_type", partial(resolve, context))
+        context.resolve_function_type = remembered
         try:
             return bool(super().run_pass(state))
         finally:
-            if not within:
-                del context.resolve_function_type
+            context.resolve_function_type = outer
 
 
 class OuterCompiler(Compiler):
