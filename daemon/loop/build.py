@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from softfinger import __version__
 from softfinger.daemon.backends import SERVOS, TACTILE, make_sensor, make_servos
 from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.gateway.config import Config
@@ -161,4 +161,4 @@ def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFa
         )
         for model in models
     ]
-    return HandFacts(version("softfinger"), settings.model_dump_json(), *calibrations, *tables)
+    return HandFacts(__version__, settings.model_dump_json(), *calibrations, *tables)
