@@ -9,6 +9,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 
+from softfinger.daemon.backends import SERVOS, TACTILE
 from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
 from softfinger.daemon.diagnosis.hand import check_board, check_servos
 from softfinger.daemon.diagnosis.kernels import check_kernels
@@ -22,7 +23,6 @@ from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
-_PORTLESS = ("none", "simulated", "replay")  # tactile backends without a board
 _EPILOG = """\
 exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
 can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
@@ -74,7 +74,7 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
             yield from _latency(settings, path, fix)
     yield from _servos(settings, free, fix)
     tactile = settings.tactile
-    if tactile.backend in _PORTLESS:
+    if not TACTILE[tactile.backend].metal:
         yield Result("note", "tactile", f"{tactile.backend}: no board to ask")
     else:
         for name in settings.scene.fingers:
@@ -91,9 +91,9 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
 def _ports(settings: Settings) -> list[tuple[str, str]]:
     """(key, path) of every port that the scene needs."""
     ports = []
-    if settings.servos.backend == "dynamixel":
+    if SERVOS[settings.servos.backend].metal:
         ports.append(("servos.port", settings.servos.port))
-    if settings.tactile.backend not in _PORTLESS:
+    if TACTILE[settings.tactile.backend].metal:
         for name in settings.scene.fingers:
             ports.append(("tactile.port", settings.tactile.port[FINGERS.index(name)]))
     return ports
@@ -113,7 +113,7 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Result]:
 
 def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Result]:
     servos = settings.servos
-    if servos.backend != "dynamixel":
+    if not SERVOS[servos.backend].metal:
         yield Result("note", "servos", f"{servos.backend}: no servo to ask")
         return
     if not free[servos.port]:
