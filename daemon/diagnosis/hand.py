@@ -12,7 +12,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import Examined, check_angle, examine
-from softfinger.daemon.servos.control_table import JointScale, ServoModel, by_name
+from softfinger.daemon.servos.control_table import ServoModel, by_name
+from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.servos.protocol import open_line
 from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, search
 from softfinger.daemon.types import FINGERS

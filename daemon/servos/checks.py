@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.control_table import JointScale, ServoModel
-from softfinger.daemon.servos.joint import servo_name
+from softfinger.daemon.servos.control_table import ServoModel
+from softfinger.daemon.servos.joint import JointScale, servo_name
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.types import FINGERS
 

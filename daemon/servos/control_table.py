@@ -1,17 +1,14 @@
 """The Dynamixel X series' control table: addresses, units, operating modes and models.
 
-Plain data from the servo maker's manuals, and the mapping between counts and a joint's SI units.
-The client and the emulated servos both read it; nothing here talks to a servo.
+Plain data from the servo maker's manuals; what a joint's counts are in rad, rad/s and A is in
+`servos.joint`. The client and the emulated servos both read it; nothing here talks to a servo.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from softfinger.daemon.profile.settings import ServoSettings
+from typing import Final
 
 # --- addresses -----------------------------------------------------------------------------------
 
@@ -316,68 +313,3 @@ def name_of(number: int) -> str:
     """The name of the model that answers a ping with ``number``; the number if it is unknown."""
     names = [model.name for model in MODELS.values() if model.number == number]
     return names[0] if names else f"model number {number}"
-
-
-# --- a joint's SI units --------------------------------------------------------------------------
-
-_GOAL_LIMIT = 1_048_575  # counts: the furthest goal the multi-turn modes take
-
-
-@dataclass(frozen=True, slots=True)
-class JointScale:
-    """How one joint's counts map to rad, rad/s and A.
-
-    q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and likewise for velocity. Currents
-    keep the motor's own ampere; only the sign follows the joint, so that positive closes.
-    """
-
-    direction: int  # +1 or -1: sign of the counts when the joint closes
-    zero: int  # counts at q = 0
-    radian: float  # rad of the joint a position count, always > 0
-    velocity: float  # rad/s of the joint a velocity count, always > 0
-    current_unit: float  # A a current count
-
-    @classmethod
-    def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """The scale of joint 0 (left) or 1 (right) under the settings.
-
-        Raises:
-            KeyError: the settings name a model that is not in the table.
-        """
-        model = by_name(servos.model) if model is None else model
-        return cls(
-            direction=servos.direction[joint],
-            zero=servos.zero[joint],
-            radian=2.0 * math.pi / COUNTS_PER_TURN / servos.gear_ratio,
-            velocity=VELOCITY_UNIT / servos.gear_ratio,
-            current_unit=model.current_unit,
-        )
-
-    def angle(self, counts: float) -> float:
-        """Joint angle [rad] of a position in counts."""
-        return self.direction * (counts - self.zero) * self.radian
-
-    def rate(self, counts: float) -> float:
-        """Joint velocity [rad/s] of a velocity in counts."""
-        return self.direction * counts * self.velocity
-
-    def amperes(self, counts: float) -> float:
-        """Motor current [A], positive closing, of a signed current in counts."""
-        return self.direction * counts * self.current_unit
-
-    def position_counts(self, q: float) -> int:
-        """Position in counts nearest to the joint angle q [rad], kept inside what a goal takes."""
-        counts = self.zero + self.direction * q / self.radian
-        return round(min(max(counts, -_GOAL_LIMIT), _GOAL_LIMIT))
-
-    def velocity_counts(self, dq: float) -> int:
-        """Velocity in counts nearest to dq [rad/s]."""
-        return round(self.direction * dq / self.velocity)
-
-    def current_counts(self, current: float) -> int:
-        """Signed current in counts nearest to a motor current [A] that is positive closing."""
-        return round(self.direction * current / self.current_unit) if self.current_unit else 0
-
-    def bound_counts(self, current: float) -> int:
-        """Counts of a bound on the current's magnitude [A], rounded down so that it stays one."""
-        return int(abs(current) / self.current_unit + 1e-9) if self.current_unit else 0

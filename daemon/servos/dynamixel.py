@@ -25,8 +25,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency, examine
-from softfinger.daemon.servos.control_table import JointScale, ServoModel, by_name
-from softfinger.daemon.servos.joint import Joint
+from softfinger.daemon.servos.control_table import ServoModel, by_name
+from softfinger.daemon.servos.joint import Joint, JointScale
 from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
 from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.servos.torque import Torque
@@ -213,11 +213,10 @@ class DynamixelServos:
         alert = 0
         for joint in self._joints:
             f, scale = joint.finger, joint.scale
-            sign = scale.direction
             current, velocity, position = _MOTION(group.data[joint.id], at)
-            reading.q[f] = joint.q = sign * (position - scale.zero) * scale.radian
-            reading.dq[f] = joint.dq = sign * velocity * scale.velocity
-            reading.current[f] = sign * current * scale.current_unit
+            reading.q[f] = joint.q = scale.angle(position)
+            reading.dq[f] = joint.dq = scale.rate(velocity)
+            reading.current[f] = scale.amperes(current)
             if group.errors[joint.id] & 0x80:
                 alert |= 1 << f
         if alert:

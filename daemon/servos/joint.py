@@ -1,4 +1,4 @@
-"""One joint and its servo: scale, bounds, last reading, and goals as the registers hold them."""
+"""One joint and its servo: counts in SI units, bounds, last reading, goals for the registers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Final
 
 from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.control_table import JointScale
+from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.types import FINGERS
 
+_GOAL_LIMIT = 1_048_575  # counts: the furthest goal the multi-turn modes take
 _CURRENT_AND_POSITION = struct.Struct("<hi")
 _CURRENT = struct.Struct("<h")
 _POSITION = struct.Struct("<i")
@@ -38,6 +39,66 @@ def current_toward(
     bound = abs(bound)
     current = servos.stiffness * (goal_q - q) - servos.damping * dq
     return min(max(current, -bound), bound)
+
+
+@dataclass(frozen=True, slots=True)
+class JointScale:
+    """How one joint's counts map to rad, rad/s and A.
+
+    q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and likewise for velocity. Currents
+    keep the motor's own ampere; only the sign follows the joint, so that positive closes.
+    """
+
+    direction: int  # +1 or -1: sign of the counts when the joint closes
+    zero: int  # counts at q = 0
+    radian: float  # rad of the joint a position count, always > 0
+    velocity: float  # rad/s of the joint a velocity count, always > 0
+    current_unit: float  # A a current count
+
+    @classmethod
+    def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
+        """The scale of joint 0 (left) or 1 (right) under the settings.
+
+        Raises:
+            KeyError: the settings name a model that is not in the table.
+        """
+        model = by_name(servos.model) if model is None else model
+        return cls(
+            direction=servos.direction[joint],
+            zero=servos.zero[joint],
+            radian=2.0 * math.pi / reg.COUNTS_PER_TURN / servos.gear_ratio,
+            velocity=reg.VELOCITY_UNIT / servos.gear_ratio,
+            current_unit=model.current_unit,
+        )
+
+    def angle(self, counts: float) -> float:
+        """Joint angle [rad] of a position in counts."""
+        return self.direction * (counts - self.zero) * self.radian
+
+    def rate(self, counts: float) -> float:
+        """Joint velocity [rad/s] of a velocity in counts."""
+        return self.direction * counts * self.velocity
+
+    def amperes(self, counts: float) -> float:
+        """Motor current [A], positive closing, of a signed current in counts."""
+        return self.direction * counts * self.current_unit
+
+    def position_counts(self, q: float) -> int:
+        """Position in counts nearest to the joint angle q [rad], kept inside what a goal takes."""
+        counts = self.zero + self.direction * q / self.radian
+        return round(min(max(counts, -_GOAL_LIMIT), _GOAL_LIMIT))
+
+    def velocity_counts(self, dq: float) -> int:
+        """Velocity in counts nearest to dq [rad/s]."""
+        return round(self.direction * dq / self.velocity)
+
+    def current_counts(self, current: float) -> int:
+        """Signed current in counts nearest to a motor current [A] that is positive closing."""
+        return round(self.direction * current / self.current_unit) if self.current_unit else 0
+
+    def bound_counts(self, current: float) -> int:
+        """Counts of a bound on the current's magnitude [A], rounded down so that it stays one."""
+        return int(abs(current) / self.current_unit + 1e-9) if self.current_unit else 0
 
 
 @dataclass(slots=True)

@@ -11,8 +11,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.checks import check_model
-from softfinger.daemon.servos.control_table import JointScale, by_name
-from softfinger.daemon.servos.joint import current_toward
+from softfinger.daemon.servos.control_table import by_name
+from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _HEALTH_EVERY = 0.25  # s between two readings of temperature and supply

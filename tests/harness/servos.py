@@ -18,13 +18,9 @@ from typing import Any
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.control_table import (
-    COUNTS_PER_TURN,
-    VELOCITY_UNIT,
-    JointScale,
-    by_name,
-)
+from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT, by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.servo_model import framing, servo

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import ServoSettings
-from softfinger.daemon.servos.control_table import JointScale, by_name, name_of
+from softfinger.daemon.servos.control_table import by_name, name_of
+from softfinger.daemon.servos.joint import JointScale
 
 
 def test_models_by_name_and_number() -> None:

@@ -14,7 +14,8 @@ from typing import Any
 
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import JointScale, ServoModel
+from softfinger.daemon.servos.control_table import ServoModel
+from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.registers import ControlTable, Item

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import JointScale, by_name
+from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_faults import (
     LINE_FAULTS,

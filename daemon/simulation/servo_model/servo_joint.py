@@ -11,7 +11,8 @@ import struct
 
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import JointScale, ServoModel
+from softfinger.daemon.servos.control_table import ServoModel
+from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 from softfinger.daemon.simulation.servo_model.trajectory import Profile
 
