@@ -206,7 +206,7 @@ class CommandSettings(Section):
     address: str = COMMAND_ADDRESS
     lease: Seconds = 2.0  # s a commander keeps the hand after its last command
     max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
-    per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is free
+    per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is always heard
 
 
 class Access(Section):
