@@ -1,7 +1,7 @@
 """The control law's modes: commands in, one goal for the servos a tick out.
 
 What each mode does, and when it passes into the next. `control.modes` lists the commands,
-`loop.requests` checks them, `control.grip` has the grip law, and `safety.supervisor` the limits,
+`loop.requests` checks them, `control.grip` has the grip law, and `safety.safety` the limits,
 which are not left to a control law.
 """
 

@@ -74,7 +74,7 @@ def open_server(
     """
     server = Server(end, config, clock)
     if config.keys:
-        from softfinger.daemon.gateway.curve import open_endpoints  # which alone needs libzmq
+        from softfinger.daemon.gateway.keyed import open_endpoints  # which alone needs libzmq
 
         open_endpoints(server, config)
         return server

@@ -22,7 +22,7 @@ from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.supervisor import BUS, Finding, Safety
+from softfinger.daemon.safety.safety import BUS, Breach, Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import State, Truth
@@ -83,7 +83,7 @@ class Loop:
         self._requests = Requests(
             settings, self.state, self._control, self._safety, self._torque, perception, self.emit
         )
-        self._after_opening: Finding | None = None  # a fault for when the hand is open
+        self._after_opening: Breach | None = None  # a fault for when the hand is open
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing)
         self._publishing = None
@@ -258,21 +258,21 @@ class Loop:
 
     def _judge(self) -> None:
         state, control, safety = self.state, self._control, self._safety
-        finding = safety.judge(state)
+        breach = safety.judge(state)
         for warning in safety.warnings:
             self.emit("warning", *warning)
         safety.warnings.clear()
         if not control.torque:
             self._after_opening = None
             return
-        if finding is not None:
-            finding = finding._replace(text=self._with_cause(*finding))
-            if safety.opens_first(finding, state.mode):
-                self.emit("error", *finding)
-                self._after_opening = finding
+        if breach is not None:
+            breach = breach._replace(text=self._with_cause(*breach))
+            if safety.opens_first(breach, state.mode):
+                self.emit("error", *breach)
+                self._after_opening = breach
                 control.release()
             else:
-                self._fail(finding.text, finding.name)
+                self._fail(breach.text, breach.name)
         elif self._after_opening is not None and state.mode != Mode.RELEASING:
             self._fail(self._after_opening.text, self._after_opening.name)
 

@@ -16,7 +16,7 @@ from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
-from softfinger.daemon.safety.supervisor import Safety
+from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, State
 
@@ -113,6 +113,19 @@ class Requests:
         self._torque = torque
         self._perception = perception
         self._emit = emit
+        self._handlers: dict[str, Callable[..., None]] = {
+            "arm": control.arm,
+            "disarm": control.disarm,
+            "tare": self._tare,
+            "move": control.move,
+            "grasp": control.grasp,
+            "rotate": control.rotate,
+            "release": control.release,
+            "set": control.set,
+            "stop": control.stop,
+            "clear": control.disarm,
+            "status": lambda: None,
+        }
         self._lease = Lease(settings.commands.lease)
 
     def carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -127,11 +140,7 @@ class Requests:
         for reason in self._against(name, numbers):
             raise Refused(f"{name}: {reason}")
         queued = name == "rotate" and control.mode is Mode.GRASPING
-        if name == "tare":
-            for perception in self._perception.fingers:
-                perception.tare()
-        elif name != "status":
-            getattr(control, "disarm" if name == "clear" else name)(**numbers)
+        self._handlers[name](**numbers)
         self._lease.renew(command, state.t)
         reply: dict[str, Any] = {"mode": control.mode.value}
         if queued:
@@ -194,6 +203,10 @@ class Requests:
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
                 yield f"{name}: found {q:g} rad, expected {low:g} to {high:g}"
+
+    def _tare(self) -> None:
+        for perception in self._perception.fingers:
+            perception.tare()
 
     def _reconnect(self) -> None:
         """Connect servos that have gone silent anew: only on command.

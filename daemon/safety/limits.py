@@ -6,7 +6,7 @@
 
 ``softfinger limits`` prints the table with a profile's numbers. A limit's name is the ``kind`` of
 its events and the ``fault_name`` of ``hand/state``. How the table is gone through at each tick
-stands in `safety.supervisor`.
+stands in `safety.safety`.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Limit:
     """One row. Without ``holds`` and ``check`` it is met elsewhere: in `Safety.bound`, on the bus.
 
     ``holds`` is an expression of `holding`'s names, in which numbers of the settings are filled in:
-    the supervisor joins those of every tick to one. What takes more to compute is a ``check``.
+    `safety.safety` joins those of every tick to one. What takes more to compute is a ``check``.
     """
 
     name: str
@@ -440,8 +440,8 @@ LIMITS: tuple[Limit, ...] = (
         "not view.holds(state) or view.grasp.shear <= {share} * {friction}",
         lambda view, *_: f"shear is {view.grasp.shear:.2f} of the grip's force, above "
         f"{_usable(view.settings):.2f}: may slip", in_turn=True, lasts=0.1),
-    Limit("commands.pace", "a client's commands a second, stop not counted", "limit",
-        ("commands.per_second",)),
+    Limit("commands.pace", "a client's commands a second; a stop counts, and is always heard",
+        "limit", ("commands.per_second",)),
     Limit("loop.overruns", "late ticks in a row", "fault", ("safety.overruns_fault",),
         holds="state.timing.late_in_row < {safety.overruns_fault}",
         text=lambda _, state, *__: f"loop: {state.timing.late_in_row} overruns in a row"),

@@ -27,7 +27,7 @@ BUS = "servos.bus"  # the limit of what the servo backend itself refuses
 TORQUE_OFF = "torque.off"  # of torque off that is not confirmed, `safety.torque_state`
 
 
-class Finding(NamedTuple):
+class Breach(NamedTuple):
     """A limit that is broken: its name, and what was found."""
 
     name: str
@@ -110,7 +110,7 @@ class Safety:
         self._turn = 0
         self._busy = False  # a limit of each tick is broken, or was a moment ago
         self._found: dict[_Watch, str] = {}  # faults that stand
-        self.warnings: list[Finding] = []  # to be reported; the loop empties it
+        self.warnings: list[Breach] = []  # to be reported; the loop empties it
         self.limited: Counter[str] = Counter()  # ticks in which a goal was changed, by limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
@@ -125,7 +125,7 @@ class Safety:
 
     # Judging
 
-    def judge(self, state: State) -> Finding | None:
+    def judge(self, state: State) -> Breach | None:
         """Look at this tick's state; the first fault that stands, if any.
 
         Warnings that are new are added to ``warnings``.
@@ -147,7 +147,7 @@ class Safety:
         gripping = state.mode in GRIPPING
         for watch in self._faults:
             if watch in self._found and (gripping or not watch.limit.gripping):
-                return Finding(watch.limit.name, self._found[watch])
+                return Breach(watch.limit.name, self._found[watch])
         return None
 
     def _look(self, watch: _Watch, state: State) -> None:
@@ -159,7 +159,7 @@ class Safety:
                 self._found.pop(watch, None)
         elif found and not watch.reported:
             watch.reported = True
-            self.warnings.append(Finding(watch.limit.name, found))
+            self.warnings.append(Breach(watch.limit.name, found))
 
     def cause(self, state: State, gripping: bool = False) -> str:
         """The first fault that stands in this state, or an empty text: what refuses a command.
@@ -188,10 +188,10 @@ class Safety:
                 return True
         return False
 
-    def opens_first(self, finding: Finding, mode: Mode | str) -> bool:
+    def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
         """The hand shall open before this fault takes its torque."""
         wanted = self._limits.frame_age_action == "open"
-        return wanted and finding.name == "tactile.silent" and mode in GRIPPING
+        return wanted and breach.name == "tactile.silent" and mode in GRIPPING
 
     # Goals
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import ServoSettings
-from softfinger.daemon.safety.supervisor import BUS, TORQUE_OFF, Safety
+from softfinger.daemon.safety.safety import BUS, TORQUE_OFF, Safety
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State

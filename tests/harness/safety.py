@@ -10,7 +10,7 @@ from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS
-from softfinger.daemon.safety.supervisor import Safety
+from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.types import Contact, Frame, Goal, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 

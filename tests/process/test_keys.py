@@ -17,8 +17,8 @@ import zmq.auth
 from softfinger.daemon.client import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
-from softfinger.daemon.gateway.curve import Keys
 from softfinger.daemon.gateway.endpoints import StartAnew
+from softfinger.daemon.gateway.keyed import Keys
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import until
 from tests.harness.daemon_process import Running, insist, softfinger, until_it_says

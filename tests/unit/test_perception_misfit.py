@@ -8,7 +8,7 @@ from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.supervisor import Safety
+from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import Contact, Frame, Parts, State
 from softfinger.daemon.wire.packer import message_maker

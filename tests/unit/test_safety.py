@@ -12,7 +12,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.supervisor import Safety
+from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.types import Goal, State
 from tests.harness.safety import SETTINGS, goal, judged, levers, safety, sound
 
@@ -114,4 +114,4 @@ def test_nothing_but_safety_writes_a_goal() -> None:
                 and "servos" in ast.unparse(node.func.value)
             ):
                 callers.append(path.name)
-    assert callers == ["supervisor.py"]
+    assert callers == ["safety.py"]
