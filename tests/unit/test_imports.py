@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import softfinger
 
 ROOT = Path(softfinger.__file__).parents[1]
 ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it
+PAGE = ROOT / "docs" / "architecture.md"
 
 
 @cache
@@ -86,6 +88,12 @@ def rooms(top: str) -> dict[str, set[str]]:
     return {room: others - {room} for room, others in graph.items()}
 
 
+def table_of_rooms() -> list[str]:
+    """The rows of the table of rooms in the architecture's page, top down."""
+    _, _, after = PAGE.read_text(encoding="utf-8").partition("| room |")
+    return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
+
+
 def test_circles_are_found() -> None:
     graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": set[str]()}
     assert circles(graph) == [["a", "b", "c"]]
@@ -109,7 +117,16 @@ def test_no_rooms_import_in_a_circle() -> None:
         assert circles(rooms(top)) == [], top
 
 
-def test_clients_and_gateway_use_the_wire_which_knows_neither() -> None:
+def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture() -> None:
+    rows = (re.findall(r"`daemon/(\w+)", line.split("|")[1]) for line in table_of_rooms())
+    place = {room: row for row, names in enumerate(rows) for room in names}
     graph = rooms("daemon")
-    assert not {"client", "gateway", "loop"} & graph["wire"]
+    assert place.keys() == graph.keys()
+    for room, others in graph.items():
+        wrong = sorted(each for each in others if place[each] <= place[room])
+        assert not wrong, f"daemon/{room} imports {', '.join(wrong)}, not below it in the table"
+
+
+def test_clients_and_gateway_know_neither_loop_nor_profile() -> None:
+    graph = rooms("daemon")
     assert not {"loop", "profile"} & (graph["client"] | graph["gateway"])
