@@ -70,8 +70,8 @@ class Contact:
     theta_std: float = 0.0
     gain: float = 1.0  # measured pressure over modelled pressure
     misfit: bool = False  # the frame fits no contact of the model: d and theta may be biased
-    force: float = 0.0  # F(d, θ) [N]
-    energy: float = 0.0  # U(d, θ) [J]
+    force: float = 0.0  # gain · F(d, total tilt of theta and tilt_y) by the contact table [N]
+    energy: float = 0.0  # gain · U(d, total tilt) [J]
     inside: bool = True  # (d, θ) lies inside the model's domain
 
 

@@ -79,8 +79,10 @@ class FingerState:
     d: float = field("m", "maximum displacement of the tip")
     theta: float = field("rad", "the object's angle in the tip's frame, in the hand's plane")
     tilt_y: float = field("rad", "and across the plane")
-    force: float = field("N", "elastic force F(d, θ)")
-    energy: float = field("J", "elastic potential energy U(d, θ)")
+    force: float = field(
+        "N", "elastic force, gain · F(d, total tilt of theta and tilt_y) by the contact table"
+    )
+    energy: float = field("J", "elastic potential energy, gain · U(d, total tilt) likewise")
     d_std: float = field("m", "standard deviation of d")
     theta_std: float = field("rad", "standard deviation of theta")
     gain: float = field("", "measured over modelled pressure")
@@ -278,7 +280,9 @@ class HandSettings(_Announcement):
     settings: str = field("", "all settings, as JSON")
     calibration_left: str = field("", "the left sensor's calibration as JSON, or empty")
     calibration_right: str = field("", "the right sensor's")
-    table_left: str = field("", "the left tip's contact table: form, tolerance, certificate")
+    table_left: str = field(
+        "", "the left tip's contact table: form, tolerance, certificate (largest error found)"
+    )
     table_right: str = field("", "the right tip's")
 
 
