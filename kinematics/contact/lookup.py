@@ -86,8 +86,8 @@ class TableHeader(Record):
     inverse_radius: float
     corner: float  # where its coefficients start
     tolerance: float
-    max_error: float  # the certificate
-    worst_d: float  # where it is met [m]
+    max_error: float  # largest relative error found
+    worst_d: float  # where it was found [m]
     worst_theta: float  # [rad]
 
 

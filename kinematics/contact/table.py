@@ -1,8 +1,9 @@
-"""Contact tables: force, energy and their partials by lookup, to a proven tolerance.
+"""Contact tables: force, energy and their partials by lookup, within a tolerance.
 
 Holds the table as an object and as bytes. A table is one flat float64 array, header and
-coefficients, which is the kernel's argument and the bytes' content alike. How one is built and
-certified is in `table_build`, the lookup itself and the array's layout in `lookup`.
+coefficients, which is the kernel's argument and the bytes' content alike. How one is built is in
+`table_build`, the lookup itself and the array's layout in `lookup`. A table's error is the largest
+found against the integrals at 5,000 points, most of them near the domain's edges: no bound.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ class Contact(NamedTuple):
     energy_d: FloatArray  # ∂U/∂d = F/cos θ [N], the push along the face's normal
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
     inside: NDArray[np.bool_]  # False where d or θ was clamped to the domain
-    max_error: float  # the certificate: largest relative error of any of the six
+    max_error: float  # largest relative error found of any of the six, see Certificate
 
 
 class Certificate(NamedTuple):
-    """How a table was proven: its largest relative error over all outputs, and where it was."""
+    """The largest relative error of any output found at 5,000 seeded points, and where."""
 
     max_error: float
     d: float  # [m]
@@ -73,8 +74,8 @@ _SOURCES = (
 class ContactTable:
     """Force, energy and first partials of one tip of one material, by lookup.
 
-    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the certificate's
-    largest relative error of any output. The domain is 0 < d ≤ a and
+    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the largest
+    relative error of any output that was found. The domain is 0 < d ≤ a and
     |θ| ≤ asin((a − d)/a).
     """
 
@@ -91,7 +92,7 @@ class ContactTable:
         tolerance: float = 1e-9,
         form: str | None = None,
     ) -> ContactTable:
-        """Build and certify the cheapest table that meets ``tolerance``, relative, on all outputs.
+        """Build the cheapest table found within ``tolerance``, relative, on all outputs.
 
         ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
 

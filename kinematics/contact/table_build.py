@@ -1,4 +1,4 @@
-"""How contact tables are fitted to the reference integrals, chosen by cost, and certified."""
+"""How contact tables are fitted to the reference integrals, chosen by cost, and checked."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ from softfinger.kinematics.contact.quadrature import (
 FloatArray = NDArray[np.float64]
 
 MEMORY_LIMIT = 256 * 1024  # bytes of a table
-_HOPE = 3.0  # times the tolerance: a fit's estimate above it is not worth certifying
+_HOPE = 3.0  # times the tolerance: a fit's estimate above it is not worth checking
+_POINTS = 5000  # that a table is checked at
+_SEED = 1  # of these points, so that a table built anew is the same
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
 
 
@@ -67,7 +69,7 @@ class Law:
 
 
 def build(tip: Fingertip, material: Material, tolerance: float, form: str | None) -> FloatArray:
-    """The array of the cheapest certified table; see ContactTable.build."""
+    """The array of the cheapest table within ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
     names = [known.name for known in FORMS]
@@ -83,7 +85,7 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
             continue
         estimate = _fit(data, law, number, tolerance) if number != CLOSED else 0.0
         if estimate <= _HOPE * tolerance:
-            estimate = certify(data, law)
+            estimate = largest_error(data, law)
             if estimate <= tolerance:
                 return data
         best = min(best, estimate)
@@ -165,7 +167,7 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
-    """Chebyshev coefficients [5, x, y] as the numbers that the kernel in `lanes` reads."""
+    """Chebyshev coefficients [5, x, y] as the numbers that `compiled.simd` evaluates."""
     rising = np.einsum(
         "ai,bj,kij->kab",
         _to_powers(terms.shape[1]),
@@ -228,16 +230,16 @@ def _to_powers(count: int) -> FloatArray:
     return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
 
 
-def certify(data: FloatArray, law: Law, points: int = 5000, seed: int | None = None) -> float:
-    """Prove the table on random points and the domain's corners; writes the result to its header.
+def largest_error(data: FloatArray, law: Law) -> float:
+    """Largest relative error at random points, the same for each table; written to its header.
 
     A third of the points are dense over the domain; the others crowd, by orders of magnitude, at
-    d → 0, at d → a, at θ → 0 and at θ's limit, and at two of these at once. Returns the largest
-    relative error.
+    d → 0, at d → a, at θ → 0 and at θ's limit, and at two of these at once. Between the points the
+    table may err a little more.
     """
     header = header_of(data)
     radius = header.radius
-    d, theta = hard_points(radius, points, np.random.default_rng(seed))
+    d, theta = hard_points(radius, _POINTS, np.random.default_rng(_SEED))
     out = _errors(data, law, d, theta)
     worst = int(np.argmax(np.where(np.isnan(out), np.inf, out)))
     error = float(out[worst])

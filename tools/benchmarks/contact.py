@@ -185,7 +185,7 @@ def _run(kernel: Callable[..., None], *arguments: Any) -> None:
 def _table(
     name: str, table: ContactTable, material: Material, d: FloatArray, theta: FloatArray
 ) -> _Case:
-    facts = {"certified": table.max_error, "KiB": table.data.nbytes / 1024}
+    facts = {"error found": table.max_error, "KiB": table.data.nbytes / 1024}
     case = _Case(name, _error(table(d, theta), reference(material, d, theta)), facts=facts)
     return _compiled(case, "lookup", table.data, (partial(lookup, table.data), table), d, theta)
 
@@ -245,7 +245,7 @@ def _row(case: _Case, mode: str, times: dict[str, FloatArray]) -> Row:
 
 
 def _aims(built: Built, times: dict[str, FloatArray]) -> Iterator[Row]:
-    """Ratios of the same rounds, certified errors and builds, beside their aims."""
+    """Ratios of the same rounds, errors found and builds, beside their aims."""
     names = {"table, constant E": 1.2}
     names |= {f"table to {tolerance:g}": aims[0] for tolerance, aims in _TOLERANCES.items()}
     for name, aim in names.items():
@@ -255,5 +255,5 @@ def _aims(built: Built, times: dict[str, FloatArray]) -> Iterator[Row]:
     for tolerance, (table, samples) in built.items():
         name = f"table to {tolerance:g}"
         yield figure(f"{name}: build", "s", samples, _TOLERANCES[tolerance][1])
-        yield figure(f"{name}: certified error", "1", [table.max_error], tolerance)
+        yield figure(f"{name}: largest error found", "1", [table.max_error], tolerance)
         yield figure(f"{name}: memory", "KiB", [table.data.nbytes / 1024], 256.0)
