@@ -147,7 +147,7 @@ class Daemon:
 
 
 def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFacts:
-    """Published once for each subscriber: settings, calibrations, the tables' certificates."""
+    """Published once for each subscriber: settings, calibrations, the tables' errors."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
     ]

@@ -170,7 +170,7 @@ def _control(scene: Scene) -> None:
         contact_filter.advance(Reading(t=0.01 * k))
         for finger in fingers:
             contact_filter.correct(finger, frame, touch, contacts[finger])
-        contact_filter.publish(0.01 * k, contacts, pose)
+        contact_filter.write_contacts(0.01 * k, contacts, pose)
     grip = Grip(settings, fingers, contact_filter.grasp)
     grip.start(1.0, 2.0)
     grip.steer(0.0, 0.1)
@@ -185,12 +185,12 @@ def _many(scene: Scene) -> None:
     scene.models[0].table(np.zeros(2), np.zeros(2))
 
 
-_TABLE = Part("contact table", 24, _table)
-_ESTIMATOR = Part("estimator", 61, _estimator)
+_TABLE = Part("contact table", 26, _table)
+_ESTIMATOR = Part("estimator", 67, _estimator)
 _HAND = Part("simulated hand", 61, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
-_CONTROL = Part("filter and grip", 53, _control, after=_TABLE.name)
-_MANY = Part("lookup of many points", 2, _many, after=_TABLE.name)
+_CONTROL = Part("filter and grip", 52, _control, after=_TABLE.name)
+_MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _CONTROL, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
 LANDSCAPE = (_TABLE, _MANY)  # what a picture of the energy needs

@@ -118,13 +118,13 @@ class ContactFilter:
             estimate.covariance,
         )
 
-    def publish(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
+    def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
         """Write the estimates of time ``t`` into contacts and pose."""
         live = self._live
         pose.valid = live[0] and live[1] and self._with_object
         pose.angle = pose.width = 0.0
         if live[0] or live[1]:
-            left, right, angle, width = kernels.publish(self._state.array, *self._tables)
+            left, right, angle, width = kernels.write_grasp(self._state.array, *self._tables)
             tips = left, right
             if pose.valid:
                 pose.angle, pose.width = angle, width

@@ -24,7 +24,7 @@ from softfinger.kinematics.hand.grasp_state import (
 )
 
 FloatArray = NDArray[np.float64]
-Tip = tuple[float, float, float, float, float, float, bool]  # what `publish` returns of one
+Tip = tuple[float, float, float, float, float, float, bool]  # what `write_grasp` returns of one
 
 HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
@@ -62,7 +62,7 @@ class GraspState(Record):
     """How the held object answers the joints at this tick: what a grip law needs."""
 
     d: Pair  # displacements [m]
-    force: Pair  # of the tips, by their tables [N]
+    force: Pair  # of the tips, gain times their tables' [N]
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # α between the object's faces, as both tips feel them [rad]
     stray: float  # turning of the object that no joint explains, summed [rad]
@@ -88,7 +88,7 @@ class Past(Record):
 
 
 class FilterState(Record):
-    """What is set once, what the filter remembers, and what it publishes."""
+    """What is set once, what the filter remembers, and what it finds."""
 
     half_separation: float  # of the hand, in m as its other lengths
     length: float
@@ -341,7 +341,7 @@ def _between(first: float, last: float, share: float) -> float:
 
 
 @inner_kernel
-def _publish_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -> Tip:
+def _write_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -> Tip:
     tip = f.tip[finger]
     grasp = f.grasp
     force, energy, stiffness, _, _, _, inside = lookup(
@@ -364,7 +364,7 @@ def _publish_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -
 
 
 @kernel
-def publish(
+def write_grasp(
     filters: Records[FilterState], table1: FloatArray, table2: FloatArray
 ) -> tuple[Tip, Tip, float, float]:
     """Write what the estimates mean into ``grasp``.
@@ -381,8 +381,8 @@ def publish(
     motion = _motion(f)
     theta1 = angle - 0.5 * taper + left.q
     theta2 = angle + 0.5 * taper - right.q
-    seen1 = _publish_tip(f, 0, theta1, table1)
-    seen2 = _publish_tip(f, 1, theta2, table2)
+    seen1 = _write_tip(f, 0, theta1, table1)
+    seen2 = _write_tip(f, 1, theta2, table2)
     grasp.angle_std = math.sqrt(_variance(f.angle, f.count))
     grasp.taper = taper
     grasp.stray = f.stray

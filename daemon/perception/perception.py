@@ -49,7 +49,7 @@ class Perception:
             frame = each.update()
             if frame is not None:
                 self.filter.correct(each.finger, frame, each.estimate, state.contacts[each.finger])
-        self.filter.publish(state.t, state.contacts, state.object)
+        self.filter.write_contacts(state.t, state.contacts, state.object)
 
 
 class FingerPerception:

@@ -173,7 +173,7 @@ class SerialReader:
             if stop in ready:
                 return None
             if not ready:
-                self._publish(decoder.settle())
+                self._hand_over(decoder.settle())
                 timeout = self._ask(port)
                 continue
             try:
@@ -187,7 +187,7 @@ class SerialReader:
                 return self._end("the port is gone (it reports data and has none)")
             self._bytes += len(data)
             decoded = decoder.feed(data, self._clock.now())
-            self._publish(decoded)
+            self._hand_over(decoded)
             if decoder.lost and not self._error:
                 self._invalidate(decoder.diagnosis())
             if decoder.pending:
@@ -216,7 +216,7 @@ class SerialReader:
                 os.write(port, self.request)
         return self._patience
 
-    def _publish(self, decoded: Decoded | None) -> None:
+    def _hand_over(self, decoded: Decoded | None) -> None:
         if decoded is None:
             return
         self._seq += decoded.steps

@@ -102,11 +102,11 @@ def _likelihood(
 
 
 @inner_kernel
-def _publish(state: State) -> None:
+def _to_tilts(state: State) -> None:
     """Turn the estimate from normals in the sensor's axes to tilts in the finger's."""
     estimate = state.estimate
     covariance = state.fit.covariance
-    published = estimate.covariance
+    turned = estimate.covariance
     c = math.cos(state.options.rotation)
     s = math.sin(state.options.rotation)
     n_x = c * estimate.n_x - s * estimate.n_y
@@ -124,10 +124,10 @@ def _publish(state: State) -> None:
     for i in range(4):
         along = covariance[i, 1]
         across = covariance[i, 2]
-        published[i, 0] = covariance[i, 0]
-        published[i, 1] = per_x * (c * along - s * across)
-        published[i, 2] = per_y * (s * along + c * across)
-        published[i, 3] = covariance[i, 3]
+        turned[i, 0] = covariance[i, 0]
+        turned[i, 1] = per_x * (c * along - s * across)
+        turned[i, 2] = per_y * (s * along + c * across)
+        turned[i, 3] = covariance[i, 3]
 
 
 @inner_kernel
@@ -146,7 +146,7 @@ def _estimate(
     else:
         done = _likelihood(state, frame, arena, centres, places)
     in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
-    _publish(state)
+    _to_tilts(state)
     return done and in_range
 
 

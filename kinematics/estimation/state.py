@@ -85,7 +85,7 @@ class Signal(Record):
 
 
 class Estimate(Record):
-    """What a frame leaves, and where the next one starts: in the sensor's axes, then published."""
+    """What a frame leaves, where the next one starts: in the sensor's axes, then the finger's."""
 
     d: float
     gain: float

@@ -45,7 +45,7 @@ def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(
     # Both frames were sampled before the first reading was taken.
     for k in range(2):
         contact_filter.correct(0, frame(4.98 + 0.01 * k), ESTIMATE, contacts[0])
-        contact_filter.publish(5.0, contacts, pose)
+        contact_filter.write_contacts(5.0, contacts, pose)
         assert contacts[0].valid
         assert contacts[0].d == pytest.approx(0.003)
         assert contacts[0].theta == pytest.approx(0.1)
@@ -54,7 +54,7 @@ def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(
         contact_filter.advance(Reading(t=t, q=[0.15, 0.15], valid=True))
         if k % 5 == 0:
             contact_filter.correct(0, frame(t - 0.01), ESTIMATE, contacts[0])
-        contact_filter.publish(t, contacts, pose)
+        contact_filter.write_contacts(t, contacts, pose)
     contact = contacts[0]
     assert contact.d == pytest.approx(0.003, rel=0.02)
     assert contact.theta == pytest.approx(0.1, rel=0.02)

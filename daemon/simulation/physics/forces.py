@@ -1,4 +1,7 @@
-"""All forces on the simulated hand but the motors', summed over its contacts."""
+"""Weight, pushes, friction and end stops; and the sum of all forces but the motors'.
+
+The contacts' own forces are in `tip`, `tip_tip` and `palm`, the motors' torque in `servo_loop`.
+"""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     simulation = settings.simulation
     p.step = step
     p.sample_period = 1.0 / settings.tactile.rate
-    p.modulus = float(table.data[3]) * simulation.modulus_scale
+    p.modulus = float(table.header.modulus) * simulation.modulus_scale
     p.radius = settings.tip.radius
     p.scale = simulation.modulus_scale
     p.friction = simulation.tip_friction
