@@ -41,14 +41,16 @@ class Repeated:
         self._settings: bytes | None = None
         self._events: deque[bytes] = deque(maxlen=bounds.LATE_EVENTS)
 
-    def add(self, topic: int, message: bytes) -> None:
-        """Remember a message of the stream, if it is one of these."""
-        if topic in (self._topics.settings, self._topics.events):
-            again: bytes = msgpack.packb({**msgpack.unpackb(message), "again": True})
-            if topic == self._topics.events:
-                self._events.append(again)
-            else:
-                self._settings = again
+    def add(self, topic: int, message: bytes) -> bytes:
+        """Remember a message of the stream, if it is one of these: as it is then sent again."""
+        if topic not in (self._topics.settings, self._topics.events):
+            return message
+        again: bytes = msgpack.packb({**msgpack.unpackb(message), "again": True})
+        if topic == self._topics.events:
+            self._events.append(again)
+        else:
+            self._settings = again
+        return again
 
     def late(self, wanted: int) -> list[tuple[int, bytes]]:
         """For a subscriber to the topics ``wanted``, as bits: each message with its topic."""
@@ -176,9 +178,10 @@ class Server:
                 return
             message = bytes(self._pieces)
             self._pieces.clear()
-        self.repeated.add(topic, message)
-        if self._stream is not None and not flags & loop_link.KEEP:
-            self._stream.publish(topic, message)
+        again = self.repeated.add(topic, message)
+        if self._stream is not None:
+            # Subscribers may have come back before the loop has: they get its last events, too.
+            self._stream.publish(topic, again if flags & loop_link.KEEP else message)
 
     def close(self) -> None:
         """Let subscribers take what waits, for a moment, and disconnect all."""

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 PUBLISH = b"P"  # topic's index, flags, piece of the message
 REPLY = b"R"  # number, reply
 EPOCH = b"E"  # epoch
-FIRST, LAST, KEEP = 1, 2, 4  # place of the piece; KEEP: for late subscribers alone
+FIRST, LAST, KEEP = 1, 2, 4  # place of the piece; KEEP: sent again, after a restart
 
 # From the gateway.
 READY = b"U"  # nothing: the sockets are bound
