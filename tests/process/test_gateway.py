@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import signal
 import stat
 import subprocess
@@ -13,11 +14,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgpack
 import pytest
+import zmq
 
 from softfinger.daemon.client import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError
+from softfinger.daemon.gateway.__main__ import open_server
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
@@ -91,6 +95,35 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
         assert state.mode == "armed"
         assert state.seq > ticks
         assert hand.status()["torque"] is True
+
+
+def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events(
+    addresses: tuple[str, str], context: zmq.Context[zmq.Socket[bytes]]
+) -> None:
+    link = loop_link.Link()
+    Publisher(link).event(0.0, 0.0, "info", "test", "while there was no gateway")
+    ours, theirs = loop_link.pair()
+    server = open_server(theirs, Config(*addresses, GATEWAY_TOPICS, 100), 16)
+    subscriber = context.socket(zmq.SUB)
+    subscriber.subscribe(b"hand/event")
+    subscriber.connect(addresses[0])
+
+    def subscribed() -> bool:
+        server.step(0.0)
+        return bool(select.select([ours], [], [], 0)[0]) and (
+            ours.recv(loop_link.LARGEST)[:1] == loop_link.WANTED
+        )
+
+    try:
+        until(subscribed)
+        link.offer(ours)
+        link.look()
+        until(lambda: [server.step(0.0), subscriber.poll(1)][1])
+        event = msgpack.unpackb(subscriber.recv_multipart()[1])
+        assert (event["text"], event["again"]) == ("while there was no gateway", True)
+    finally:
+        link.close()
+        server.close()
 
 
 def test_the_gateway_leaves_with_its_daemon(
