@@ -110,9 +110,10 @@ def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events
 
     def subscribed() -> bool:
         server.step(0.0)
-        return bool(select.select([ours], [], [], 0)[0]) and (
-            ours.recv(loop_link.LARGEST)[:1] == loop_link.WANTED
-        )
+        if not select.select([ours], [], [], 0)[0]:
+            return False
+        packet = ours.recv(loop_link.LARGEST)
+        return packet[:1] == loop_link.WANTED and loop_link.WANTS.unpack_from(packet, 1)[0] != 0
 
     try:
         until(subscribed)
