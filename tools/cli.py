@@ -1,6 +1,6 @@
 """The command line: parses which subcommand is meant and hands over to its module.
 
-A subcommand's module is imported only when it is called, and has two functions:
+A subcommand's module, in a room of ``tools/``, is imported only when it is called. Its functions:
 ``add_arguments(parser)`` and ``run(arguments) -> exit status``. What a person can put right, it
 raises: a SettingsError (exit status 2), any other SoftfingerError or an OSError about a file (1).
 """
@@ -15,26 +15,26 @@ from collections.abc import Sequence
 from softfinger import __version__
 from softfinger.daemon.errors import SettingsError, SoftfingerError
 
-SUBCOMMANDS = {
-    "run": "run the daemon; without --config, on the built-in simulated hand",
-    "emulate": "emulate a hand in its own process: servos and tactile boards on ptys",
-    "send": "send one command to the running daemon",
-    "monitor": "live page of the running daemon in the terminal",
-    "view": "show the running hand, or a recording, in Rerun's viewer: window or browser",
-    "record": "record the running daemon's stream into an MCAP file",
-    "replay": "publish a recording again, or recompute and compare it with today's code",
-    "analyse": "compute contact, force and energy over time from recorded pressure frames",
-    "plot": "draw a recording: over time, against the model, errors, timing",
-    "export": "export a recording's topics as CSV or Parquet",
-    "doctor": "check ports, servos, boards and this machine, and say what mends them",
-    "scan": "find the servos on a port, at any rate",
-    "calibrate": "calibrate the pressure sensor under a tip, step by step",
-    "limits": "list every limit: condition, consequence, setting",
-    "compile": "compile a hand's kernels ahead of its first start",
-    "keys": "make the keys that addresses outside this machine need",
-    "install-service": "print or write a systemd unit and udev rules",
-    "figures": "draw the paper's figures from this model, as CSV and PNG",
-    "bench": "measure run time, beside the usual alternatives",
+SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
+    "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
+    "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
+    "send": ("terminal", "send one command to the running daemon"),
+    "monitor": ("terminal", "live page of the running daemon in the terminal"),
+    "view": ("viewing", "show the running hand, or a recording, in Rerun's viewer"),
+    "record": ("recordings", "record the running daemon's stream into an MCAP file"),
+    "replay": ("recordings", "publish a recording again, or compare it with today's code"),
+    "analyse": ("analysis", "compute contact, force and energy over time from recorded frames"),
+    "plot": ("analysis", "draw a recording: over time, against the model, errors, timing"),
+    "export": ("recordings", "export a recording's topics as CSV or Parquet"),
+    "doctor": ("setup", "check ports, servos, boards and this machine, and say what mends them"),
+    "scan": ("setup", "find the servos on a port, at any rate"),
+    "calibrate": ("calibration", "calibrate the pressure sensor under a tip, step by step"),
+    "limits": ("setup", "list every limit: condition, consequence, setting"),
+    "compile": ("processes", "compile a hand's kernels ahead of its first start"),
+    "keys": ("setup", "make the keys that addresses outside this machine need"),
+    "install-service": ("setup", "print or write a systemd unit and udev rules"),
+    "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
+    "bench": ("benchmarks", "measure run time, beside the usual alternatives"),
 }
 
 
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     called = next((word for word in words if word in SUBCOMMANDS), None)
     subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND")
     module = None
-    for name, text in SUBCOMMANDS.items():
+    for name, (room, text) in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(
             name,
             help=text,
@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if name == called:
-            module = importlib.import_module(f"softfinger.tools.{name.replace('-', '_')}")
+            module = importlib.import_module(f"softfinger.tools.{room}.{name.replace('-', '_')}")
             module.add_arguments(subparser)
     arguments = parser.parse_args(words)
     if module is None:  # no words at all: argparse has refused everything else

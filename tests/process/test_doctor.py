@@ -22,8 +22,8 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
-from softfinger.tools import doctor
 from softfinger.tools.cli import main
+from softfinger.tools.setup import doctor
 from tests.harness.descendants import ending
 from tests.harness.emulated import HIL, emulated
 from tests.harness.gateway import Served

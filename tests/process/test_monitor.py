@@ -72,7 +72,7 @@ def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
 
 BREAKS_AT_THE_TENTH_PAGE = """
 import argparse, sys
-from softfinger.tools import monitor
+from softfinger.tools.terminal import monitor
 from softfinger.tools.terminal import monitor_page
 whole, count = monitor_page.Page.lines, 0
 def lines(*arguments):

@@ -15,8 +15,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from softfinger.daemon.wire import schema
-from softfinger.tools import plot
-from softfinger.tools.analysis import plots, plots_model
+from softfinger.tools.analysis import plot, plots, plots_model
 from softfinger.tools.analysis.plots_data import MODES, Missing, Run, load_run
 from softfinger.tools.cli import main
 from softfinger.tools.paper import style

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.tools import bench, cli
-from softfinger.tools.benchmarks import tick, wakeup
+from softfinger.tools import cli
+from softfinger.tools.benchmarks import bench, tick, wakeup
 from softfinger.tools.benchmarks.campaigns import accuracy
 from softfinger.tools.benchmarks.framework import interleaved
 from softfinger.tools.benchmarks.framework.campaign import RigError, run_trials, upper_bound

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from softfinger.tools import cli, figures
-from softfinger.tools.paper import style
+from softfinger.tools import cli
+from softfinger.tools.paper import figures, style
 from softfinger.tools.paper.integrals import double_integrals
 from softfinger.tools.paper.sheets import sheet
 

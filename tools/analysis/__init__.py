@@ -1,4 +1,4 @@
-"""From recorded pressure frames to contacts over time: sources, the pass over them, pictures.
+"""`analyse` and `plot`: recorded frames to contacts over time, and pictures of recordings.
 
-What ``softfinger analyse`` and ``softfinger plot`` are made of. The estimate is the daemon's own.
+The estimate is the daemon's own.
 """

@@ -1,4 +1,4 @@
-"""The measurements of ``softfinger bench``, one module each with ``measure(brief) -> list[Table]``.
+"""`bench`: its measurements, one module each with ``measure(brief) -> list[Table]``.
 
 ``PAGE`` names the rows that belong on the page: by a table's title, how their names begin.
 """

@@ -1,1 +1,1 @@
-"""Frames, steps and pictures of `softfinger calibrate`."""
+"""`calibrate`: its frames, steps and pictures."""

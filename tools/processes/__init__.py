@@ -1,1 +1,1 @@
-"""Processes beside the daemon: monitor, recorder, kernel compilation, log of events."""
+"""`run`, `emulate` and `compile`: the processes of a hand, what runs beside them, and their log."""

@@ -1,4 +1,4 @@
-"""Recordings of the stream in MCAP files: writing, reading, repairing, recomputing.
+"""`record`, `replay` and `export`: recordings of the stream in MCAP files.
 
 A message is JSON with the schema of its topic (`wire.schema_docs.json_schema`), so that Foxglove
 and PlotJuggler open the file; floats keep all their digits, NaN is null. Tactile frames are images:

@@ -1,1 +1,1 @@
-"""The live page of `softfinger monitor` in a terminal, and what it is drawn with."""
+"""`monitor` and `send`: the running daemon from a terminal, and what the live page is drawn with."""

@@ -1,1 +1,1 @@
-"""What ``softfinger view`` shows and how: the stream turned into Rerun's entities."""
+"""`view`: the stream, or a recording, turned into Rerun's entities."""

@@ -1,0 +1,1 @@
+"""What is done before a hand runs: `doctor`, `scan`, `keys`, `limits`, `install-service`."""
