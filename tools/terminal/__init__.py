@@ -1,1 +1,1 @@
-"""`monitor` and `send`: the running daemon from a terminal, and what the live page is drawn with."""
+"""`monitor` and `send`: the running daemon from a terminal, and the parts of the live page."""
