@@ -61,9 +61,13 @@ def test_force_and_energy_are_least_at_0_degrees(path: tuple[Sheet, ...]) -> Non
             at = np.argmin(rolling[f"{symbol} at {depth} mm"])
             assert abs(rolling[f"theta at {depth} mm"][at]) < 0.2
     for symbol in "FU":
-        # As far as noise lets the estimates say.
-        bounds = np.array([1.5, 0.5, 0.3, 0.3])
-        assert (np.abs(least[f"angle of the least {symbol} estimated"]) < bounds).all()
+        # As far as noise lets the estimates say; ten seeds scatter by about these errors.
+        found, error = (
+            least[f"angle of the least {symbol} estimated"],
+            least[f"its standard error, {symbol}"],
+        )
+        assert (np.abs(found) < 3.0 * error).all()
+        np.testing.assert_allclose(error, (0.45, 0.14, 0.07, 0.05), rtol=0.35)
     assert (least["RMS error of theta"] < 0.15).all()
     assert (least["RMS error of F"] < 1.2).all()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from softfinger.tools import cli
-from softfinger.tools.paper import figures, style
+from softfinger.tools.paper import appendix, figures, style
 from softfinger.tools.paper.integrals import double_integrals
 from softfinger.tools.paper.sheets import sheet
 
@@ -170,6 +171,24 @@ def test_path_of_tilt_and_roll(folder: Path) -> None:
         assert rotation[f"d up to {d} mm [mm]"][-1] == pytest.approx(d, rel=1e-12)
 
 
+@pytest.mark.parametrize("of", [appendix.printed_terms, appendix.integrated_terms])
+def test_checkpoints_of_the_appendix(of: Callable[..., appendix.Terms]) -> None:
+    a, d = 20.0, np.array(4.0)  # mm
+    expected = (31.939525311496, 1.7671458676443, 0.098174770424681)  # eqs. 16, 18 and 19
+    np.testing.assert_allclose(of(a, d), expected, rtol=1e-13)
+    assert appendix.limits(a, d)[1] == pytest.approx(0.92729521800161, rel=1e-14)  # eq. 17
+    assert of(a, d).energy(a, 0.304, d) == pytest.approx(20.374275556081, rel=1e-12)
+
+
+def test_the_appendix_over_displacement(folder: Path) -> None:
+    columns = read(folder / "fig11.csv")
+    d = columns["d [mm]"]
+    for how in ("as printed", "integrated"):
+        # The terms cancel, to a part in 10⁴ at 0.1 mm.
+        np.testing.assert_allclose(columns[f"U {how} [mJ]"], np.pi * 0.304 / 3 * d**3, rtol=1e-7)
+    np.testing.assert_allclose(columns["theta_max [deg]"] + columns["p [deg]"], 90.0, rtol=1e-13)
+
+
 def test_every_figure_has_picture_and_errata(folder: Path) -> None:
     from matplotlib.image import imread
 
@@ -193,6 +212,8 @@ def test_every_figure_has_picture_and_errata(folder: Path) -> None:
     assert "1/cos θ" in holds["fig4b"]
     assert "1/cos² θ" in holds["fig5b"]
     assert "rises with strain" in holds["fig3"]
+    assert "dt" in holds["fig11"]
+    assert "polar coordinates" in holds["fig11"]
 
 
 def test_errata_and_labels_stand_in_the_pictures() -> None:

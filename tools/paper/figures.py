@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from softfinger.tools.paper.sheets import Page
 
-NAMES = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig7_run", "fig10", "fig10_run")
+NAMES = (
+    *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
+    *("fig7", "fig7_run", "fig10", "fig10_run", "fig11"),
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,9 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, Page]:
     """All figures by name."""
-    from softfinger.tools.paper import experiment_pages, model_pages, run_pages
+    from softfinger.tools.paper import appendix, experiment_pages, model_pages, run_pages
 
-    found = {**model_pages.PAGES, **experiment_pages.PAGES, **run_pages.PAGES}
+    pages = (model_pages.PAGES, experiment_pages.PAGES, run_pages.PAGES, appendix.PAGES)
+    found = {name: page for each in pages for name, page in each.items()}
     return {name: found[name] for name in NAMES}
 
 
