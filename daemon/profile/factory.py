@@ -21,7 +21,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 def make_tip(settings: Settings) -> Fingertip:
     """The fingertip."""
-    return Fingertip(radius=settings.tip.radius)
+    tip = settings.tip
+    return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base)
 
 
 def make_material(law: MaterialLaw) -> Material:
@@ -51,7 +52,7 @@ def make_table(
     tolerance = settings.table.tolerance
     warn = warnings.warn if on_event is None else partial(on_event, "warning", "table")
     try:
-        if cache is None:
+        if cache is None or tip.physics == "solid":  # which takes no time to make
             return ContactTable.build(tip, material, tolerance=tolerance)
         return load_or_build(cache, tip, material, tolerance, warn)
     except TableError as error:

@@ -84,6 +84,21 @@ def _timing(settings: Settings) -> Iterator[str]:
             yield f"servos.{key}: found {value:g} s, expected above two ticks, {2.0 * period:g} s"
 
 
+def _solid_tip(settings: Settings) -> Iterator[str]:
+    if settings.tip.physics != "solid":
+        return
+    if settings.material.law != "constant":
+        yield f'material.law: found "{settings.material.law}", expected "constant" for a solid tip'
+    if settings.estimator.method != "ml":
+        yield 'estimator.method: found "moments", expected "ml" for a solid tip'
+    deepest = 0.4 * settings.tip.radius
+    if settings.safety.d_max > deepest:
+        yield (
+            f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {deepest:g} m, "
+            "0.4 of a solid tip's radius"
+        )
+
+
 def _material(settings: Settings) -> Iterator[str]:
     material = settings.material
     if material.law != "points":
@@ -214,6 +229,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...]
     (("scene", "servos"), _servos),
     (("servos", "loop"), _timing),
     (("material",), _material),
+    (("tip", "material", "estimator", "safety"), _solid_tip),
     (("simulation",), _wedge),
     (("tactile",), _cells),
     (("scene", "tactile"), _recordings),

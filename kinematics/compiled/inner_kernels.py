@@ -46,6 +46,15 @@ class InnerKernel:
             tuple(types.unliteral(each) for each in args), kws
         )
 
+    def also(self, other: InnerKernel, takes: Callable[[Any], bool]) -> None:
+        """Let ``other`` be compiled instead where ``takes`` the type of the first argument."""
+        mine, others = self._dispatcher, other._dispatcher
+        template, overload = mine.get_call_template, mine.get_overload
+        mine.get_call_template = lambda args, kws: (
+            others.get_call_template if takes(args[0]) else template
+        )(args, kws)
+        mine.get_overload = lambda sig: (others.get_overload if takes(sig[0]) else overload)(sig)
+
     @property
     def _numba_type_(self) -> Any:
         """By this Numba knows what a compiled caller means."""

@@ -20,8 +20,8 @@ LANES = 5  # polynomials
 STRIDE = 8  # numbers stored for each coefficient: the lanes, padded to a vector register
 
 # Shapes by number: how many powers of x each power of y has, the lowest first. Squares, then
-# shapes cut to what an analytic function needs for one precision after the other, and the shape
-# for a narrow strip of x.
+# shapes cut to what an analytic function needs for one precision after the other, the shape for a
+# narrow strip of x, and that of a solid tip.
 SHAPES: tuple[tuple[int, ...], ...] = (
     (),
     (2,) * 2,
@@ -32,6 +32,7 @@ SHAPES: tuple[tuple[int, ...], ...] = (
     (9, 8, 8, 7, 7, 7, 6, 6, 5, 5, 5, 4, 4, 4, 3, 3, 3, 2, 1, 1),
     (10, 9, 9, 9, 9, 8, 8, 7, 7, 7, 6, 6, 6, 6, 5, 5, 5, 5, 4, 4, 4, 3, 3, 2, 2, 1),
     (8,) * 15,
+    (12,) * 6,
 )
 SIZES = tuple(STRIDE * sum(shape) for shape in SHAPES)  # numbers of one set of coefficients
 

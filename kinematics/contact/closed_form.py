@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,15 +25,35 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
+POISSON = (0.45, 0.4995)  # of a solid tip: what its data cover
+
+
+Physics = Literal["springs", "solid"]
+Base = Literal["bonded", "lying"]
 
 
 @dataclass(frozen=True)
 class Fingertip:
-    """A hemispherical soft tip of ``radius`` a [m]. Raises ValueError unless a is positive."""
+    """A hemispherical soft tip of ``radius`` a [m].
+
+    ``physics`` says how it gives way: as independent "springs", or as "solid" rubber, linear
+    elastic with the ratio ``poisson``, its ``base`` "bonded" to the sensor or "lying" on it; the
+    last two are for solid tips alone. Raises ValueError for values out of their range.
+    """
 
     radius: float
+    physics: Physics = "springs"
+    poisson: float = 0.49
+    base: Base = "bonded"
 
     def __post_init__(self) -> None:
+        for name, known in (("physics", get_args(Physics)), ("base", get_args(Base))):
+            if getattr(self, name) not in known:
+                expected = " or ".join(map(repr, known))
+                raise ValueError(f"{name} must be {expected}, not {getattr(self, name)!r}")
+        if not POISSON[0] <= self.poisson <= POISSON[1]:
+            low, high = POISSON
+            raise ValueError(f"poisson must be {low} to {high}, not {self.poisson!r}")
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
             raise ValueError(f"the tip's radius must be positive and finite, not {self.radius!r}")

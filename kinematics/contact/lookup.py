@@ -331,6 +331,15 @@ def lookup(data: FloatArray, d: float, theta: float) -> Six:
 
 
 @inlined_kernel
+def stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
+    """∂F/∂d [N/m] of an upright tip at d = ``reach`` [m]; ``scale`` is 2πE [Pa].
+
+    E is the modulus at no strain.
+    """
+    return scale * reach
+
+
+@inlined_kernel
 def _coordinates(p: Pointer, d: FloatArray, theta: FloatArray, work: FloatArray) -> None:
     """y, h, 1/cos θ and tan θ of a block into ``work`` [4 * _BLOCK].
 

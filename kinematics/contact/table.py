@@ -29,6 +29,7 @@ from softfinger.kinematics.contact.lookup import (
     lookups,
 )
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.solid_lookup import SolidTable, solid_lookups, solid_table
 from softfinger.kinematics.contact.table_build import build
 
 FloatArray = NDArray[np.float64]
@@ -76,12 +77,14 @@ class ContactTable:
 
     ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the largest
     relative error of any output that was found. The domain is 0 < d ≤ a and
-    |θ| ≤ asin((a − d)/a).
+    |θ| ≤ asin((a − d)/a). A solid tip's ``data`` is a :class:`SolidTable`, which is exact for the
+    data of `solid_data`, so that ``max_error`` is theirs, and the domain what they cover.
     """
 
-    def __init__(self, data: FloatArray) -> None:
-        self.data = data
-        self.header = header_of(data)
+    def __init__(self, data: Any) -> None:
+        self.data: Any = data
+        self.is_solid = bool(self.data.dtype == SolidTable.dtype)
+        self.header: Any = SolidTable(self.data) if self.is_solid else header_of(self.data)
         self.max_error = self.header.max_error
 
     @classmethod
@@ -97,14 +100,17 @@ class ContactTable:
         ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
 
         ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
-        with the best that was reached, when the tolerance can't be met within 256 KiB.
+        with the best that was reached, when the tolerance can't be met within 256 KiB. For a
+        solid tip they say nothing; it raises MaterialError unless the modulus is constant.
         """
+        if tip.physics == "solid":
+            return cls(solid_table(tip, material).array)
         return cls(build(tip, material, tolerance, form))
 
     def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
         """The table with its key and checksum, for :meth:`from_bytes` to read again."""
         key = table_key(tip, material, self.tolerance)
-        body = key + struct.pack("<Q", self.data.size) + self.data.astype("<f8").tobytes()
+        body: bytes = key + struct.pack("<Q", self.data.size) + self.data.astype("<f8").tobytes()
         return _MAGIC + hashlib.sha256(body).digest() + body
 
     @classmethod
@@ -131,7 +137,8 @@ class ContactTable:
     @property
     def tolerance(self) -> float:
         """The tolerance it was built to."""
-        return self.header.tolerance
+        tolerance: float = self.header.tolerance
+        return tolerance
 
     @property
     def certificate(self) -> Certificate:
@@ -160,7 +167,7 @@ class ContactTable:
         shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)
-        lookups(self.data, depth, tilt, out, within)
+        (solid_lookups if self.is_solid else lookups)(self.data, depth, tilt, out, within)
         f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
         return Contact(f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -36,6 +37,7 @@ from softfinger.kinematics.sensing.footprint import (
     set_extremes,
     set_face,
 )
+from softfinger.kinematics.sensing.solid_pressure import SolidPressure, pictures
 
 OWNERS = 256  # cells whose nodes are evaluated at once
 
@@ -196,7 +198,8 @@ class SensorGrid:
 
         ``d`` [m] is the displacement, the tilts [rad] give the object's normal
         (sin tilt_x, sin tilt_y, …). Accurate to 1e-6 of the modulus, cut cells included; with a
-        blur to 5e-4, mostly to 1e-5. ``out`` is written and returned if given. Raises ValueError
+        blur to 5e-4, mostly to 1e-5. A solid tip's is as exact as `solid_data` say, and ends where
+        they do. ``out`` is written and returned if given. Raises ValueError
         for a d that is not finite or exceeds the radius, and for tilts whose normal would point
         into the tip.
         """
@@ -205,6 +208,11 @@ class SensorGrid:
             out = np.empty(self.shape)
         elif out.shape != self.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
             raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
+        if tip.physics == "solid":
+            SolidPressure(tip, material, self.pictures(tip))(
+                d, *self.to_sensor(n_x, n_y), gain, out
+            )
+            return out
         work = Rendering(np.empty(1, Rendering.dtype))
         work.d, work.gain = d, gain
         work.n_x, work.n_y = self.to_sensor(n_x, n_y)
@@ -221,6 +229,10 @@ class SensorGrid:
         out[:] = average(fine, *stencils, n)
         return out
 
+    def pictures(self, tip: Fingertip) -> FloatArray:
+        """The cells' means of a solid tip's modes, see `solid_pressure`: [pictures, cells]."""
+        return _pictures(self, tip)
+
     def finer(self, parts: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:
         """The blur's stencils along x and y in parts of cells, and the unblurred grid of all parts.
 
@@ -236,6 +248,16 @@ class SensorGrid:
             blur=0.0,
         )
         return (across, along), finer
+
+
+@lru_cache(maxsize=4)
+def _pictures(grid: SensorGrid, tip: Fingertip) -> FloatArray:
+    if grid.blur == 0.0:
+        return pictures(tip, grid.on(tip))
+    n = parts(grid.blur / grid.pitches[0]), parts(grid.blur / grid.pitches[1])
+    stencils, finer = grid.finer(n)
+    fine = pictures(tip, finer.on(tip)).reshape(-1, *finer.shape)
+    return np.stack([average(each, *stencils, n).ravel() for each in fine])
 
 
 def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float, float]:

@@ -64,7 +64,9 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     p.step = step
     p.sample_period = 1.0 / settings.tactile.rate
     p.modulus = float(table.header.modulus) * simulation.modulus_scale
-    p.radius = settings.tip.radius
+    p.radius = p.deepest = settings.tip.radius
+    if table.is_solid:
+        p.deepest = float(table.header.deepest)
     p.scale = simulation.modulus_scale
     p.friction = simulation.tip_friction
     p.loss = simulation.tip_loss
@@ -95,6 +97,8 @@ def _object(p: Parameters, settings: Settings) -> None:
     # κ of a face with that radius, see tip.py.
     curved = shape.roundness
     p.share = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
+    if settings.tip.physics == "solid":
+        p.share = math.sqrt(p.share)
     p.mass = mass
     p.inertia = mass * shape.gyration**2
     p.gravity[:] = simulation.gravity

@@ -92,6 +92,7 @@ class Parameters(Record):
     sample_period: float  # [s]
     modulus: float  # of the real tip at zero strain [Pa]
     radius: float  # of the tips [m]
+    deepest: float  # d up to which their law holds [m]
     scale: float  # real modulus over the table's
     friction: float
     loss: float  # damping over stiffness [s]

@@ -19,7 +19,9 @@ order in d: the footprint is narrower along the tilt by κ² = R/(R + a), the cu
 1/a + 1/R, and force and energy are κ times those of the plane, whatever θ. Integrals over the very
 springs, for a constant modulus, a = 20 mm and d up to 8 mm, are within 1.6 % of that upright and
 within 4.5 % at 30° for R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm. The sensor's frame is
-rendered from those springs (`sensor.curved_face`), so its sum differs by as much.
+rendered from those springs (`sensor.curved_face`), so its sum differs by as much. A solid tip's
+force goes with d^(3/2) and by √κ, as Hertz's does between a sphere and a cylinder in the limit of
+small d; its frame is the plane's with that share.
 
 Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
 ratio |T|/N can't reach μ (with a constant E it can't exceed 1 at θ = 0), the tip slips at its
@@ -43,7 +45,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.contact.lookup import lookup_at
+from softfinger.kinematics.contact.lookup import lookup_at, stiffness_ahead
 
 D_MIN = 1e-9  # m, less is no contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
@@ -132,7 +134,8 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
         tangent = sine * inverse_cosine
-        coming = 2.0 * math.pi * p.modulus * gain * tip.reach * inverse_cosine
+        coming = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.reach)
+        coming *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
         # The soft part within its range; d_soft_d, d_soft_theta are d_soft's derivatives.
         radius = p.radius
@@ -146,6 +149,10 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
                 d_soft = limit
                 d_soft_d = 0.0
                 d_soft_theta = -radius * sine * cosine / bent
+        if d_soft > p.deepest:
+            d_soft = p.deepest
+            d_soft_d = 0.0
+            d_soft_theta = 0.0
         force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(table, d_soft, tip.theta)
         scale = p.scale
         force *= scale

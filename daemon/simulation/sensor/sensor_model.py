@@ -20,6 +20,7 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.blur import average, parts
 from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
+from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 
 FloatArray = NDArray[np.float64]
 
@@ -120,6 +121,10 @@ class SensorModel:
             self._parts = n_x, n_y
             self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._parts)
             self._rendered = np.zeros(cells.shape)
+        self._solid: SolidPressure | None = None
+        if tip.physics == "solid":
+            blurred = replace(grid, blur=flaws.blur)
+            self._solid = SolidPressure(tip, material, blurred.pictures(tip))
         self._plane, self._curved = Rendering(), CurvedContact()
         for contact in (self._plane, self._curved):
             contact.grid.assign(cells.on(tip))
@@ -162,26 +167,36 @@ class SensorModel:
         self.read(out)
 
     def press(
-        self, d: float, tilt_x: float, tilt_y: float, t: float = 0.0, bend: float = 0.0
+        self,
+        d: float,
+        tilt_x: float,
+        tilt_y: float,
+        t: float = 0.0,
+        bend: float = 0.0,
+        share: float = 1.0,
     ) -> None:
         """Let the cells feel the contact of time ``t`` without reading them.
 
         ``bend`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face: that
-        of a cylinder whose axis is along the finger's y.
+        of a cylinder whose axis is along the finger's y. A solid tip shows it as a ``share`` of the
+        plane's pressure alone.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
         elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
         self._t = t
-        contact = self._curved if bend > 0.0 else self._plane
-        contact.d, contact.n_x, contact.n_y = d, n_x, n_y
-        if bend > 0.0:
-            self._curved.bend = bend
-            render_curved(self._curved.array, self._law, self._rendered)
+        if self._solid is not None:
+            self._solid(d, n_x, n_y, share, pressure)
         else:
-            render(self._plane.array, self._law, self._rendered)
-        if flaws.blur > 0.0:
-            pressure[:] = average(self._rendered, *self._stencils, self._parts)
+            contact = self._curved if bend > 0.0 else self._plane
+            contact.d, contact.n_x, contact.n_y = d, n_x, n_y
+            if bend > 0.0:
+                self._curved.bend = bend
+                render_curved(self._curved.array, self._law, self._rendered)
+            else:
+                render(self._plane.array, self._law, self._rendered)
+            if flaws.blur > 0.0:
+                pressure[:] = average(self._rendered, *self._stencils, self._parts)
         if flaws.hysteresis > 0.0:
             sensor_effects.hysteresis(pressure, flaws.hysteresis, self._plays)
         if flaws.creep > 0.0:

@@ -59,6 +59,7 @@ class SimulatedTactile:
         self._shape = (tactile.rows, tactile.cols)
         self._model = make_sensor_model(settings, finger)
         self._radius = settings.tip.radius
+        self._solid = settings.tip.physics == "solid"
         self._pressed = -1  # number of the newest sample that the cells have felt
         self._frame: Frame | None = None
         self._lost = 0
@@ -123,9 +124,13 @@ class SimulatedTactile:
         finger = self._finger
         d, theta = float(sample.d[finger]), float(sample.theta[finger])
         share, bend = float(sample.gain[finger]), float(sample.bend[finger])
+        if abs(theta) >= 0.5 * math.pi:
+            d = 0.0
+        if self._solid:
+            self._model.press(d, theta, 0.0, number * self._period, bend, share)
+            return True
         # What is left without the curvature's own share, which the cells are to show themselves.
         share *= math.sqrt(1.0 + bend * self._radius)
         # Force goes with d²: half a tip on the face's edge presses with half the force.
-        d = d * math.sqrt(share) if abs(theta) < 0.5 * math.pi else 0.0
-        self._model.press(d, theta, 0.0, number * self._period, bend)
+        self._model.press(d * math.sqrt(share), theta, 0.0, number * self._period, bend)
         return True

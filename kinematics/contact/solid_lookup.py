@@ -1,0 +1,176 @@
+"""The lookup kernel of a solid tip's contact table, and the record that it reads.
+
+One polynomial g(t, sin² θ), t = √(d/a), and its partials give all six outputs from one energy
+U = E a³ t⁵ g (see `solid_data`), so that they agree with each other to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, TypeAlias, cast
+
+import numba
+import numpy as np
+from numba.core import types
+from numba.core.extending import intrinsic
+from numpy.polynomial import chebyshev
+
+from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Record, Records
+from softfinger.kinematics.compiled.simd import (
+    SHAPES,
+    SIZES,
+    STRIDE,
+    Pointer,
+    address,
+    polynomials,
+)
+from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
+from softfinger.kinematics.contact.lookup import Six, lookup_at, stiffness_ahead
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.material_fit import MaterialError
+from softfinger.kinematics.contact.solid_data import FloatArray, SolidData, powers, solid_data
+
+_SHAPE = 9
+
+Lanes: TypeAlias = tuple[float, float, float, float, float]
+
+
+class SolidTable(Record):
+    """A solid tip's table: g and its partials by t, t twice, sin² θ, and both, in SIMD lanes."""
+
+    radius: float  # [m]
+    modulus: float  # [Pa]
+    inverse_radius: float
+    deepest: float  # d up to which it holds [m]
+    tilt: float  # |θ| likewise [rad]
+    by_root: float  # 2/largest t
+    by_square: float  # 2/largest sin² θ
+    at_first: float  # g at t = 0: Hertz's
+    tolerance: float
+    max_error: float  # of the data, relative
+    worst_d: float
+    worst_theta: float
+    coefficients: Annotated[FloatArray, SIZES[_SHAPE]]
+
+
+def solid_table(tip: Fingertip, material: Material) -> SolidTable:
+    """The table of a solid ``tip``. Raises MaterialError unless the material is linear."""
+    if not material.is_linear:
+        raise MaterialError("a solid tip's material must have a constant modulus")
+    data, table = solid_data(tip), SolidTable()
+    table.radius, table.inverse_radius = tip.radius, 1.0 / tip.radius
+    table.modulus = material.reference_modulus
+    table.deepest = data.root**2 * tip.radius
+    table.tilt = math.asin(math.sqrt(data.square))
+    table.by_root, table.by_square = 2.0 / data.root, 2.0 / data.square
+    table.at_first = 8.0 / (15.0 * (1.0 - tip.poisson**2))
+    table.max_error = data.error
+    table.coefficients = _numbers(data)
+    return table
+
+
+def _numbers(data: SolidData) -> FloatArray:
+    """g and its partials as the numbers that `compiled.simd` evaluates."""
+    by_t = chebyshev.chebder(data.energy, axis=0) * (2.0 / data.root)
+    by_tt = chebyshev.chebder(by_t, axis=0) * (2.0 / data.root)
+    by_s, by_ts = (
+        chebyshev.chebder(each, axis=1) * (2.0 / data.square) for each in (data.energy, by_t)
+    )
+    terms, rows = SHAPES[_SHAPE][0], len(SHAPES[_SHAPE])
+    out = np.zeros((rows, terms, STRIDE))
+    for lane, each in enumerate((data.energy, by_t, by_tt, by_s, by_ts)):
+        i, j = each.shape
+        out[:j, terms - i :, lane] = powers(each)[::-1].T
+    return out.reshape(-1)
+
+
+def _record(context: Any, start: Any) -> Any:
+    """Signature and code generator; see :data:`solid_at`."""
+    record = numba.from_dtype(SolidTable.dtype)
+
+    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], codegen.get_value_type(record))
+
+    return record(start), generate
+
+
+# solid_at(address): the record at the address of an array of one.
+solid_at: Callable[[Pointer], SolidTable] = cast(Any, intrinsic)(_record)
+
+
+@inlined_kernel
+def energy_lanes(table: SolidTable, t: float, square: float) -> Lanes:
+    """g(t, sin² θ), ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ."""
+    x = t * table.by_root - 1.0
+    y = square * table.by_square - 1.0
+    lanes: Lanes = polynomials(address(table.coefficients), 0, 9, x, y)
+    return lanes
+
+
+@inner_kernel
+def _solid_lookup_at(p: Pointer, d: float, theta: float) -> Six:
+    """As `lookup.lookup_at`; where |θ| is beyond the data, the energy stays with θ, d being kept.
+
+    The partials are those of that energy, and the force goes on with cos θ.
+    """
+    table = solid_at(p)
+    if math.isnan(d) or math.isnan(theta):
+        nan = math.nan
+        return nan, nan, nan, nan, nan, nan, False
+    if d <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
+    within = abs(theta) <= table.tilt
+    inside = within and d <= table.deepest
+    angle = min(max(theta, -HALF_PI), HALF_PI)
+    s = math.sin(angle)
+    c = math.cos(angle)
+    t = math.sqrt(min(d, table.deepest) * table.inverse_radius)
+    square = s * s if within else 2.0 / table.by_square
+    g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
+    # Before t³ and its like; the chain from sin² θ to θ is 2 sin θ cos θ.
+    chain = 2.0 * s * c if within else 0.0
+    a = table.radius
+    size = table.modulus * a * a * t * t * t
+    depth = a * t * t
+    push = size * (2.5 * g + 0.5 * t * g_t)
+    stiffness = 0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
+    push_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
+    return (
+        c * push,
+        size * depth * g,
+        c * stiffness,
+        c * push_theta - s * push,
+        push,
+        chain * size * depth * g_s,
+        inside,
+    )
+
+
+@inner_kernel
+def _solid_stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
+    """As `lookup.stiffness_ahead`: Hertz's ∂N/∂d at d = ``reach``."""
+    table = solid_at(p)
+    stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
+    return stiffness * math.sqrt(reach * table.radius)
+
+
+@kernel
+def solid_lookups(
+    tables: Records[SolidTable], d: FloatArray, theta: FloatArray, out: FloatArray, inside: Any
+) -> None:
+    """As `lookup.lookups`."""
+    p = address(tables)
+    for k in range(d.shape[0]):
+        out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
+            _solid_lookup_at(p, d[k], theta[k])
+        )
+
+
+def _is_solid(start: Any) -> bool:
+    return isinstance(start.dtype, types.Record)
+
+
+cast(Any, lookup_at).also(_solid_lookup_at, _is_solid)
+cast(Any, stiffness_ahead).also(_solid_stiffness_ahead, _is_solid)

@@ -1,0 +1,242 @@
+"""The forward model of a solid tip: a frame is a sum of fixed pictures, the modes of `solid_data`.
+
+A mode makes one picture of a grid's cells, or two where it has a direction: B(r) cos mφ and
+B(r) sin mφ, averaged over each cell. What each counts in a contact are its weights, smooth in
+(d, n_x, n_y). The sensor feels no pull: where the sum is below 0 a cell reads 0.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Record, Records
+from softfinger.kinematics.compiled.simd import Pointer, address, further
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.solid_data import powers, solid_data
+from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes, solid_table
+from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
+
+MODES = 24
+PICTURES = 2 * MODES
+ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
+
+_INSIDE, _CUT = 6, 24  # points a side of a cell, and of one that the rim cuts
+
+
+class Weights(Record):
+    """What each picture counts in one contact: their sum is the pressure over E; see `weigh`."""
+
+    table: SolidTable
+    modes: int
+    pictures: int
+    harmonics: Annotated[IntArray, MODES]
+    shares: Annotated[FloatArray, SQUARE_TERMS, ROOT_TERMS, MODES]  # by powers of x and y
+    q: Annotated[FloatArray, MODES]
+    q_x: Annotated[FloatArray, MODES]
+    q_y: Annotated[FloatArray, MODES]
+    row: Annotated[FloatArray, MODES]  # scratch
+    slope: Annotated[FloatArray, MODES]
+    value: Annotated[FloatArray, PICTURES]
+    by_d: Annotated[FloatArray, PICTURES]
+    by_x: Annotated[FloatArray, PICTURES]
+    by_y: Annotated[FloatArray, PICTURES]
+
+
+def weights_of(tip: Fingertip, material: Material) -> Weights:
+    """A solid tip's modes, without a contact yet. Raises MaterialError for one not linear."""
+    data, weights = solid_data(tip), Weights()
+    weights.table.assign(solid_table(tip, material))
+    count, i, j = data.shares.shape
+    weights.modes, weights.pictures = count, pictures_of(data.harmonics)
+    weights.harmonics[:count] = data.harmonics
+    weights.shares[:j, :i, :count] = np.stack([powers(each).T for each in data.shares], axis=-1)
+    return weights
+
+
+def pictures_of(harmonics: IntArray) -> int:
+    """How many pictures the modes make."""
+    return int(len(harmonics) + np.count_nonzero(harmonics))
+
+
+def pictures(tip: Fingertip, cells: Grid) -> FloatArray:
+    """The modes' means over each cell, float64 [pictures, rows · cols]."""
+    data = solid_data(tip)
+    out = np.zeros((pictures_of(data.harmonics), cells.rows * cells.cols))
+    x, y = (
+        (low + pitch * np.arange(count)) / cells.radius
+        for low, pitch, count in (
+            (cells.x, cells.pitch_x, cells.cols),
+            (cells.y, cells.pitch_y, cells.rows),
+        )
+    )
+    width, height = cells.pitch_x / cells.radius, cells.pitch_y / cells.radius
+    near = np.hypot(*np.meshgrid(_nearest(x, width), _nearest(y, height)))
+    far = np.hypot(*np.meshgrid(np.maximum(-x, x + width), np.maximum(-y, y + height)))
+    for points, chosen in ((_INSIDE, far <= 1.0), (_CUT, (near < 1.0) & (far > 1.0))):
+        rows, cols = np.nonzero(chosen)
+        place = (np.arange(points) + 0.5) / points
+        at_x = x[cols, None, None] + width * place[None, None, :]
+        at_y = y[rows, None, None] + height * place[None, :, None]
+        z = (at_x + 1j * at_y).reshape(len(rows), -1)
+        out[:, rows * cells.cols + cols] = _means(tip, z)
+    return out
+
+
+def _nearest(low: NDArray[Any], width: float) -> NDArray[Any]:
+    return np.asarray(np.maximum(np.maximum(low, -(low + width)), 0.0))
+
+
+def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
+    """Means of all pictures over the points x + i y [cells, points], 0 beyond the rim."""
+    data = solid_data(tip)
+    middle = 0.5 * (data.edges[1:] + data.edges[:-1])
+    r = np.abs(z)
+    inside = (r < 1.0) / z.shape[1]
+    turn = z / np.maximum(r, 1e-12)
+    found: list[FloatArray] = []
+    for m, mode in zip(data.harmonics.tolist(), data.modes, strict=True):
+        # Where m > 0 a mode goes to 0 at the middle.
+        start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
+        end = 1.5 * mode[-1] - 0.5 * mode[-2]
+        value = np.interp(r, [0.0, *middle, 1.0], [start, *mode, end]) * inside
+        found.append((value * (turn**m).real).sum(axis=1))
+        if m:
+            found.append((value * (turn**m).imag).sum(axis=1))
+    return np.stack(found)
+
+
+@inner_kernel
+def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
+    """The weights of a contact and their partials by d [m], n_x and n_y, for pressures in Pa."""
+    table = weights.table
+    square = n_x * n_x + n_y * n_y
+    t = math.sqrt(d * table.inverse_radius)
+    x = t * table.by_root - 1.0
+    y = square * table.by_square - 1.0
+    g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
+    # The push over a², and its partials by t and sin² θ.
+    push = table.modulus * t * t * t * (2.5 * g + 0.5 * t * g_t)
+    push_t = 0.5 * table.modulus * t * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
+    push_s = table.modulus * t * t * t * (2.5 * g_s + 0.5 * t * g_ts)
+    t_d = 0.5 * table.inverse_radius / t
+    cosine = math.sqrt(1.0 - square)
+    value = weights.value
+    by_d = weights.by_d
+    by_x = weights.by_x
+    by_y = weights.by_y
+    value[0] = push * cosine
+    by_d[0] = push_t * t_d * cosine
+    both = 2.0 * push_s * cosine - push / cosine
+    by_x[0] = n_x * both
+    by_y[0] = n_y * both
+    _evaluate_shares(weights, x, y)
+    at = 1
+    for k in range(1, weights.modes):
+        q = weights.q[k]
+        q_t = weights.q_x[k] * table.by_root
+        q_s = weights.q_y[k] * table.by_square
+        share = push * q
+        share_d = (push_t * q + push * q_t) * t_d
+        share_s = 2.0 * (push_s * q + push * q_s)
+        m = weights.harmonics[k]
+        # (n_x + i n_y)^m and its derivative over m.
+        power = 1.0 + 0.0j
+        below = 0.0j
+        for _ in range(m):
+            below = power
+            power *= complex(n_x, n_y)
+        value[at] = share * power.real
+        by_d[at] = share_d * power.real
+        by_x[at] = share_s * n_x * power.real + share * m * below.real
+        by_y[at] = share_s * n_y * power.real - share * m * below.imag
+        at += 1
+        if m > 0:
+            value[at] = share * power.imag
+            by_d[at] = share_d * power.imag
+            by_x[at] = share_s * n_x * power.imag + share * m * below.imag
+            by_y[at] = share_s * n_y * power.imag + share * m * below.real
+            at += 1
+
+
+@fast_inner_kernel
+def _evaluate_shares(weights: Weights, x: float, y: float) -> None:
+    """q of each mode, and its partials by x and y, all modes side by side in SIMD lanes."""
+    shares = address(weights.shares)
+    q = address(weights.q)
+    q_x = address(weights.q_x)
+    q_y = address(weights.q_y)
+    row = address(weights.row)
+    slope = address(weights.slope)
+    for k in range(MODES):
+        q[k] = q_x[k] = q_y[k] = 0.0
+    for j in range(SQUARE_TERMS - 1, -1, -1):
+        for k in range(MODES):
+            row[k] = slope[k] = 0.0
+        for i in range(ROOT_TERMS - 1, -1, -1):
+            c = further(shares, (j * ROOT_TERMS + i) * MODES)
+            for k in range(MODES):
+                slope[k] = slope[k] * x + row[k]
+                row[k] = row[k] * x + c[k]
+        for k in range(MODES):
+            q_y[k] = q_y[k] * y + q[k]
+            q[k] = q[k] * y + row[k]
+            q_x[k] = q_x[k] * y + slope[k]
+
+
+@fast_inner_kernel
+def add_picture(picture: Pointer, weight: float, first: int, last: int, out: Pointer) -> None:
+    """Add ``weight`` times the picture's cells first..last to ``out``."""
+    for k in range(first, last):
+        out[k] += weight * picture[k]
+
+
+@kernel
+def render_solid(
+    weights: Records[Weights],
+    shown: FloatArray,
+    contact: tuple[float, float, float],
+    gain: float,
+    out: FloatArray,
+) -> None:
+    """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
+
+    ``shown`` are the grid's pictures. d ≤ 0 gives zeros; beyond what the data cover the deepest
+    and the most tilted contact of that azimuth.
+    """
+    each = weights[0]
+    table = each.table
+    d, n_x, n_y = contact
+    out[:] = 0.0
+    if not (d > 0.0 and n_x * n_x + n_y * n_y < 1.0):
+        return
+    tilt = math.hypot(n_x, n_y)
+    most = math.sin(table.tilt)
+    if tilt > most:
+        n_x *= most / tilt
+        n_y *= most / tilt
+    weigh(each, min(d, table.deepest), n_x, n_y)
+    cells = out.size
+    start = address(out)
+    for k in range(each.pictures):
+        picture = further(address(shown), k * cells)
+        add_picture(picture, gain * each.value[k], 0, cells, start)
+    for k in range(cells):
+        start[k] = max(start[k], 0.0)
+
+
+class SolidPressure:
+    """What one tip of one material presses on the cells of given ``shown`` pictures."""
+
+    def __init__(self, tip: Fingertip, material: Material, shown: FloatArray) -> None:
+        self._weights = weights_of(tip, material).array
+        self._shown = shown
+
+    def __call__(self, d: float, n_x: float, n_y: float, gain: float, out: FloatArray) -> None:
+        """As :func:`render_solid`."""
+        render_solid(self._weights, self._shown, (d, n_x, n_y), gain, out)
