@@ -90,7 +90,7 @@ class Hand(Section):
 class Tip(Section):
     """The soft hemispherical fingertip: the paper's springs, or solid rubber."""
 
-    radius: Length = 0.020
+    radius: Annotated[float, Field(ge=1e-4, le=1)] = 0.020
     physics: Literal["springs", "solid"] = "springs"
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor

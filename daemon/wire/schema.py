@@ -281,7 +281,7 @@ class HandSettings(_Announcement):
     calibration_left: str = field("", "the left sensor's calibration as JSON, or empty")
     calibration_right: str = field("", "the right sensor's")
     table_left: str = field(
-        "", "the left tip's contact table: form, tolerance, certificate (largest error found)"
+        "", "the left tip's contact table: form, tolerance, certificate (bound of its error)"
     )
     table_right: str = field("", "the right tip's")
 

@@ -25,6 +25,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
+LARGEST = 1.0  # m of radius; a larger number is one of millimetres
 POISSON = (0.45, 0.4995)  # of a solid tip: what its data cover
 
 
@@ -38,7 +39,8 @@ class Fingertip:
 
     ``physics`` says how it gives way: as independent "springs", or as "solid" rubber, linear
     elastic with the ratio ``poisson``, its ``base`` "bonded" to the sensor or "lying" on it; the
-    last two are for solid tips alone. Raises ValueError for values out of their range.
+    last two are for solid tips alone. Raises ValueError for values out of their range; a radius is
+    at most 1 m.
     """
 
     radius: float
@@ -57,6 +59,11 @@ class Fingertip:
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
             raise ValueError(f"the tip's radius must be positive and finite, not {self.radius!r}")
+        if radius > LARGEST:
+            raise ValueError(
+                f"the tip's radius must be in metres, at most {LARGEST:g}, not {radius:g}; "
+                f"{radius:g} mm is {radius * 1e-3:g}"
+            )
         object.__setattr__(self, "radius", radius)
 
     def theta_limit(self, d: ArrayLike) -> FloatArray:
@@ -116,10 +123,20 @@ def closed_form(
 
 
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
-    """Broadcast to one shape; returns it and each argument flat, contiguous and in float64."""
-    arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values))
+    """Broadcast to one shape; returns it and each argument flat, contiguous and in float64.
+
+    Raises TypeError for what is no real number.
+    """
+    arrays = np.broadcast_arrays(*map(_real, values))
     shape = arrays[0].shape
     return shape, [np.ascontiguousarray(array).reshape(-1) for array in arrays]
+
+
+def _real(value: ArrayLike) -> FloatArray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"d and θ must be real numbers, not {value!r} ({array.dtype})")
+    return np.asarray(array, dtype=np.float64)
 
 
 # A value that is no number makes a NaN, without a warning.
@@ -134,7 +151,7 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
     """
     if type(d) is float and type(theta) is float:
         return cast(Closed, _closed(*map(np.float64, closed_form(float(modulus), d, theta))))
-    depth, tilt = np.broadcast_arrays(np.asarray(d, np.float64), np.asarray(theta, np.float64))
+    depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)
     force_d = 2.0 * np.pi * float(modulus) * depth * inverse
     force = 0.5 * depth * force_d

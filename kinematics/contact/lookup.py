@@ -38,6 +38,7 @@ VERSION = 2.0
 
 OCTAVES = 3  # of h above the corner
 LOWEST = 0.5**OCTAVES  # h where the corner begins
+LEAST = 0.5**54  # less than any h but 0
 
 # The corner h → 0, the same for all forms: its pieces over y, and the shape of A and of B in each.
 CORNER_PIECES = 2
@@ -86,8 +87,8 @@ class TableHeader(Record):
     inverse_radius: float
     corner: float  # where its coefficients start
     tolerance: float
-    max_error: float  # largest relative error found
-    worst_d: float  # where it was found [m]
+    max_error: float  # bound of the relative error
+    worst_d: float  # where the piece errs most that has the largest [m]
     worst_theta: float  # [rad]
 
 
@@ -216,7 +217,7 @@ def _from_corner(p: Pointer, h: float, y: float) -> Ratios:
     a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 8, x, y)
     b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 8, x, y)
     # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
-    scale = math.log(max(h, 1e-300))
+    scale = math.log(max(h, LEAST))
     return (
         a_f + scale * b_f,
         a_u + scale * b_u,

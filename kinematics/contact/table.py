@@ -2,8 +2,8 @@
 
 Holds the table as an object and as bytes. A table is one flat float64 array, header and
 coefficients, which is the kernel's argument and the bytes' content alike. How one is built is in
-`table_build`, the lookup itself and the array's layout in `lookup`. A table's error is the largest
-found against the integrals at 5,000 points, most of them near the domain's edges: no bound.
+`table_build`, with the bound of a table's error; the lookup itself and the array's layout are in
+`lookup`.
 """
 
 from __future__ import annotations
@@ -45,11 +45,15 @@ class Contact(NamedTuple):
     energy_d: FloatArray  # ∂U/∂d = F/cos θ [N], the push along the face's normal
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
     inside: NDArray[np.bool_]  # False where d or θ was clamped to the domain
-    max_error: float  # largest relative error found of any of the six, see Certificate
+    max_error: float  # bound of the relative error of any of the six, see Certificate
 
 
 class Certificate(NamedTuple):
-    """The largest relative error of any output found at 5,000 seeded points, and where."""
+    """A bound of the relative error of any output, and where about the table errs most.
+
+    Over the whole domain with its edges and with rounding; `table_build` says what it rests on.
+    ∂F/∂θ may pass through zero where a law softens: it counts relative to F tan θ if that is more.
+    """
 
     max_error: float
     d: float  # [m]
@@ -75,10 +79,10 @@ _SOURCES = (
 class ContactTable:
     """Force, energy and first partials of one tip of one material, by lookup.
 
-    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the largest
-    relative error of any output that was found. The domain is 0 < d ≤ a and
-    |θ| ≤ asin((a − d)/a). A solid tip's ``data`` is a :class:`SolidTable`, which is exact for the
-    data of `solid_data`, so that ``max_error`` is theirs, and the domain what they cover.
+    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the bound of the
+    relative error of any output. The domain is 0 < d ≤ a and |θ| ≤ asin((a − d)/a). A solid tip's
+    ``data`` is a :class:`SolidTable`, which is exact for the data of `solid_data`, so that
+    ``max_error`` is theirs, and the domain what they cover.
     """
 
     def __init__(self, data: Any) -> None:
@@ -142,7 +146,7 @@ class ContactTable:
 
     @property
     def certificate(self) -> Certificate:
-        """Largest relative error found, and at what d and θ."""
+        """Bound of the relative error, and the d and θ where the table errs most."""
         return Certificate(self.max_error, self.header.worst_d, self.header.worst_theta)
 
     @property
@@ -158,7 +162,8 @@ class ContactTable:
     def __call__(self, d: ArrayLike, theta: ArrayLike) -> Contact:
         """Look up at displacement d [m] and tilt θ [rad]; they broadcast.
 
-        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged.
+        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged. Raises
+        TypeError for what is no real number.
         """
         if type(d) is float and type(theta) is float:
             *six, inside = lookup(self.data, d, theta)

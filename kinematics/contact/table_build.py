@@ -1,10 +1,19 @@
-"""How contact tables are fitted to the reference integrals, chosen by cost, and checked."""
+"""How contact tables are fitted to the reference integrals, chosen by cost, with their error.
+
+A table's error is bounded piece by piece, over the whole domain with its edges: by the sum of the
+Chebyshev coefficients that the piece leaves out, what lies beyond them, and rounding. What it rests
+on: that the integrals' own error is rounding, and that coefficients beyond those computed go on
+falling. Both hold for every law here, since it is one polynomial.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -18,6 +27,7 @@ from softfinger.kinematics.contact.lookup import (
     CORNER_PIECES,
     CORNER_SHAPE,
     FORMS,
+    LEAST,
     LOWEST,
     OCTAVES,
     START,
@@ -26,13 +36,11 @@ from softfinger.kinematics.contact.lookup import (
     TableError,
     aligned,
     header_of,
-    lookup,
 )
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import (
     circle_rule,
     gauss_rule,
-    integrate,
     nodes_for,
     ratios_at,
 )
@@ -40,10 +48,19 @@ from softfinger.kinematics.contact.quadrature import (
 FloatArray = NDArray[np.float64]
 
 MEMORY_LIMIT = 256 * 1024  # bytes of a table
-_HOPE = 3.0  # times the tolerance: a fit's estimate above it is not worth checking
-_POINTS = 5000  # that a table is checked at
-_SEED = 1  # of these points, so that a table built anew is the same
+ROUNDING = 16.0 * np.finfo(float).eps  # of the closed forms and the kernel's last products
+_MORE_ROWS, _MORE_COLUMNS = 4, 6  # Chebyshev coefficients in h and y beyond those kept
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
+_CORNER_OCTAVES = (-OCTAVES, -4, -6, -9, -14, -24, -54)  # pieces of log₂ h; no float lies below
+_CORNER_NODES = 14  # in each of them
+
+
+class _Worst(NamedTuple):
+    """Bound of the relative error of a piece, and where it errs most."""
+
+    bound: float
+    h: float
+    y: float
 
 
 @dataclass(frozen=True)
@@ -76,23 +93,39 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
     if form is not None and form not in names:
         raise TableError(f"no form is called {form!r}; there are {', '.join(names)}")
     law = Law.of(material)
-    best = math.inf
-    for number in CHEAPEST_FIRST if form is None else [names.index(form)]:
-        if number == CLOSED and not material.is_linear:
-            continue
-        data = _header(tip, law, number, tolerance)
-        if data.nbytes > MEMORY_LIMIT:
-            continue
-        estimate = _fit(data, law, number, tolerance) if number != CLOSED else 0.0
-        if estimate <= _HOPE * tolerance:
-            estimate = largest_error(data, law)
-            if estimate <= tolerance:
-                return data
-        best = min(best, estimate)
+    numbers = CHEAPEST_FIRST if form is None else (names.index(form),)
+    possible = [number for number in numbers if number != CLOSED or material.is_linear]
+    for number in possible:
+        data = _made(tip, law, number, tolerance, tolerance)
+        if data is not None:
+            return data
+    made = [_made(tip, law, number, tolerance, math.inf) for number in possible]
+    best = min((header_of(data).max_error for data in made if data is not None), default=math.inf)
     raise TableError(
         f"no table within {MEMORY_LIMIT // 1024} KiB reaches {tolerance:.3g} for this material; "
         f"the best reached {best:.4g}"
     )
+
+
+def _made(
+    tip: Fingertip, law: Law, number: int, tolerance: float, limit: float
+) -> FloatArray | None:
+    """The array of one form; None where it is too large, or its error's bound above ``limit``."""
+    data = _header(tip, law, number, tolerance)
+    if data.nbytes > MEMORY_LIMIT:
+        return None
+    worst = _Worst(ROUNDING, 0.5, 0.0)
+    if number != CLOSED:
+        for found in _filled(data, law, number):
+            worst = max(worst, found)
+            if not worst.bound <= limit:
+                return None
+    if not worst.bound <= limit:
+        return None
+    header, theta = header_of(data), _tilt(worst)
+    header.max_error = worst.bound
+    header.worst_d, header.worst_theta = tip.radius * (1.0 - worst.h), theta
+    return data
 
 
 def _header(tip: Fingertip, law: Law, number: int, tolerance: float) -> FloatArray:
@@ -119,43 +152,82 @@ def _h_piece(form: Form, i: int) -> tuple[float, float]:
     return base + part * width, base + (part + 1) * width
 
 
-def _fit(data: FloatArray, law: Law, number: int, tolerance: float) -> float:
-    """Fill in a form's coefficients; returns the largest relative error to be expected.
-
-    That is the largest sum of the discarded Chebyshev coefficients, over the ratio. Gives up as
-    soon as it is too large for the tolerance.
-    """
+def _filled(data: FloatArray, law: Law, number: int) -> Iterator[_Worst]:
+    """Fill in a form's coefficients piece by piece; yields the bound of each piece's error."""
     form, columns = FORMS[number], SHAPES[number]
-    # Two more than needed in each direction, to estimate what is left out.
-    x, in_x = _nodes(columns[0] + 2)
-    y, in_y = _nodes(len(columns) + 2)
-    kept = np.zeros((x.size, y.size), dtype=np.bool_)
+    # More than needed in each direction, for what is left out.
+    rows, width = columns[0] + _MORE_ROWS, len(columns) + _MORE_COLUMNS
+    kept = np.zeros((rows, width), dtype=np.bool_)
     for j, count in enumerate(columns):
         kept[:count, j] = True
+    x, y = _nodes(rows)[0], _nodes(width)[0]
     at = START
-    estimate = 0.0
     for i in range(_h_pieces(form)):
         low, high = _h_piece(form, i)
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
         for j in range(form.y_pieces):
             places = (j + 0.5 * (y + 1.0)) / form.y_pieces
             values = _ratios_at(law, h[:, None], places[None, :])
-            terms = np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True)
-            size = np.abs(values)
-            size[3] = np.maximum(size[3], size[0])
-            lost = (np.abs(terms) * ~kept).sum(axis=(1, 2)) / size.min(axis=(1, 2))
-            estimate = max(estimate, float(lost.max()))
-            if estimate > _HOPE * tolerance:
-                return estimate
+            terms = _terms(values)
             numbers = _powers(terms * kept, columns)
             data[at : at + numbers.size] = numbers
             at += numbers.size
+            rounding = _rounding(terms * kept, (high + low) / (high - low), form.y_pieces, low)
+            yield _bound(values, terms * ~kept, rounding, h, places)
     for j in range(CORNER_PIECES):
-        numbers, misfit = _corner(law, j)
-        estimate = max(estimate, misfit)
+        fitted = _corner(law, j)
+        numbers = np.concatenate([_powers(part, SHAPES[CORNER_SHAPE]) for part in fitted])
         data[at : at + numbers.size] = numbers
         at += numbers.size
-    return estimate
+        yield from _corner_bounds(law, j, fitted)
+
+
+def _bound(
+    values: FloatArray, lost: FloatArray, rounding: FloatArray, h: FloatArray, y: FloatArray
+) -> _Worst:
+    """Bound of a piece's relative error, and where in ``h`` and ``y`` about most is lost.
+
+    ``values`` [5, h, y] are the ratios at the piece's nodes, ``lost`` the Chebyshev coefficients of
+    what the table leaves of them. Their sum bounds that; what lies beyond the coefficients is less
+    than twice the last two in each direction, as they fall to less than half each, the ratios being
+    analytic well beyond the piece. ``rounding`` [5] is absolute.
+    """
+    everywhere = _dense(len(h)) @ _terms(values) @ _dense(len(y)).T
+    size = np.abs(everywhere)
+    size[3] = np.maximum(size[3], size[0])
+    least = 0.99 * size.min(axis=(1, 2))
+    each = np.abs(lost)
+    beyond = each[:, -2:].sum(axis=(1, 2)) + each[:, :, -2:].sum(axis=(1, 2))
+    total = each.sum(axis=(1, 2)) + 2.0 * beyond + rounding
+    bounds = total / least
+    k = int(np.argmax(bounds))
+    here = np.abs(_dense(len(h)) @ lost[k] @ _dense(len(y)).T)
+    i, j = np.unravel_index(int(np.argmax(here)), here.shape)
+    # The dense points run upwards, four to a node, and the nodes downwards.
+    return _Worst(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
+
+
+def _rounding(terms: FloatArray, steep: float, y_pieces: int, low: float) -> FloatArray:
+    """Bound of what rounding does to a piece's five ratios, from their Chebyshev ``terms``.
+
+    Sums of powers, each over some 32 roundings at most; h, off by two ulps, ``steep`` being h over
+    half the piece's width; and y², off by 4 ulps over h² as cos² θ − ρ² cancels towards the limit
+    of θ. The ratios' slope in y is 0 there, so that the second derivative bounds that in y².
+    """
+    i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
+    size = np.abs(terms)
+    powers = np.abs(_to_powers(len(i))), np.abs(_to_powers(len(j)))
+    sums = 32.0 * np.einsum("ai,bj,kij->k", *powers, size, optimize=True)
+    by_h = 2.0 * (steep + 1.0) * (i**2 * size).sum(axis=(1, 2))
+    bend = (2.0 * y_pieces) ** 2 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
+    total: FloatArray = np.finfo(float).eps * (sums + by_h + 2.0 * bend / low**2)
+    return total
+
+
+def _terms(values: FloatArray) -> FloatArray:
+    """Chebyshev coefficients [5, i, j] of ``values`` [5, i, j] at the nodes of both directions."""
+    in_x, in_y = _nodes(values.shape[1])[1], _nodes(values.shape[2])[1]
+    return np.asarray(np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True))
 
 
 @cache
@@ -164,6 +236,12 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
     nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
     return nodes, np.asarray(inverse, dtype=np.float64)
+
+
+@cache
+def _dense(count: int) -> FloatArray:
+    """``count`` Chebyshev polynomials at points between which none of them does anything new."""
+    return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
 
 
 def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
@@ -183,6 +261,12 @@ def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
     return out.reshape(-1)
 
 
+def _tilt(at: _Worst) -> float:
+    """θ [rad] at h and y."""
+    rest = 1.0 - (at.h * at.y) ** 2
+    return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / rest), 1.0))
+
+
 def _ratios_at(law: Law, h: FloatArray, y: FloatArray) -> FloatArray:
     """Ratios [5, …] at the table's broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
@@ -196,8 +280,8 @@ def _ratios_at(law: Law, h: FloatArray, y: FloatArray) -> FloatArray:
     return out.reshape(LANES, *h.shape)
 
 
-def _corner(law: Law, piece: int) -> tuple[FloatArray, float]:
-    """One piece over y of the corner: its numbers, and the largest relative misfit at its nodes.
+def _corner(law: Law, piece: int) -> FloatArray:
+    """Chebyshev coefficients [2, 5, h, y] of A and B, of one piece over y of the corner.
 
     A and B of R = A + B log h are found by least squares in h at each node of y. Only their sum is
     well determined; since it is found linearly, it is interpolated in y as R itself would be.
@@ -214,13 +298,38 @@ def _corner(law: Law, piece: int) -> tuple[FloatArray, float]:
     basis = chebyshev.chebvander(2.0 * h / LOWEST - 1.0, rows - 1)
     matrix = np.concatenate([basis, basis * np.log(h)[:, None]], axis=1)
     found = np.linalg.lstsq(matrix, values, rcond=1e-14)[0]
-    size = np.abs(values).reshape(h.size, LANES, columns)
-    size[:, 3] = np.maximum(size[:, 3], size[:, 0])
-    misfit = float(np.max(np.abs(matrix @ found - values) / size.reshape(h.size, -1)))
     terms = found.reshape(2, rows, LANES, columns)
     # From values at the nodes of y to coefficients.
-    terms = np.einsum("bj,pikj->pkib", in_y, terms, optimize=True)
-    return np.concatenate([_powers(part, shape) for part in terms]), misfit
+    return np.asarray(np.einsum("bj,pikj->pkib", in_y, terms, optimize=True))
+
+
+def _corner_bounds(law: Law, piece: int, fitted: FloatArray) -> Iterator[_Worst]:
+    """Bounds of the corner's error, in pieces of log h down to the least h, and at d = a itself.
+
+    In log h what is left of the ratios is smooth: powers of h are exponentials, and towards h = 0
+    only α + β log h is left.
+    """
+    rows, columns = fitted.shape[2:]
+    x, y = _nodes(_CORNER_NODES)[0], _nodes(columns + _MORE_COLUMNS)[0]
+    places = (piece + 0.5 * (y + 1.0)) / CORNER_PIECES
+    in_y = chebyshev.chebvander(y, columns - 1)
+    for high, low in pairwise(_CORNER_OCTAVES):
+        h = 2.0 ** (0.5 * (high + low) + 0.5 * (high - low) * x)
+        values = _ratios_at(law, h[:, None], places[None, :])
+        in_h = chebyshev.chebvander(2.0 * h / LOWEST - 1.0, rows - 1)
+        ours = np.einsum("xi,pkij,yj->pkxy", in_h, fitted, in_y, optimize=True)
+        lost = _terms(values - ours[0] - np.log(h)[:, None] * ours[1])
+        rounding = _rounding(fitted[0], 1.0, CORNER_PIECES, 1.0)
+        rounding -= low * math.log(2.0) * _rounding(fitted[1], 1.0, CORNER_PIECES, 1.0)
+        yield _bound(values, lost, rounding, h, places)
+    if piece == 0:
+        # At d = a the kernel takes h = LEAST in the logarithm, and θ and y are 0.
+        one = np.ones((1, 1))
+        exact = _ratios_at(law, 0.0 * one, 0.0 * one)[:3, 0, 0]
+        ends = (-1.0) ** np.arange(rows), (-1.0) ** np.arange(columns)
+        a, b = np.einsum("i,pkij,j->pk", ends[0], fitted, ends[1], optimize=True)
+        lost = np.abs(a + math.log(LEAST) * b)[:3] - exact
+        yield _Worst(float(np.max(np.abs(lost) / exact)) + ROUNDING, 0.0, 0.0)
 
 
 @cache
@@ -228,57 +337,3 @@ def _to_powers(count: int) -> FloatArray:
     """Matrix from ``count`` Chebyshev coefficients to those of rising powers."""
     columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]
     return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
-
-
-def largest_error(data: FloatArray, law: Law) -> float:
-    """Largest relative error at random points, the same for each table; written to its header.
-
-    A third of the points are dense over the domain; the others crowd, by orders of magnitude, at
-    d → 0, at d → a, at θ → 0 and at θ's limit, and at two of these at once. Between the points the
-    table may err a little more.
-    """
-    header = header_of(data)
-    radius = header.radius
-    d, theta = hard_points(radius, _POINTS, np.random.default_rng(_SEED))
-    out = _errors(data, law, d, theta)
-    worst = int(np.argmax(np.where(np.isnan(out), np.inf, out)))
-    error = float(out[worst])
-    if math.isnan(error):
-        raise TableError(f"the table gives no number at d = {d[worst]!r}, θ = {theta[worst]!r}")
-    header.max_error, header.worst_d, header.worst_theta = error, d[worst], theta[worst]
-    return error
-
-
-def _errors(data: FloatArray, law: Law, d: FloatArray, theta: FloatArray) -> FloatArray:
-    """Largest relative error [n] of the table's six outputs, each against the integral.
-
-    ∂F/∂θ may pass through zero where a law softens; it counts relative to F tan θ if that is more.
-    """
-    found = np.array([lookup(data, *at)[:6] for at in zip(d.tolist(), theta.tolist(), strict=True)])
-    exact = np.stack(integrate(Fingertip(header_of(data).radius), law.material, d, theta))
-    scale = np.abs(exact)
-    scale[3] = np.maximum(scale[3], np.abs(exact[0] * np.tan(theta)))
-    lost = np.abs(found.T - exact)
-    # Both vanish with θ.
-    lost[[3, 5]] = np.where(theta == 0.0, 0.0, lost[[3, 5]])
-    scale[[3, 5]] = np.where(theta == 0.0, 1.0, scale[[3, 5]])
-    worst: FloatArray = np.max(lost / scale, axis=0)
-    return worst
-
-
-def hard_points(
-    radius: float, points: int, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Random d [m] and θ [rad] over the domain, crowded at its edges and corners."""
-    which = rng.integers(0, 9, points)
-    small = 10.0 ** rng.uniform(-9.0, -0.3, points)
-    even = rng.uniform(0.0, 1.0, points)
-    d = np.where(which < 3, small, np.where(which < 5, 1.0 - small, even)) * radius
-    d = np.maximum(d, 1e-9 * radius)
-    limit = Fingertip(radius).theta_limit(d)
-    near = 10.0 ** rng.uniform(-12.0, 0.0, points)
-    kind = np.where(which % 3 == 0, rng.uniform(0.0, 1.0, points), 1.0 - near)
-    kind = np.where(rng.integers(0, 8, points) == 0, near, kind)
-    kind = np.where(rng.integers(0, 30, points) == 0, 1.0, kind)
-    theta = np.minimum(limit * kind, limit) * rng.choice([-1.0, 1.0], points)
-    return np.asarray(d), np.asarray(theta)

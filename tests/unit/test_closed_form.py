@@ -136,3 +136,8 @@ def test_shapes_types_and_odd_values() -> None:
 def test_a_tip_needs_a_radius(radius: float) -> None:
     with pytest.raises(ValueError, match="radius must be positive"):
         Fingertip(radius)
+
+
+def test_a_radius_in_millimetres_is_refused_with_the_metres_it_means() -> None:
+    with pytest.raises(ValueError, match=r"in metres, at most 1, not 20; 20 mm is 0\.02"):
+        Fingertip(20.0)

@@ -185,7 +185,7 @@ def _run(kernel: Callable[..., None], *arguments: Any) -> None:
 def _table(
     name: str, table: ContactTable, material: Material, d: FloatArray, theta: FloatArray
 ) -> _Case:
-    facts = {"error found": table.max_error, "KiB": table.data.nbytes / 1024}
+    facts = {"error bound": table.max_error, "KiB": table.data.nbytes / 1024}
     case = _Case(name, _error(table(d, theta), reference(material, d, theta)), facts=facts)
     return _compiled(case, "lookup", table.data, (partial(lookup, table.data), table), d, theta)
 
@@ -255,5 +255,5 @@ def _aims(built: Built, times: dict[str, FloatArray]) -> Iterator[Row]:
     for tolerance, (table, samples) in built.items():
         name = f"table to {tolerance:g}"
         yield figure(f"{name}: build", "s", samples, _TOLERANCES[tolerance][1])
-        yield figure(f"{name}: largest error found", "1", [table.max_error], tolerance)
+        yield figure(f"{name}: bound of the error", "1", [table.max_error], tolerance)
         yield figure(f"{name}: memory", "KiB", [table.data.nbytes / 1024], 256.0)
