@@ -1,11 +1,14 @@
-"""When a subcommand ends: by Ctrl-C, SIGTERM, or after a duration."""
+"""When a subcommand ends: by a signal, or after a duration."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from typing import Any, Protocol
 
 
 class Ending:
@@ -45,3 +48,46 @@ class Ending:
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+
+
+class Endable(Protocol):
+    """What runs until its end is asked for, at any moment: a loop, an emulator."""
+
+    def end(self) -> None:
+        """End soon."""
+
+
+class Interrupted(BaseException):
+    """A signal asked for the end before anything ran. No ``except Exception`` may hold it up."""
+
+
+class Signals:
+    """SIGINT, SIGTERM and SIGHUP (the terminal is gone) end, quietly, at whatever stage."""
+
+    def __init__(self) -> None:
+        self._running: Endable | None = None
+        self._ended = self._held = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._end)
+
+    def hand_over(self, running: Endable) -> None:
+        """From now on signals end ``running``. Raises Interrupted when one came before."""
+        self._running = running
+        if self._ended:
+            raise Interrupted
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Signals wait meanwhile."""
+        self._held = True
+        yield
+        self._held = False
+        if self._ended:
+            raise Interrupted
+
+    def _end(self, *_: Any) -> None:
+        self._ended = True
+        if self._running is not None:
+            self._running.end()
+        elif not self._held:
+            raise Interrupted

@@ -34,7 +34,7 @@ def emulated(
         assert ready.wait(READY_WITHIN)
         yield made
     finally:
-        made.stop()
+        made.end()
         runner.join()
         made.close()
 

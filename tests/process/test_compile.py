@@ -53,7 +53,7 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
     table = named("contact table")
     settings = Settings().model_dump_json()
     done = subprocess.run(
-        [sys.executable, "-m", "softfinger.tools.processes.kernel_worker"],
+        [sys.executable, "-m", "softfinger.tools.processes.kernel_build"],
         input=f"{settings}\n\n{table.name}\n",
         env=environment(tmp_path),
         capture_output=True,

@@ -16,7 +16,7 @@ from softfinger.daemon.client import AsyncHand, Hand, NoStream
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire.keys import make_keys
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.republish import Wire
+from softfinger.tools.recordings.replay import Wire
 from tests.conftest import own_addresses, until
 from tests.harness.daemon_process import SOFTFINGER, Running, insist, softfinger, until_it_says
 

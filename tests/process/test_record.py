@@ -23,7 +23,7 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.recover import recover
+from softfinger.tools.recordings.record import recover
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger

@@ -13,10 +13,9 @@ from softfinger.kinematics.contact.closed_form import closed_form
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.benchmarks import contact, contact_kernels, contact_scipy
+from softfinger.tools.benchmarks import contact, contact_scipy
 from softfinger.tools.benchmarks.contact import CONSTANT, ERROR, LAW, MODES, TIP
-from softfinger.tools.benchmarks.framework import picture
-from softfinger.tools.benchmarks.framework.report import Table
+from softfinger.tools.benchmarks.framework.report import Table, draw
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,7 @@ def test_every_way_of_calling_has_a_table_and_the_page_its_rows(tables: list[Tab
 def test_the_picture_is_drawn(tables: list[Table], tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    picture.draw(tables[3:4], tmp_path / "bench.png")
+    draw(tables[3:4], tmp_path / "bench.png")
     pixels = imread(tmp_path / "bench.png")
     assert (pixels[..., :3].min(axis=-1) < 0.8).mean() > 0.01
 
@@ -76,10 +75,10 @@ def test_compiled_loops_compute_what_they_time(mode: str) -> None:
     d, theta = contact.points(16)
     table = ContactTable.build(TIP, LAW, 1e-9)
     out = np.zeros((16, 6))
-    getattr(contact_kernels, f"lookup_{mode}")(2, table.data, d, theta, out)
+    contact.LOOKUP_KERNELS[mode](2, table.data, d, theta, out)
     expected = [lookup(table.data, *point)[:6] for point in zip(d, theta, strict=True)]
     np.testing.assert_allclose(out, expected, rtol=1e-15)
-    getattr(contact_kernels, f"closed_{mode}")(2, contact.MODULUS, d, theta, out)
+    contact.CLOSED_KERNELS[mode](2, contact.MODULUS, d, theta, out)
     points = zip(d, theta, strict=True)
     expected = [closed_form(contact.MODULUS, *point)[:6] for point in points]
     np.testing.assert_allclose(out, expected, rtol=1e-15)

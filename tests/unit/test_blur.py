@@ -12,7 +12,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_grid, make_material
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -269,7 +269,7 @@ def test_the_settings_blur_goes_into_the_fingers_estimator():
         make_grid(settings),
         TIP,
         material,
-        tactile.pascal_per_count,
+        Board(tactile.pascal_per_count),
         flaws=Imperfections(noise=300.0, blur=settings.simulation.tactile_blur),
     )
     estimator = make_estimator(settings, material)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
+from softfinger.daemon.simulation.sensor.sensor_model import Board, SensorModel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
@@ -20,7 +20,7 @@ COUNT = 2.5  # Pa
 
 
 def frame(grid: SensorGrid, d: float, tilt: float, bend: float) -> np.ndarray:
-    sensor = SensorModel(grid, TIP, MATERIAL, COUNT)
+    sensor = SensorModel(grid, TIP, MATERIAL, Board(COUNT))
     out = np.zeros(grid.shape, np.uint16)
     sensor.frame(d, tilt, 0.0, out, bend=bend)
     return out * COUNT

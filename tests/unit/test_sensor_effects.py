@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.simulation.sensor import sensor_effects
-from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
@@ -22,7 +22,7 @@ CONTACTS = [(0.0005, 0.1, -0.2), (0.002, 0.3, 0.1), (0.006, 0.0, -0.4)]
 
 def sensor(grid=None, **flaws):
     grid = grid or SensorGrid(44, 44, PITCH, (3e-4, -5e-4))
-    return SensorModel(grid, TIP, LINEAR, 1.0, Imperfections(**flaws), full_count=65535, gain=0.2)
+    return SensorModel(grid, TIP, LINEAR, Board(1.0), Imperfections(**flaws), gain=0.2)
 
 
 def counts(model, contact, t=0.0):
@@ -192,7 +192,7 @@ def test_dead_cells_nobody_is_told_of_are_a_share_and_the_seeds():
     grid = SensorGrid(100, 100, PITCH)
     flaws = Imperfections(dead=0.05)
     first, again, other = (
-        SensorModel(grid, TIP, LINEAR, 1.0, flaws, seed=seed).live for seed in (1, 1, 2)
+        SensorModel(grid, TIP, LINEAR, Board(1.0), flaws, seed=seed).live for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()

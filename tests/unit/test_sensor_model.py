@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
@@ -22,7 +22,11 @@ FLAWS = set(Imperfections.__dataclass_fields__) - {"dead"}
 def model(scale=4.0, grid=GRID, **options):
     flaws = {name: options.pop(name) for name in list(options) if name in FLAWS}
     flaws["dead"] = options.pop("dead_share", 0.0)
-    return SensorModel(grid, TIP, MATERIAL, scale, Imperfections(**flaws), **options)
+    board = Board(
+        scale,
+        **{name: options.pop(name) for name in ("full_count", "threshold") if name in options},
+    )
+    return SensorModel(grid, TIP, MATERIAL, board, Imperfections(**flaws), **options)
 
 
 def frame(sensor, d=0.004, tilt_x=0.2, tilt_y=-0.1):
@@ -87,7 +91,7 @@ def test_the_estimator_reads_it_back():
         SensorGrid(44, 44, 0.058 / 44, rotation=0.3),
         TIP,
         MATERIAL,
-        4.0,
+        Board(4.0),
         Imperfections(noise=600.0),
         seed=7,
     )

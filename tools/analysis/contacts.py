@@ -14,6 +14,7 @@ from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.tools.analysis.sources import Progress, Source
+from softfinger.tools.paper import style
 
 FloatArray = NDArray[np.float64]
 
@@ -91,3 +92,48 @@ def write_csv(path: Path, contacts: list[Contacts]) -> None:
                 each.t.tolist(), each.valid.tolist(), each.contact.tolist(), numbers, strict=True
             ):
                 writer.writerow([f"{t:.6f}", each.finger, int(valid), int(touches), *row])
+
+
+# Title, value, its standard deviation, factor to what is shown, unit shown.
+_PANELS = (
+    ("displacement d", "d", "d_std", 1e3, "mm"),
+    ("object's angle θ", "theta", "theta_std", 180.0 / np.pi, "°"),
+    ("force F", "force", "", 1.0, "N"),
+    ("energy U", "energy", "", 1e3, "mJ"),
+)
+
+
+def draw(contacts: list[Contacts], title: str, path: Path) -> None:
+    """d and θ with two standard deviations, F and U over time. Raises MissingExtra."""
+    with style.settings():
+        figure = style.new_figure(7.0, 7.5)
+        axes = figure.subplots(len(_PANELS), 1, sharex=True)
+        for panel, (name, value, spread, factor, unit) in zip(axes, _PANELS, strict=True):
+            for k, each in enumerate(contacts):
+                sound = each.valid & each.contact
+                shown = np.where(sound, each.values[value] * factor, np.nan)
+                colour = style.KINDS[k]
+                line = "-" if k == 0 else (0, (5, 1.5))
+                panel.plot(each.t, shown, color=colour, linestyle=line, label=each.finger)
+                if spread:
+                    band = 2.0 * factor * each.values[spread]
+                    panel.fill_between(
+                        each.t, shown - band, shown + band, color=colour, alpha=0.25, lw=0
+                    )
+                if value in each.truths:
+                    panel.plot(
+                        each.t,
+                        each.truths[value] * factor,
+                        color=style.INK,
+                        linestyle=":",
+                        label=f"{each.finger}, known",
+                    )
+            panel.set_ylabel(f"{name} [{unit}]")
+        axes[0].set_title(title, loc="left")
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper right", ncols=4)
+        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_xlim(
+            0.0, max([float(each.t.max()) for each in contacts if each.t.size] or [1])
+        )
+        style.save(figure, path)

@@ -117,7 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
     if arguments.plot:
-        from softfinger.tools.benchmarks.framework.picture import draw
+        from softfinger.tools.benchmarks.framework.report import draw
 
         draw(drawn, arguments.plot)
     if old:

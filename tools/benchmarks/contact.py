@@ -18,16 +18,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.simd import address
 from softfinger.kinematics.contact.closed_form import (
     Fingertip,
     closed_form,
     closed_forms,
 )
-from softfinger.kinematics.contact.lookup import CLOSED, FORMS, TableError, lookup
+from softfinger.kinematics.contact.lookup import CLOSED, FORMS, TableError, lookup, lookup_at
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.benchmarks import contact_kernels, contact_scipy
+from softfinger.tools.benchmarks import contact_scipy
 from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
 from softfinger.tools.benchmarks.framework.report import Row, Table, figure
 
@@ -127,7 +129,7 @@ def _error(got: Any, expected: FloatArray) -> float:
 def _cases(brief: bool, built: Built, d: FloatArray, theta: FloatArray) -> Iterator[_Case]:
     error = _error(closed_forms(MODULUS, d, theta), reference(CONSTANT, d, theta))
     calls = partial(closed_form, MODULUS), partial(closed_forms, MODULUS)
-    yield _compiled(_Case(_CLOSED, error), "closed", MODULUS, calls, d, theta)
+    yield _compiled(_Case(_CLOSED, error), CLOSED_KERNELS, MODULUS, calls, d, theta)
     yield _table("table, constant E", ContactTable.build(TIP, CONSTANT), CONSTANT, d, theta)
     for tolerance, (table, _) in built.items():
         yield _table(f"table to {tolerance:g}", table, LAW, d, theta)
@@ -159,7 +161,7 @@ def _cases(brief: bool, built: Built, d: FloatArray, theta: FloatArray) -> Itera
 
 def _compiled(
     case: _Case,
-    kernels: str,
+    kernels: dict[str, Callable[..., None]],
     argument: Any,
     calls: tuple[Callable[..., object], Callable[..., object]],
     d: FloatArray,
@@ -168,7 +170,7 @@ def _compiled(
     """With the subjects of a compiled representation: ``calls`` as kernel and as Python API."""
     out = np.empty((d.size, 6))
     for mode in ("loop", "chain"):
-        run = partial(_run, getattr(contact_kernels, f"{kernels}_{mode}"), argument, d, theta, out)
+        run = partial(_run, kernels[mode], argument, d, theta, out)
         case.subjects[mode] = Subject(run, d.size)
     case.subjects["kernel"] = _single(calls[0], d, theta)
     case.subjects["python"] = _single(calls[1], d, theta)
@@ -187,7 +189,9 @@ def _table(
 ) -> _Case:
     facts = {"error bound": table.max_error, "KiB": table.data.nbytes / 1024}
     case = _Case(name, _error(table(d, theta), reference(material, d, theta)), facts=facts)
-    return _compiled(case, "lookup", table.data, (partial(lookup, table.data), table), d, theta)
+    return _compiled(
+        case, LOOKUP_KERNELS, table.data, (partial(lookup, table.data), table), d, theta
+    )
 
 
 def _scipy(d: FloatArray, theta: FloatArray, expected: FloatArray) -> Iterator[_Case]:
@@ -257,3 +261,74 @@ def _aims(built: Built, times: dict[str, FloatArray]) -> Iterator[Row]:
         yield figure(f"{name}: build", "s", samples, _TOLERANCES[tolerance][1])
         yield figure(f"{name}: bound of the error", "1", [table.max_error], tolerance)
         yield figure(f"{name}: memory", "KiB", [table.data.nbytes / 1024], 256.0)
+
+
+# Loops that call the contact kernels one by one, as the control loop does. In a ``loop`` the calls
+# are independent, so that the processor overlaps them; the order of the n points, a power of
+# two, jumps about, or the compiler would merge calls into vector instructions. In a ``chain`` each
+# call's arguments wait for the last one's result. The outputs in ``out`` [n, 6] keep the compiler
+# from dropping a call.
+
+
+@kernel
+def _next(i: int, count: int) -> int:
+    """The next of ``count`` places, a power of two: each once before any comes again."""
+    return (5 * i + 1) & (count - 1)
+
+
+@kernel
+def closed_loop(
+    repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
+) -> None:
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = closed_form(
+            modulus, d[i], theta[i]
+        )
+
+
+@kernel
+def closed_chain(
+    repeat: int, modulus: float, d: FloatArray, theta: FloatArray, out: FloatArray
+) -> None:
+    wait = 0.0
+    for _ in range(repeat):
+        for i in range(d.shape[0]):
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], last = closed_form(
+                modulus, d[i] + wait, theta[i] + wait
+            )
+            out[i, 5] = last
+            wait = 0.0 * last
+
+
+@kernel
+def lookup_loop(
+    repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
+) -> None:
+    p = address(data)
+    i = 0
+    for _ in range(repeat * d.shape[0]):
+        i = _next(i, d.shape[0])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5], _ = lookup_at(
+            p, d[i], theta[i]
+        )
+
+
+@kernel
+def lookup_chain(
+    repeat: int, data: FloatArray, d: FloatArray, theta: FloatArray, out: FloatArray
+) -> None:
+    p = address(data)
+    wait = 0.0
+    for _ in range(repeat):
+        for i in range(d.shape[0]):
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], last, _ = lookup_at(
+                p, d[i] + wait, theta[i] + wait
+            )
+            out[i, 5] = last
+            wait = 0.0 * last
+
+
+CLOSED_KERNELS = {"loop": closed_loop, "chain": closed_chain}
+LOOKUP_KERNELS = {"loop": lookup_loop, "chain": lookup_chain}

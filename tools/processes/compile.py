@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
-from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
@@ -19,12 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile what is missing; 1 when something could not be, 2 with the report on the settings."""
-    try:
-        settings = profile(arguments)
-    except SettingsError as error:
-        print(error, file=sys.stderr)
-        return 2
+    """Compile what is missing; 1 when something could not be. Raises SettingsError."""
+    settings = profile(arguments)
     from softfinger.daemon.loop.warm_up import ALL
 
     built = build_kernels(settings, print_event, ALL if arguments.all else None)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
+from softfinger.tools.ending import Interrupted, Signals
 
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
@@ -53,7 +50,6 @@ begins the record anew, --send "report forget" does both without a gap:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``emulate``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _FAULTS
     parser.add_argument(
         "--dir",
@@ -125,30 +121,31 @@ def _ids(text: str) -> tuple[int, ...]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
-    try:
-        arguments.dir = arguments.dir or own_runtime_folder()
-        if arguments.send is not None:
-            return _send(arguments.dir, arguments.send)
-        if arguments.model is not None:
-            arguments.set = [*arguments.set, f"servos.model={arguments.model}"]
-        settings = profile(arguments)
-    except SettingsError as error:
-        print(error, file=sys.stderr)
-        return 2
-    signals = _Signals()
+    arguments.dir = arguments.dir or own_runtime_folder()
+    if arguments.send is not None:
+        return _send(arguments.dir, arguments.send)
+    if arguments.model is not None:
+        arguments.set = [*arguments.set, f"servos.model={arguments.model}"]
+    settings = profile(arguments)
+    signals = Signals()
     try:
         return _serve(settings, arguments, signals)
     except Interrupted:
         return 0
 
 
-def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals) -> int:
+def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
     # What follows imports numpy and numba: wrong settings are reported without waiting for them.
     from softfinger.daemon.loop.realtime import RealTime, hold_collector
 
     hold_collector()
     from softfinger.daemon.loop.warm_up import EMULATED
-    from softfinger.daemon.simulation.emulator.emulator import Emulator, EmulatorError, with_board
+    from softfinger.daemon.simulation.emulator.emulator import (
+        Emulator,
+        EmulatorError,
+        ServoLine,
+        with_board,
+    )
     from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
 
     build_kernels(with_board(settings), print_event, EMULATED)
@@ -156,10 +153,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: _Signals)
         emulator = Emulator(
             settings,
             arguments.dir,
-            baud=arguments.baud,
-            latency=arguments.latency,
-            factory=arguments.factory,
-            ids=arguments.ids,
+            line=ServoLine(arguments.baud, arguments.latency, arguments.factory, arguments.ids),
             faults=arguments.fault,
             table_cache=table_cache(),
             undisturbed=signals.held,
@@ -187,42 +181,6 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
     realtime = settings.realtime.model_copy(update={**changes, "hold_latency": held})
     loop = settings.loop.model_copy(update={"clock": "real"})
     return settings.model_copy(update={"realtime": realtime, "loop": loop})
-
-
-class Interrupted(BaseException):
-    """A signal asked for the end before anything answered."""
-
-
-class _Signals:
-    """SIGINT, SIGTERM and SIGHUP (the terminal is gone) end, quietly, at whatever stage."""
-
-    def __init__(self) -> None:
-        self._emulator: Any = None
-        self._ended = self._held = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._end)
-
-    def hand_over(self, emulator: Any) -> None:
-        """From now on signals stop the emulator. Raises Interrupted when one came before."""
-        self._emulator = emulator
-        if self._ended:
-            raise Interrupted
-
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Signals wait meanwhile."""
-        self._held = True
-        yield
-        self._held = False
-        if self._ended:
-            raise Interrupted
-
-    def _end(self, _number: int, _frame: Any) -> None:
-        self._ended = True
-        if self._emulator is not None:
-            self._emulator.stop()
-        elif not self._held:
-            raise Interrupted
 
 
 def _send(folder: Path, words: str) -> int:

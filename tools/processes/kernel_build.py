@@ -6,6 +6,7 @@ another (`loop.warm_up`); parts that need the contact table wait for it.
 
 from __future__ import annotations
 
+import gc
 import os
 import selectors
 import subprocess
@@ -13,9 +14,9 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from softfinger.daemon.loop.warm_up import Part, is_built, parts
+from softfinger.daemon.loop.warm_up import Part, Scene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.kernel_cache import kernel_folder, user_cache
 from softfinger.tools.terminal.progress import Progress
@@ -174,11 +175,11 @@ class _Workers:
 
 
 class _Worker:
-    """One process: `processes.kernel_worker`."""
+    """One process, which runs `main`."""
 
     def __init__(self, settings: Settings) -> None:
         # -P: a folder named tools where this was started is not ours.
-        command = [sys.executable, "-P", "-m", "softfinger.tools.processes.kernel_worker"]
+        command = [sys.executable, "-P", "-m", "softfinger.tools.processes.kernel_build"]
         path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
         self._process = subprocess.Popen(
             command,
@@ -231,3 +232,50 @@ class _Worker:
             pass
         self._output.close()
         return status
+
+
+def main() -> None:
+    """A process that compiles kernels, a part of a scene at a time, until standard input ends.
+
+    Standard input: the settings in JSON, the folder of contact tables (empty: none), then the name
+    of a part a line. Standard output, a line each: ``kernel NAME`` as one is begun, ``done`` when a
+    part is built, ``failed REASON`` when it can't be.
+    """
+    gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
+    out = sys.stdout
+    sys.stdout = sys.stderr  # whatever else prints, prints there
+
+    def tell(line: str) -> None:
+        print(line, file=out, flush=True)
+
+    from numba.core import event as numba_event
+
+    events: Any = numba_event
+
+    class Compiling(numba_event.Listener):
+        def on_start(self, event: Any) -> None:
+            tell(f"kernel {event.data['dispatcher'].py_func.__name__}")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    events.register("numba:compile", Compiling())
+    head = sys.stdin.readline()
+    if not head:
+        return
+    settings = Settings.model_validate_json(head)
+    cache = sys.stdin.readline().rstrip("\n")
+    scene = Scene(settings, Path(cache) if cache else None)
+    for line in sys.stdin:
+        part = named(line.rstrip("\n"))
+        try:
+            part.run(scene)
+        except Exception as error:
+            tell(f"failed {type(error).__name__}: {error}".replace("\n", " "))
+        else:
+            mark_built(part)
+            tell("done")
+
+
+if __name__ == "__main__":
+    main()

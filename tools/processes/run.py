@@ -11,10 +11,11 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.errors import SettingsError, SoftfingerError
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.sd_notify import Service
 from softfinger.daemon.profile.settings import Settings, Task
 from softfinger.tools.arguments import add_profile, profile, seconds
+from softfinger.tools.ending import Interrupted, Signals
 from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
 from softfinger.tools.processes.event_log import EventLog
 
@@ -48,16 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run until a signal or ``--duration``; 0, or 1 with a line that says what was wrong.
 
-    Wrong settings give 2 and the whole report.
+    Raises SettingsError with the whole report.
     """
-    try:
-        settings = profile(arguments)
-    except SettingsError as error:
-        print(error, file=sys.stderr)
-        return 2
+    settings = profile(arguments)
     if arguments.no_task:
         settings = settings.model_copy(update={"task": Task()})
-    signals = _Signals()
+    signals = Signals()
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is something to stop
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:
@@ -74,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(
-    settings: Settings, arguments: argparse.Namespace, signals: _Signals, log: EventLog
+    settings: Settings, arguments: argparse.Namespace, signals: Signals, log: EventLog
 ) -> int:
     # What follows imports numpy, numba and zmq: wrong settings are reported before.
     from softfinger.daemon.loop.realtime import RealTime, hold_collector
@@ -94,6 +92,7 @@ def _serve(
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
         signals.hand_over(loop)
+        signal.signal(signal.SIGUSR1, lambda *_: loop.stop())
         for event in measures.events():
             loop.emit(*event)
         loop.emit("info", "schedule", plan(settings))
@@ -179,34 +178,3 @@ def _ready(settings: Settings, daemon: Any) -> str:
         f"state on {settings.stream.address}, commands on {settings.commands.address}; "
         f"contact table within {max(table.max_error for table in daemon.tables):.1e}"
     )
-
-
-class Interrupted(BaseException):
-    """A signal asked for the end before the loop ran. No ``except Exception`` may hold it up."""
-
-
-class _Signals:
-    """SIGINT, SIGTERM and SIGHUP (the terminal is gone) end; SIGUSR1 stops, once the loop runs."""
-
-    def __init__(self) -> None:
-        self._loop: Any = None
-        self._ended = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._end)
-        signal.signal(signal.SIGUSR1, self._stop)
-
-    def hand_over(self, loop: Any) -> None:
-        """From now on signals go to the loop. Raises Interrupted when one came before."""
-        self._loop = loop
-        if self._ended:
-            raise Interrupted
-
-    def _end(self, _number: int, _frame: Any) -> None:
-        self._ended = True
-        if self._loop is None:
-            raise Interrupted
-        self._loop.end()
-
-    def _stop(self, _number: int, _frame: Any) -> None:
-        if self._loop is not None:
-            self._loop.stop()

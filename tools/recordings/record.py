@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import select
 import sys
 import time
@@ -28,7 +29,7 @@ from softfinger.tools.arguments import (
     waiting,
 )
 from softfinger.tools.ending import Ending
-from softfinger.tools.recordings.recover import recover
+from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.writer import RecordingWriter
 
 _EPILOG = """\
@@ -240,3 +241,28 @@ def _topics(named: list[bytes] | None) -> list[bytes]:
     if named is None:
         return [each for each in schema.TOPICS if each != schema.INPUT]
     return list(schema.TOPICS) if ALL in named else named
+
+
+def recover(path: Path) -> tuple[int, str]:
+    """Close the recording in place; how many messages it has, and what ended its reading.
+
+    A sound file is left as it is. The new file takes the old one's place only once it is whole.
+    Raises RecordingError.
+    """
+    recording = Recording(path)
+    if recording.check():
+        return recording.total, ""
+    closed = path.with_name(path.name + ".recovered")
+    closed.unlink(missing_ok=True)
+    writer = RecordingWriter(closed)
+    try:
+        for topic, message in recording.messages():
+            writer.add(topic, message)
+        writer.close()
+        closed.replace(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            closed.unlink(missing_ok=True)
+    return writer.messages, recording.damage

@@ -6,7 +6,6 @@ Arguments, order, printing and exit status; the checks are :mod:`softfinger.daem
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 
 from softfinger.daemon.backends import SERVOS, TACTILE
@@ -17,7 +16,6 @@ from softfinger.daemon.diagnosis.machine import check_machine
 from softfinger.daemon.diagnosis.ports import check_latency_timer, check_port, note_ports
 from softfinger.daemon.diagnosis.repair import repair_latency_timer, repair_servos
 from softfinger.daemon.diagnosis.result import Result
-from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
@@ -36,19 +34,14 @@ one beside it, and doctor --fix again."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``doctor``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     add_profile(parser)
     parser.add_argument("--fix", action="store_true", help="repair what can be repaired from here")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check, print, and tell by the exit status."""
-    try:
-        settings = profile(arguments)
-    except SettingsError as error:
-        print(error, file=sys.stderr)
-        return 2
+    """Check, print, and tell by the exit status. Raises SettingsError."""
+    settings = profile(arguments)
     print(f"settings: {arguments.config or 'the built-in simulated hand'}")
     counts = {"FAIL": 0, "warn": 0, "pass": 0}
     for result in results(settings, arguments.fix):

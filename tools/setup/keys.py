@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.wire.keys import make_keys
 
 _EPILOG = """\
@@ -20,19 +18,13 @@ Exit status: 0 made, 1 refused."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``keys``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("clients", nargs="*", metavar="CLIENT")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make keys; 0, or 1 with the reason."""
-    try:
-        made = make_keys(arguments.folder, arguments.clients)
-    except KeyFileError as error:
-        print(f"keys: {error}", file=sys.stderr)
-        return 1
-    for folder in made:
+    """Make keys. Raises KeyFileError."""
+    for folder in make_keys(arguments.folder, arguments.clients):
         print(folder)
     return 0

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
-from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
 
@@ -17,12 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the table; 2 for wrong settings."""
-    try:
-        settings = profile(arguments)
-    except SettingsError as error:
-        print(error, file=sys.stderr)
-        return 2
+    """Print the table. Raises SettingsError."""
+    settings = profile(arguments)
     from softfinger.daemon.safety.limits import LIMITS
 
     lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in LIMITS]

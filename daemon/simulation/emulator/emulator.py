@@ -15,6 +15,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,16 @@ class EmulatorClock:
         return -delay
 
 
+@dataclass(frozen=True, slots=True)
+class ServoLine:
+    """How the servos are emulated, beside the settings."""
+
+    baud: int = 0  # 0: they answer at once and at any rate
+    latency: float = 0.0  # s of a USB adapter's timer, with a ``baud``
+    factory: bool = False  # as they leave the factory but for their IDs and rate
+    ids: tuple[int, ...] | None = None  # others than the settings', even one for both
+
+
 class Emulator:
     """An emulated hand on ptys, linked in ``folder``; :meth:`run` keeps it alive.
 
@@ -96,22 +107,16 @@ class Emulator:
         settings: Settings,
         folder: Path,
         *,
-        baud: int = 0,
-        latency: float = 0.0,
-        factory: bool = False,
-        ids: tuple[int, ...] | None = None,
+        line: ServoLine | None = None,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
         undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
-        ``baud`` 0: servos answer at once and at any rate. ``latency`` [s]: a USB adapter's timer,
-        with a ``baud``. ``factory``: servos as they leave the factory but for their IDs and rate.
-        ``ids``: others than the settings', even one for both. ``faults``: see
-        :func:`parse_faults`. ``table_cache``: a folder where the contact table is kept.
-        ``undisturbed``: a context without exceptions of signal handlers, for making what has to
-        be removed again.
+        ``faults``: see :func:`parse_faults`. ``table_cache``: a folder where the contact table is
+        kept. ``undisturbed``: a context without exceptions of signal handlers, for making what has
+        to be removed again.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
@@ -125,7 +130,8 @@ class Emulator:
         self._sources: list[SimulatedTactile] = []
         self._advance_due = 0.0
         try:
-            self._ids = settings.servos.ids if ids is None else ids
+            line = line or ServoLine()
+            self._ids = settings.servos.ids if line.ids is None else line.ids
             self._events = parse_faults(faults, self._ids)
             with undisturbed():
                 self._links = LinkFolder(folder)
@@ -138,7 +144,7 @@ class Emulator:
             table = make_table(settings, make_material(settings.material), table_cache)
             self.hand = SimulatedHand(settings, 0.0, table)
             if settings.servos.backend != "none":
-                self._add_servos(settings, baud, latency, factory)
+                self._add_servos(settings, line)
             if settings.tactile.backend != "none":
                 for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
                     self._add_board(settings, finger)
@@ -149,15 +155,15 @@ class Emulator:
             self.close()
             raise
 
-    def _add_servos(self, settings: Settings, baud: int, latency: float, factory: bool) -> None:
+    def _add_servos(self, settings: Settings, line: ServoLine) -> None:
         try:
             bus = ServoBus.from_settings(
-                settings, self.hand, ids=self._ids, baud=baud, factory=factory
+                settings, self.hand, ids=self._ids, baud=line.baud, factory=line.factory
             )
         except ValueError as error:
             raise EmulatorError(str(error)) from None
         with self._undisturbed():
-            servos = PtyServoBus(bus, baud=baud, latency=latency, clock=self.clock.now)
+            servos = PtyServoBus(bus, baud=line.baud, latency=line.latency, clock=self.clock.now)
             self._closers.append(servos.unplug)
             self._links.link("servos", servos.path)
         self._servos = servos
@@ -180,7 +186,7 @@ class Emulator:
             self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Answer until :meth:`stop`. ``on_ready`` is called once everything answers."""
+        """Answer until :meth:`end`. ``on_ready`` is called once everything answers."""
         ready = False
         while not self._stopping:
             self._turn()
@@ -188,7 +194,7 @@ class Emulator:
                 ready = True
                 on_ready()
 
-    def stop(self) -> None:
+    def end(self) -> None:
         """End :meth:`run`; may be called from a signal handler or another thread."""
         self._stopping = True
         with contextlib.suppress(OSError):

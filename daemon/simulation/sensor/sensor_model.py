@@ -72,13 +72,30 @@ class Imperfections:
         return cls(**{each.name: values[f"tactile_{each.name}"] for each in fields(cls)})
 
 
+@dataclass(frozen=True, slots=True)
+class Board:
+    """How a board counts: the pressure of a count, the largest one, the smallest that is sent.
+
+    Below ``threshold`` it sends 0. Raises ValueError for values out of their range.
+    """
+
+    pascal_per_count: float
+    full_count: int = 65535  # 255 for 8 bits
+    threshold: int = 0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.full_count <= 65535:
+            raise ValueError(f"full_count must be 1 … 65535, got {self.full_count}")
+        if not 0.0 < self.pascal_per_count < math.inf:
+            raise ValueError(f"pascal_per_count must be positive, got {self.pascal_per_count}")
+
+
 class SensorModel:
     """A pressure sensor under one simulated tip.
 
-    ``full_count`` is the largest count (255 for 8 bits), ``gain`` the tip's pressure over the
-    material's, ``dead`` the cells (row, col) that always read 0, and ``threshold`` the smallest
-    count that is sent: below it goes 0. Two models of equal arguments and calls give equal frames.
-    Raises ValueError for arguments out of their range.
+    ``gain`` is the tip's pressure over the material's, and ``dead`` has the cells (row, col) that
+    always read 0. Two models of equal arguments and calls give equal frames. Raises ValueError for
+    arguments out of their range.
     """
 
     def __init__(
@@ -86,29 +103,24 @@ class SensorModel:
         grid: SensorGrid,
         tip: Fingertip,
         material: Material,
-        pascal_per_count: float,
+        board: Board,
         flaws: Imperfections | None = None,
         *,
         seed: int | Sequence[int] = 0,
-        full_count: int = 65535,
         gain: float = 1.0,
         dead: Sequence[tuple[int, int]] = (),
-        threshold: int = 0,
     ) -> None:
-        if not 1 <= full_count <= 65535:
-            raise ValueError(f"full_count must be 1 … 65535, got {full_count}")
-        for name, value in (("pascal_per_count", pascal_per_count), ("gain", gain)):
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be positive, got {value}")
+        if not 0.0 < gain < math.inf:
+            raise ValueError(f"gain must be positive, got {gain}")
         self.grid = grid
         self._flaws = flaws = flaws or Imperfections()
-        self._per_count = pascal_per_count
+        self._per_count = board.pascal_per_count
         self._law = material.law
-        self._ends = (threshold, full_count)
+        self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
         spread = self._generator.standard_normal(shape)
-        sensitivity = gain * np.maximum(1.0 + flaws.gain_spread * spread, 0.0) / pascal_per_count
+        sensitivity = gain * np.maximum(1.0 + flaws.gain_spread * spread, 0.0) / self._per_count
         for row, col in dead:
             sensitivity[row, col] = 0.0
         if flaws.dead > 0.0:

@@ -12,7 +12,7 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.arrivals import Arrivals
-from softfinger.daemon.simulation.sensor.sensor_model import Imperfections, SensorModel
+from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.daemon.types import Frame
 
 
@@ -23,13 +23,11 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
         make_grid(settings, finger),
         make_tip(settings),
         make_material(settings.material),
-        tactile.pascal_per_count,
+        Board(tactile.pascal_per_count, tactile.full_count, tactile.threshold),
         Imperfections.of(simulation),
         seed=(simulation.seed, finger),
-        full_count=tactile.full_count,
         gain=simulation.modulus_scale,
         dead=tactile.dead[finger],
-        threshold=tactile.threshold,
     )
 
 

@@ -19,20 +19,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.simulation.sensor.sensor_model import Board
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import CLIPPED_MORE
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.campaigns import accuracy_trials as trials
 from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     EIGHT_BITS,
-    FLOAT,
     LINEAR,
     MODULUS,
     PITCH,
     SIXTEEN_BITS,
     SIZE,
     TIP,
-    Board,
 )
 from softfinger.tools.benchmarks.framework.campaign import upper_bound
 from softfinger.tools.benchmarks.framework.report import Row, Table
@@ -43,8 +42,8 @@ FloatArray = NDArray[np.float64]
 PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
 FAINT = 0.0002  # m
 NOISE = 0.002 * MODULUS
-_BOARDS = {
-    "float": FLOAT,
+_BOARDS: dict[str, Board | None] = {
+    "float": None,
     "16 bits of 4 Pa": SIXTEEN_BITS,
     "8 bits of 800 Pa, 3 sent": EIGHT_BITS,
 }
@@ -79,7 +78,9 @@ def detection(around: int, frames: int, again_frames: int, seed: int = 11) -> li
     return [Table("share of d = 0.2 mm at 0.2 % noise that is seen", rows)]
 
 
-def _missed(place: trials.Place, frames: int, random: np.random.Generator, board: Board) -> int:
+def _missed(
+    place: trials.Place, frames: int, random: np.random.Generator, board: Board | None
+) -> int:
     made = trials.estimator(place, NOISE, True, board, method="moments")
     clean = place.grid.pressure(TIP, LINEAR, *place.truth[:3])
     missed = 0
@@ -107,11 +108,11 @@ def false_alarms(frames: int) -> list[Table]:
     return [Table("alarms a frame of noise alone", rows)]
 
 
-def _alarm_row(name: str, board: Board, noise: float, level: float) -> Row:
+def _alarm_row(name: str, board: Board | None, noise: float, level: float) -> Row:
     return {
         "name": name,
         "noise Pa": noise,
-        "level": level + (CLIPPED_MORE if board.pascal_per_count > 0.0 else 0.0),
+        "level": level + (CLIPPED_MORE if board is not None else 0.0),
         "computed": expected_alarms(noise, board, level),
         "aim ≤": 1e-6 if level == PATCH_LEVEL else None,
     }
@@ -129,13 +130,15 @@ def gaussian_tail(level: float) -> float:
     return 0.5 * math.erfc(level / math.sqrt(2.0))
 
 
-def expected_alarms(noise: float, board: Board = FLOAT, patch_level: float = PATCH_LEVEL) -> float:
+def expected_alarms(
+    noise: float, board: Board | None = None, patch_level: float = PATCH_LEVEL
+) -> float:
     """Expected number of cells a frame that pass the contact test in noise alone.
 
     ``patch_level`` is the estimator's argument.
     """
     cells = int(disc().sum())
-    if board.pascal_per_count == 0.0:
+    if board is None:
         return cells * gaussian_tail(PEAK_LEVEL) * gaussian_tail(patch_level)
     scale = board.pascal_per_count
     deviation = math.sqrt(noise**2 + scale**2 / 12.0) / scale  # counts, as the estimator has it
@@ -169,12 +172,12 @@ def neighbours_distribution(one: FloatArray) -> FloatArray:
 
 
 def sampled(
-    levels: tuple[float, ...], frames: int, noise: float, board: Board = FLOAT, seed: int = 17
+    levels: tuple[float, ...], frames: int, noise: float, board: Board | None = None, seed: int = 17
 ) -> list[int]:
     """Frames of noise alone, of ``frames``, that the estimator takes for a contact, by level."""
     random = np.random.default_rng(seed)
     grid = SensorGrid(_SMALL, _SMALL, PITCH)
-    options = {"method": "moments", "peak_level": PEAK_LEVEL, "threshold": float(board.threshold)}
+    options = {"method": "moments", "peak_level": PEAK_LEVEL, "threshold": trials.threshold(board)}
     made = [
         ContactEstimator(TIP, LINEAR, grid, noise, patch_level=level, **options)  # type: ignore[arg-type]
         for level in levels

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.simulation.sensor.sensor_model import Board
 from softfinger.tools.benchmarks.campaigns import accuracy_trials as trials
 from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     EIGHT_BITS,
-    FLOAT,
     LINEAR,
     SIZE,
     TIP,
@@ -54,7 +54,7 @@ class Case:
     small: bool
     sigma: FloatArray  # the bound's deviations
     live: NDArray[np.bool_] | None
-    board: trials.Board
+    board: Board | None
 
     def __str__(self) -> str:
         return f"{self.place}, noise {self.noise:.0f} Pa"
@@ -90,7 +90,7 @@ def against_the_bound(sweep: Sweep, seed: int = 1) -> list[Table]:
     errors, honesty, notes = [], [], []
     for dead, small_aim in ((0.0, 1.10), (_DEAD, 1.20)):
         part = replace(sweep, around=max(sweep.around // 2, 1)) if dead else sweep
-        scores = _measure(_cases(part, dead, FLOAT, seed), sweep.frames, seed)
+        scores = _measure(_cases(part, dead, None, seed), sweep.frames, seed)
         for name, small, chosen in _groups(scores):
             name = f"{name}, 1 % dead" if dead else name
             d_top = _worst(chosen, lambda s: s.d, sweep, seed + 1)
@@ -176,8 +176,9 @@ def _honesty(name: str, scores: list[Score]) -> Row:
     return row | rest
 
 
-def _cases(sweep: Sweep, dead: float, board: trials.Board, seed: int) -> Iterator[Case]:
+def _cases(sweep: Sweep, dead: float, board: Board | None, seed: int) -> Iterator[Case]:
     random = np.random.default_rng(seed)
+    rounding = 0.0 if board is None else board.pascal_per_count**2 / 12.0  # its variance [Pa²]
     for place in trials.places(sweep.depths, sweep.degrees, sweep.around):
         slopes = trials.jacobian(place)
         live = random.random((SIZE, SIZE)) >= dead if dead else None
@@ -185,7 +186,7 @@ def _cases(sweep: Sweep, dead: float, board: trials.Board, seed: int) -> Iterato
             unit = trials.bound(slopes, 1.0, free, live)
             for noise in sweep.noises:
                 # What rounding adds to the noise is in the bound that decides what is small.
-                covariance = unit * (noise**2 + board.pascal_per_count**2 / 12.0)
+                covariance = unit * (noise**2 + rounding)
                 small = trials.is_small(place, covariance)
                 yield Case(place, noise, free, small, np.sqrt(np.diag(covariance)), live, board)
 

@@ -75,12 +75,11 @@ def flaws(frames: int, seed: int = 29) -> list[Table]:
     """
     rows = []
     data = np.zeros((SIZE, SIZE), np.uint16)
-    scale = SIXTEEN_BITS.pascal_per_count
     for name, options in FLAWS.items():
         for d, degrees in FLAW_CONTACTS:
             place = Place(d, math.radians(degrees), 0.0, (0.31, -0.17))
             imperfections = Imperfections(noise=FLAW_NOISE, **options)
-            sensor = SensorModel(place.grid, TIP, LINEAR, scale, imperfections, seed=seed)
+            sensor = SensorModel(place.grid, TIP, LINEAR, SIXTEEN_BITS, imperfections, seed=seed)
             sensor.press(0.0, place.theta, 0.0, 0.0)
             sensor.press(1.33 * d if sensor.remembers else d, place.theta, 0.0, 0.5)
             made = [
@@ -90,7 +89,7 @@ def flaws(frames: int, seed: int = 29) -> list[Table]:
             for k in range(frames):
                 sensor.frame(d, place.theta, 0.0, data, 1.0 + 20.0 * k / frames)
                 for each, estimator in zip(found, made, strict=True):
-                    trials.keep(estimator.update(data, scale), each[k])
+                    trials.keep(estimator.update(data, SIXTEEN_BITS.pascal_per_count), each[k])
             for gain, each in zip(("free", "known"), found, strict=True):
                 rows.append(_row(name, place, each, {"gain is": gain}))
     return [Table("a sensor with", rows)]

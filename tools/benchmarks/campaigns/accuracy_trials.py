@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.simulation.sensor.sensor_model import Board
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -47,16 +48,6 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
     return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
 
 
-@dataclass(frozen=True)
-class Board:
-    """How a board counts: Pa a count, largest count, smallest count sent. 0 Pa: float frames."""
-
-    pascal_per_count: float = 0.0
-    full_count: int = 65535
-    threshold: int = 0
-
-
-FLOAT = Board()
 SIXTEEN_BITS = Board(pascal_per_count=4.0)
 # 8 bits up to 204 kPa; the envelope's largest pressure is 188 kPa, at 8 mm and 30°.
 EIGHT_BITS = Board(pascal_per_count=800.0, full_count=255, threshold=3)
@@ -147,7 +138,7 @@ def is_misfit(chi2: FloatArray, cells: FloatArray) -> NDArray[np.bool_]:
 
 
 def estimator(
-    place: Place, noise: float, free: bool, board: Board = FLOAT, **more: Any
+    place: Place, noise: float, free: bool, board: Board | None = None, **more: Any
 ) -> ContactEstimator:
     """An estimator as the daemon would make it for that board."""
     return ContactEstimator(
@@ -156,10 +147,15 @@ def estimator(
         place.grid,
         noise,
         free_gain=free,
-        saturation=float(board.full_count) if board.pascal_per_count > 0.0 else None,
-        threshold=float(board.threshold),
+        saturation=None if board is None else float(board.full_count),
+        threshold=threshold(board),
         **more,
     )
+
+
+def threshold(board: Board | None) -> float:
+    """The least reading that the board sends; 0 for float frames."""
+    return 0.0 if board is None else float(board.threshold)
 
 
 def keep(e: ContactEstimate, row: FloatArray) -> None:
@@ -171,18 +167,21 @@ def keep(e: ContactEstimate, row: FloatArray) -> None:
 
 
 def run(
-    made: ContactEstimator, clean: FloatArray, noise: float, bank: FloatArray, board: Board = FLOAT
+    made: ContactEstimator,
+    clean: FloatArray,
+    noise: float,
+    bank: FloatArray,
+    board: Board | None = None,
 ) -> FloatArray:
     """Estimate ``clean`` + ``noise`` · each of ``bank`` [n, rows, cols]; float64 [n, COLUMNS]."""
     out = np.zeros((len(bank), COLUMNS))
-    counted = board.pascal_per_count > 0.0
-    scale = board.pascal_per_count or 1.0
-    frame = np.zeros(clean.shape, np.uint16 if counted else np.float64)
+    scale = 1.0 if board is None else board.pascal_per_count
+    frame = np.zeros(clean.shape, np.float64 if board is None else np.uint16)
     for normals, row in zip(bank, out, strict=True):
-        if counted:
-            _count(clean, noise, normals, scale, board.threshold, board.full_count, frame)
-        else:
+        if board is None:
             _add(clean, noise, normals, frame)
+        else:
+            _count(clean, noise, normals, scale, board.threshold, board.full_count, frame)
         keep(made.update(frame, scale), row)
     return out
 

@@ -1,14 +1,17 @@
-"""What a measurement returns: tables of rows; their text, and what became slower."""
+"""What a measurement returns: tables of rows; their text, their picture, and what became slower."""
 
 from __future__ import annotations
 
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from softfinger.tools.paper import style
 
 # One measured thing; each key is the heading of its column, "name" the first of them.
 Row = dict[str, Any]
@@ -108,3 +111,40 @@ def slower(old: list[Row], new: list[Row]) -> Table:
             name = ": ".join(part for part in key if part)
             rows.append({"name": name, "ratio": ratio, "noise": noise})
     return Table(f"slower than before, over the yardstick: {len(rows)} of {len(common)}", rows)
+
+
+def draw(tables: list[Table], path: Path) -> None:
+    """Run time against error: a panel for each table with an error column. Raises MissingExtra."""
+    drawn = [table for table in tables if table.error]
+    columns = min(len(drawn), 3)
+    rows = math.ceil(len(drawn) / columns)
+    looks: dict[str, int] = {}  # of each kind, the same in all panels
+    with style.settings():
+        figure = style.new_figure(3.6 * columns + 0.8, 3.4 * rows + 0.6)
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in panels[len(drawn) :]:
+            axes.remove()
+        for axes, table in zip(panels, drawn, strict=False):
+            kinds: dict[str, list[Row]] = {}
+            for row in table.rows:
+                if "median" not in row:  # a bound
+                    axes.axvline(row[table.error], color=style.GREY, linestyle="--", linewidth=1.0)
+                elif row.get(table.error, math.nan) > 0.0:  # no NaN
+                    kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
+            for kind, chosen in kinds.items():
+                k = looks.setdefault(kind, len(looks))
+                axes.plot(
+                    [row[table.error] for row in chosen],
+                    [row["median"] for row in chosen],
+                    style.MARKERS[k % len(style.MARKERS)],
+                    color=style.KINDS[k % len(style.KINDS)],
+                    ms=5,
+                    label=kind,
+                )
+            axes.set(
+                xscale="log", yscale="log", title=table.title, xlabel=f"{table.error} (better →)"
+            )
+            axes.set_ylabel(f"run time [{table.rows[0]['unit']}]")
+            axes.invert_xaxis()
+            axes.legend(loc="best", fontsize=6)
+        style.save(figure, path)
