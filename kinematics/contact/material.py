@@ -182,15 +182,20 @@ def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
     x = np.asarray(strain, dtype=np.float64)
     pieces = len(law)
     u = np.clip(x, 0.0, 1.0) * pieces
-    k = np.minimum(np.nan_to_num(u), pieces - 1).astype(np.intp)
-    u = u - k
-    value = law[k, -1]
-    for j in range(law.shape[1] - 2, -1, -1):
-        value = value * u + law[k, j]
-    beyond = np.maximum(x - 1.0, 0.0) * pieces
-    last = np.polynomial.Polynomial(law[-1])
-    for n in range(1, order + 1):
-        value = value + last.deriv(n)(1.0) / math.factorial(n) * beyond**n
+    if pieces == 1:
+        terms = law[0]
+    else:
+        k = np.minimum(np.nan_to_num(u), pieces - 1).astype(np.intp)
+        u = u - k
+        terms = np.moveaxis(law[k], -1, 0)
+    value = terms[-1]
+    for term in terms[-2::-1]:
+        value = value * u + term
+    if (x > 1.0).any():
+        beyond = np.maximum(x - 1.0, 0.0) * pieces
+        last = np.polynomial.Polynomial(law[-1])
+        for n in range(1, order + 1):
+            value = value + last.deriv(n)(1.0) / math.factorial(n) * beyond**n
     return np.asarray(np.where(x <= 0.0, 0.0, value))
 
 

@@ -61,32 +61,36 @@ def moment_ratios(tip: Fingertip, material: Material) -> FloatArray:
     Rows are evenly spaced from 0 to 0.8 a. Integrated over the flattened disc in polar coordinates
     at a tilt of 0.2 rad.
     """
-    a = tip.radius
-    table = np.ones((RATIO_POINTS, 3))
     if material.is_linear:
-        return table
+        return np.ones((RATIO_POINTS, 3))
+    a = tip.radius
     radial, radial_weight = np.polynomial.legendre.leggauss(24)
     angle = 2.0 * math.pi * (np.arange(32) + 0.5) / 32
     s, c = math.sin(_RATIO_TILT), math.cos(_RATIO_TILT)
-    for k, d in enumerate(np.linspace(0.0, _RATIO_END, RATIO_POINTS) * a):
-        depth = max(d, 1e-4 * a)
-        h = a - depth
-        rho = math.sqrt(depth * (2.0 * a - depth))
-        r = rho * 0.5 * (radial + 1.0)[:, None]
-        x = h * s + r * np.cos(angle) * c
-        y = r * np.sin(angle)
-        z = h * c - r * np.cos(angle) * s
-        length2 = a * a - x * x - y * y
-        strain = np.clip(1.0 - z / np.sqrt(np.maximum(length2, 1e-12)), 0.0, 1.0)
-        pressure = material.stress(strain) * radial_weight[:, None] * r
-        total = pressure.sum()
-        mean = (pressure * x).sum() / total
-        trace = (pressure * ((x - mean) ** 2 + y**2)).sum() / total
-        force = total * c * (0.5 * rho) * (2.0 * math.pi / 32)
-        table[k, 0] = force / (math.pi * material.reference_modulus * depth**2 / c)
-        table[k, 1] = mean / (s * (a - depth / 3.0))
-        table[k, 2] = trace / closed_trace(a, depth, s)
-    return table
+    depth = np.maximum(np.linspace(0.0, _RATIO_END, RATIO_POINTS) * a, 1e-4 * a)
+    h = (a - depth)[:, None, None]
+    rho = np.sqrt(depth * (2.0 * a - depth))
+    r = rho[:, None, None] * 0.5 * (radial + 1.0)[:, None]
+    x = h * s + r * np.cos(angle) * c
+    y = r * np.sin(angle)
+    z = h * c - r * np.cos(angle) * s
+    length2 = a * a - x * x - y * y
+    strain = np.clip(1.0 - z / np.sqrt(np.maximum(length2, 1e-12)), 0.0, 1.0)
+    pressure = material.stress(strain) * radial_weight[:, None] * r
+
+    def summed(values: FloatArray) -> FloatArray:
+        return np.asarray(values.reshape(RATIO_POINTS, -1).sum(axis=1))
+
+    total = summed(pressure)
+    mean = summed(pressure * x) / total
+    trace = summed(pressure * ((x - mean[:, None, None]) ** 2 + y**2)) / total
+    force = total * c * (0.5 * rho) * (2.0 * math.pi / 32)
+    ratios = (
+        force / (math.pi * material.reference_modulus * depth**2 / c),
+        mean / (s * (a - depth / 3.0)),
+        trace / closed_trace(a, depth, s),
+    )
+    return np.stack(ratios, axis=1)
 
 
 @inner_kernel

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -213,19 +213,19 @@ class SensorGrid:
                 d, *self.to_sensor(n_x, n_y), gain, out
             )
             return out
-        work = Rendering(np.empty(1, Rendering.dtype))
-        work.d, work.gain = d, gain
-        work.n_x, work.n_y = self.to_sensor(n_x, n_y)
+        work: Any = np.empty(1, Rendering.dtype)  # a record's views take longer than to set fields
+        work["d"], work["gain"] = d, gain
+        work["n_x"], work["n_y"] = self.to_sensor(n_x, n_y)
         if self.blur == 0.0:
-            work.grid.assign(self.on(tip))
-            render(work.array, material.law, out)
+            work["grid"] = self.on(tip).array
+            render(work, material.law, out)
             return out
         pitch_x, pitch_y = self.pitches
         n = parts(self.blur / pitch_x), parts(self.blur / pitch_y)
         stencils, finer = self.finer(n)
         fine = np.empty(finer.shape)
-        work.grid.assign(finer.on(tip))
-        render(work.array, material.law, fine)
+        work["grid"] = finer.on(tip).array
+        render(work, material.law, fine)
         out[:] = average(fine, *stencils, n)
         return out
 
