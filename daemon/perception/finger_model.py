@@ -15,7 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
@@ -102,7 +102,5 @@ def make_estimator(
         method=settings.estimator.method,
         free_gain=settings.estimator.free_gain,
         live=alive,
-        saturation=saturation,
-        threshold=threshold,
-        quantum=quantum,
+        readings=Readings(saturation, threshold, quantum),
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -88,22 +89,41 @@ _FULL = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """How a board's readings end. Raises ValueError for values out of their range.
+
+    ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; None: an
+    integer type's largest value. ``threshold`` is the smallest count the board sends, 0 stands for
+    all below; for integer frames. ``quantum`` [Pa] is the width of a count where float frames are
+    made of counts, which end at 0; 0 where they are not.
+    """
+
+    saturation: float | None = None
+    threshold: float = 0.0
+    quantum: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("threshold", "quantum"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+
+# Of the fit and the activity test; `ContactEstimator.state` has them, should others be tried.
+_TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iteration
+_ITERATIONS = 20
+PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
+PATCH_LEVEL = 4.9
+_EXPLAINED_MIN = 0.8  # share of the frame's squared pressure below which an estimate is not valid
+
+
 class ContactEstimator:
     """Estimates the contact under one tip from frames of a pressure grid.
 
     Takes the tip, its material, the grid, and ``noise``, a cell's standard deviation [Pa].
     ``method`` is "ml" (maximum likelihood) or "moments". ``free_gain`` also estimates measured over
-    modelled pressure; otherwise ``gain`` is taken. ``live`` [rows, cols] bool masks dead cells.
-    ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; by
-    default an integer type's largest value. ``threshold`` is the smallest count the board sends,
-    0 stands for all below; for integer frames. ``quantum`` [Pa] is the width of a count where float
-    frames are made of counts, which end at 0; 0 where they are not. ``tolerance`` stops the
-    iteration once the squared step, in units of the noise floor, is below it (below 1 where it
-    started from the frame alone): a step leaves an error of its square's order, so one of 4 σ ends
-    well inside the noise.
-    ``peak_level`` and ``patch_level`` set the activity test, see
-    :func:`estimation.detection.activity`; ``explained_min`` is the share of the frame's squared
-    pressure below which an estimate is not valid.
+    modelled pressure, which is 1 otherwise. ``live`` [rows, cols] bool masks dead cells.
+    ``readings`` says where the board's readings end.
 
     Raises ValueError for arguments out of their range.
     """
@@ -117,47 +137,34 @@ class ContactEstimator:
         *,
         method: Literal["ml", "moments"] = "ml",
         free_gain: bool = True,
-        gain: float = 1.0,
         live: NDArray[np.bool_] | None = None,
-        saturation: float | None = None,
-        threshold: float = 0.0,
-        quantum: float = 0.0,
-        tolerance: float = 16.0,
-        iterations: int = 20,
-        peak_level: float = 3.0,
-        patch_level: float = 4.9,
-        explained_min: float = 0.8,
+        readings: Readings | None = None,
     ) -> None:
         if not (math.isfinite(noise) and noise > 0.0):
             raise ValueError(f"noise must be a positive number of Pa, got {noise}")
         if method not in ("ml", "moments"):
             raise ValueError(f"method must be 'ml' or 'moments', got {method!r}")
-        if not (math.isfinite(gain) and gain > 0.0):
-            raise ValueError(f"gain must be positive, got {gain}")
-        if not 0.0 <= threshold < math.inf:
-            raise ValueError(f"threshold must not be negative, got {threshold}")
-        if not 0.0 <= quantum < math.inf:
-            raise ValueError(f"quantum must not be negative, got {quantum}")
         if live is not None and np.shape(live) != grid.shape:
             raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
+        readings = readings or Readings()
         self.grid = grid
-        self.saturation = saturation
-        self._quantum = quantum
+        self.saturation = readings.saturation
+        self._quantum = readings.quantum
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
         state = self._state = State()
         options = self._options = state.options
         options.noise = noise
         options.saturation = math.inf
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
-        options.floor = max(threshold - 0.5, 0.0)
+        options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = free_gain
-        options.fixed_gain = gain
-        options.tolerance = tolerance
-        options.iterations = iterations
+        options.fixed_gain = 1.0
+        options.tolerance = _TOLERANCE
+        options.iterations = _ITERATIONS
         options.moments_only = method == "moments"
-        options.peak_level = peak_level
-        options.patch_level = patch_level
-        options.explained_min = explained_min
+        options.peak_level = PEAK_LEVEL
+        options.patch_level = PATCH_LEVEL
+        options.explained_min = _EXPLAINED_MIN
         options.modulus = material.reference_modulus
         options.blur = grid.blur
         options.rotation = grid.rotation
@@ -274,6 +281,12 @@ class ContactEstimator:
         return result
 
 
+@lru_cache(maxsize=4)
+def _integrals(grid: SensorGrid, tip: Fingertip) -> FloatArray:
+    """Of a grid's cells under a tip: two fingers' are mostly the same."""
+    return cell_integrals(grid.on(tip))
+
+
 def _lay_out(
     state: State, grid: SensorGrid, tip: Fingertip, live: NDArray[np.bool_]
 ) -> tuple[FloatArray, IntArray | None]:
@@ -282,7 +295,7 @@ def _lay_out(
     state.grid.assign(geometry)
     state.model.assign(geometry)
     centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
-    cells = cell_integrals(geometry)
+    cells = _integrals(grid, tip).copy()
     # A blur reaches cells that no contact is looked for in; whatever they read, it's not used.
     cells[:, LIVE] = (centres[HEIGHT] >= 0.0).reshape(grid.shape)
     arrays = {"centres": centres, "cells": cells}
@@ -291,7 +304,7 @@ def _lay_out(
         pitch_x, pitch_y = grid.pitches
         number = parts_to_fit(grid.blur / pitch_x), parts_to_fit(grid.blur / pitch_y)
         (across, along), finer = grid.finer(number)
-        parts = cell_integrals(finer.on(tip))
+        parts = _integrals(finer, tip).copy()
         parts[:, LIVE] = 1.0
         model, blur = state.model, state.blur
         model.rows, model.cols = finer.shape

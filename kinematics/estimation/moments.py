@@ -12,6 +12,7 @@ any other material enters by the ratios to them, tabled over d (`moment_ratios`)
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,6 +56,7 @@ def closed_trace(a: float, d: float, s: float) -> float:
 _trace = inner_kernel(closed_trace)
 
 
+@lru_cache(maxsize=4)
 def moment_ratios(tip: Fingertip, material: Material) -> FloatArray:
     """Force, centroid and trace over the closed forms of E₀, float64 [RATIO_POINTS, 3], over d.
 
@@ -88,7 +90,7 @@ def moment_ratios(tip: Fingertip, material: Material) -> FloatArray:
     ratios = (
         force / (math.pi * material.reference_modulus * depth**2 / c),
         mean / (s * (a - depth / 3.0)),
-        trace / closed_trace(a, depth, s),
+        trace / [closed_trace(a, each, s) for each in depth.tolist()],
     )
     return np.stack(ratios, axis=1)
 

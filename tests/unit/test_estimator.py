@@ -10,7 +10,7 @@ import pytest
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator, Readings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A = 0.020
@@ -75,9 +75,8 @@ def test_without_noise_the_bias_stays_far_below_the_noise_floor(material, free_g
         grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
         d = 10 ** rng.uniform(math.log10(5e-4), math.log10(8e-3))
         truth = (d, *tilts(rng.uniform(0.0, math.radians(30)), rng.uniform(0, 7)), 1.0)
-        estimator = ContactEstimator(
-            TIP, material, grid, noise, free_gain=free_gain, tolerance=1e-6
-        )
+        estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
+        estimator.state.options.tolerance = 1e-6
         e = estimator(grid.pressure(TIP, material, *truth[:3]))
         assert e.valid
         n = 4 if free_gain else 3
@@ -98,7 +97,8 @@ def test_the_bias_stays_small_where_the_outline_all_but_meets_the_rim(d, degrees
         grid = SensorGrid(44, 44, PITCH, centre=tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
         truth = (d, *tilts(math.radians(degrees), rng.uniform(0, 7)), 1.0)
         sigma = np.sqrt(np.diag(fisher(grid, LINEAR, truth, noise, free_gain)))
-        estimator = ContactEstimator(TIP, LINEAR, grid, noise, free_gain=free_gain, tolerance=1e-6)
+        estimator = ContactEstimator(TIP, LINEAR, grid, noise, free_gain=free_gain)
+        estimator.state.options.tolerance = 1e-6
         e = estimator(grid.pressure(TIP, LINEAR, *truth[:3]))
         assert e.valid
         assert np.all(np.abs(errors(e, truth)[: len(sigma)]) < share * sigma)
@@ -181,8 +181,9 @@ def test_measured_over_modelled_pressure_is_the_gain():
     e = ContactEstimator(TIP, LINEAR, GRID, NOISE)(p)
     assert e.gain == pytest.approx(0.6, rel=1e-4)
     assert e.d == pytest.approx(0.003, rel=1e-4)
-    known = ContactEstimator(TIP, LINEAR, GRID, NOISE, free_gain=False, gain=0.6)(p)
-    assert known.gain == 0.6
+    softer = Material.constant(0.6 * LINEAR.reference_modulus)
+    known = ContactEstimator(TIP, softer, GRID, NOISE, free_gain=False)(p)
+    assert known.gain == 1.0
     assert known.d == pytest.approx(0.003, rel=1e-5)
     assert known.d_std < e.d_std
     assert np.all(known.covariance[3] == 0.0)
@@ -420,7 +421,7 @@ def test_a_model_that_does_not_fit_shows_in_chi2_and_widens_the_covariance():
 def test_a_board_that_sends_nothing_below_three_counts_biases_d_by_less_than_a_percent(noise):
     rng = np.random.default_rng(17)
     estimator = ContactEstimator(
-        TIP, MEASURED, GRID, max(noise, 100.0), free_gain=False, threshold=3
+        TIP, MEASURED, GRID, max(noise, 100.0), free_gain=False, readings=Readings(threshold=3)
     )
     for d in (0.001, 0.002, 0.008):
         ratios = []

@@ -9,7 +9,7 @@ import pytest
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A = 0.020
@@ -32,7 +32,8 @@ def test_saturated_cells_are_left_out():
     noisy = clean + rng.normal(0.0, NOISE, GRID.shape)
     full = 0.75 * clean.max()
     plain = ContactEstimator(TIP, LINEAR, GRID, NOISE)(noisy)
-    aware = ContactEstimator(TIP, LINEAR, GRID, NOISE, saturation=full)(np.minimum(noisy, full))
+    aware = ContactEstimator(TIP, LINEAR, GRID, NOISE, readings=Readings(full))
+    aware = aware(np.minimum(noisy, full))
     assert aware.valid
     assert abs(aware.d - 0.006) < 4.0 * aware.d_std
     assert aware.d_std > plain.d_std
@@ -179,15 +180,18 @@ def test_what_is_not_one_contact_is_not_valid(free_gain):
         ({"noise": 0.0}, "noise"),
         ({"noise": math.nan}, "noise"),
         ({"method": "best"}, "method"),
-        ({"gain": -1.0}, "gain"),
-        ({"saturation": 0.0}, "saturation"),
-        ({"threshold": -1.0}, "threshold"),
+        ({"readings": Readings(saturation=0.0)}, "saturation"),
         ({"live": np.ones((4, 4), bool)}, "live"),
     ],
 )
 def test_wrong_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
+
+
+def test_readings_below_nothing_are_refused():
+    with pytest.raises(ValueError, match="threshold"):
+        Readings(threshold=-1.0)
 
 
 def _garbage(rng, grid):

@@ -9,7 +9,7 @@ import pytest
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
 from softfinger.kinematics.estimation.gauss_newton import free_noise
 from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, set_law
 from softfinger.kinematics.estimation.state import PLANES
@@ -86,7 +86,7 @@ def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent,
     for k in range(6):
         grid = SensorGrid(44, 44, PITCH, tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
         estimator = ContactEstimator(
-            TIP, LINEAR, grid, noise, free_gain=free_gain, threshold=3, saturation=255.0
+            TIP, LINEAR, grid, noise, free_gain=free_gain, readings=Readings(255.0, 3)
         )
         clean = grid.pressure(TIP, LINEAR, d, 0.1 * k, 0.05 * k)
         for _ in range(frames):
@@ -103,7 +103,7 @@ def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent,
 
 def test_a_board_without_any_noise_is_not_corrected_for_it():
     grid = SensorGrid(44, 44, PITCH)
-    estimator = ContactEstimator(TIP, LINEAR, grid, 1500.0, threshold=3)
+    estimator = ContactEstimator(TIP, LINEAR, grid, 1500.0, readings=Readings(threshold=3))
     for d in (0.001, 0.003):
         counts = np.round(grid.pressure(TIP, LINEAR, d, 0.1, 0.2) / 500.0)
         counts[counts < 3] = 0

@@ -177,7 +177,9 @@ def _call(estimator: ContactEstimator, frames: FloatArray) -> _Case:
 
 def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Case]:
     """What is skipped, on and off."""
-    always = _estimator(peak_level=-1e9, patch_level=-1e9)
+    always, exact = _estimator(), _estimator()
+    always.state.options.peak_level = always.state.options.patch_level = -1e9
+    exact.state.options.tolerance = 1e-9
     seen = _estimator()
 
     def again(repeat: int) -> None:
@@ -190,7 +192,7 @@ def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Case]:
         ),
         "no contact: fitted all the same, kernel": replace(_kernel(always, empty), found=None),
         "frame already seen: call": _Case(Subject(again)),
-        "ml, gain free: warm, no early stop, kernel": _kernel(_estimator(tolerance=1e-9), frames),
+        "ml, gain free: warm, no early stop, kernel": _kernel(exact, frames),
     }
 
 

@@ -70,9 +70,9 @@ def _always_fitted(daemon: Daemon) -> None:
     tip, noise = daemon.models[0].table.tip, daemon.settings.tactile.noise
     for finger in daemon.loop.perception.fingers:
         grid, material = finger._estimator.grid, daemon.models[finger.finger].material
-        finger._estimator = ContactEstimator(
-            tip, material, grid, noise, peak_level=-1e9, patch_level=-1e9
-        )
+        finger._estimator = ContactEstimator(tip, material, grid, noise)
+        options = finger._estimator.state.options
+        options.peak_level = options.patch_level = -1e9
 
 
 def _always_cold(daemon: Daemon) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.simulation.sensor.sensor_model import Board
-from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.estimator import PATCH_LEVEL, PEAK_LEVEL, ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import CLIPPED_MORE
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.campaigns import accuracy_trials as trials
@@ -38,8 +38,6 @@ from softfinger.tools.benchmarks.framework.report import Row, Table
 
 FloatArray = NDArray[np.float64]
 
-# The estimator's defaults; what it asks of counts beyond is added.
-PEAK_LEVEL, PATCH_LEVEL = 3.0, 4.9
 FAINT = 0.0002  # m
 NOISE = 0.002 * MODULUS
 _BOARDS: dict[str, Board | None] = {
@@ -177,11 +175,11 @@ def sampled(
     """Frames of noise alone, of ``frames``, that the estimator takes for a contact, by level."""
     random = np.random.default_rng(seed)
     grid = SensorGrid(_SMALL, _SMALL, PITCH)
-    options = {"method": "moments", "peak_level": PEAK_LEVEL, "threshold": trials.threshold(board)}
-    made = [
-        ContactEstimator(TIP, LINEAR, grid, noise, patch_level=level, **options)  # type: ignore[arg-type]
-        for level in levels
-    ]
+    made = []
+    for level in levels:
+        ends = trials.readings(board)
+        made.append(ContactEstimator(TIP, LINEAR, grid, noise, method="moments", readings=ends))
+        made[-1].state.options.patch_level = level
     nothing = np.zeros(grid.shape)
     alarms = [0] * len(levels)
     for first in range(0, frames, _BATCH):

@@ -18,7 +18,7 @@ from softfinger.daemon.simulation.sensor.sensor_model import Board
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator, Readings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
@@ -147,15 +147,14 @@ def estimator(
         place.grid,
         noise,
         free_gain=free,
-        saturation=None if board is None else float(board.full_count),
-        threshold=threshold(board),
+        readings=readings(board),
         **more,
     )
 
 
-def threshold(board: Board | None) -> float:
-    """The least reading that the board sends; 0 for float frames."""
-    return 0.0 if board is None else float(board.threshold)
+def readings(board: Board | None) -> Readings:
+    """How a board's readings end; None: float frames."""
+    return Readings() if board is None else Readings(board.full_count, board.threshold)
 
 
 def keep(e: ContactEstimate, row: FloatArray) -> None:
