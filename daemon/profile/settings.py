@@ -32,6 +32,7 @@ Factor = Annotated[float, Field(ge=1e-5, le=1e5, allow_inf_nan=False)]
 Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
 Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Ratio = Annotated[float, Field(ge=0.1, le=10)]
 Finger = Literal["left", "right"]
 Index = Annotated[int, Field(ge=0, le=255)]
 Cells = tuple[tuple[Index, Index], ...]
@@ -325,6 +326,9 @@ class Simulation(Section):
     palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
     palm_friction: NonNegative = 0.3  # Coulomb, object on the palm
     tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
+    tip_shear_stiffness: Ratio = 1.0  # of its springs along the face over that across it
+    tip_creep_time: NonNegative = 0.0  # s in which a stuck shear relaxes to 1/e; 0: it stays
+    tip_micro_slip: bool = False  # the footprint's edge slips before all of it does
     joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
     joint_damping: NonNegative = 0.02  # N·m·s/rad
     joint_friction: NonNegative = 0.05  # N·m, Coulomb

@@ -119,6 +119,9 @@ def random_hand(generator: np.random.Generator, long: bool = False):
         "joint_inertia": float(10 ** generator.uniform(-4, -1)),
         "tip_loss": float(10 ** generator.uniform(-5, -1)),
         "gravity": tuple(float(g) for g in generator.normal(size=2)),
+        "tip_shear_stiffness": float(10 ** generator.uniform(-1, 1)),
+        "tip_creep_time": float(generator.choice([0.0, 0.01, 1.0])),
+        "tip_micro_slip": bool(generator.integers(2)),
     }
     hand = make(table, **parameters)
     if long:

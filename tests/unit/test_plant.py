@@ -51,6 +51,7 @@ def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContac
     ("depth", "scene"),
     [
         ((0.001, 0.010), {}),
+        ((0.001, 0.010), {"tip_shear_stiffness": 0.6}),
         ((0.010, 0.019), {}),
         ((0.0190, 0.0205), {}),
         ((0.001, 0.015), {"object_height": 0.002}),
@@ -58,7 +59,16 @@ def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContac
         ((0.001, 0.018), {"object_shape": "disc", "object_radius": 0.025}),
         ((0.016, 0.022), {"object_shape": "disc", "object_radius": 0.012}),
     ],
-    ids=["soft", "rim", "flat on the rim", "corner", "wedge", "disc", "disc on the rim"],
+    ids=[
+        "soft",
+        "softer along",
+        "rim",
+        "flat on the rim",
+        "corner",
+        "wedge",
+        "disc",
+        "disc on the rim",
+    ],
 )
 def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
     hand = make(table, tip_friction=500.0, **scene)

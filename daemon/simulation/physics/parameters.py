@@ -70,6 +70,10 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     p.scale = simulation.modulus_scale
     p.friction = simulation.tip_friction
     p.loss = simulation.tip_loss
+    p.shear_stiffness = simulation.tip_shear_stiffness
+    if simulation.tip_creep_time > 0.0:
+        p.creep = -math.expm1(-step / simulation.tip_creep_time)
+    p.micro_slip = simulation.tip_micro_slip
     p.rim_stiffness = RIM_STIFFNESS
     p.tolerance = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
     p.half_separation = 0.5 * settings.hand.pivot_separation

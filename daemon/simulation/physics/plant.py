@@ -46,6 +46,7 @@ from softfinger.daemon.simulation.physics.servo_loop import (
     set_motor_slopes,
     stop_stiffness,
 )
+from softfinger.daemon.simulation.physics.shear import relax_shears
 from softfinger.daemon.simulation.physics.solver import (
     along_row,
     factorise,
@@ -211,6 +212,7 @@ def step(plants: Records[Plant], table: FloatArray, ring: Records[SampleRow], co
     h = p.step
     g = _GAMMA * h
     scripted = p.object_held and p.script_speed > 0.0
+    relaxing = p.creep > 0.0 or p.micro_slip
     evaluate_state(plant, data)
     open_guard(plant)
     settle(plant, ring)
@@ -229,6 +231,8 @@ def step(plants: Records[Plant], table: FloatArray, ring: Records[SampleRow], co
         plant.steps += 1
         if scripted:
             state.position[2] = script_x(plant, plant.steps * h)
+        if relaxing:
+            relax_shears(plant)
         # Slip: the shears come back within their limits, and settle keeps them there.
         evaluate_state(plant, data)
         if scripted:

@@ -35,6 +35,7 @@ ALONG_D = 0
 ALONG_THETA = 1
 ALONG_SHEAR = 2
 
+LAYERS = 8  # of a footprint, from its edge inwards, that slip one after the other
 CORNERS = 4  # of the object, which may lie on the palm
 PALM_ROWS = 8  # of the extra ones: height and slide of each corner
 EXTRA_ROWS = 14  # and d, θ and d_t of each tip on the other
@@ -96,6 +97,9 @@ class Parameters(Record):
     scale: float  # real modulus over the table's
     friction: float
     loss: float  # damping over stiffness [s]
+    shear_stiffness: float  # over that of the springs
+    creep: float  # share of a stuck shear that relaxes in a sub-step
+    micro_slip: bool  # the footprint's edge slips before all of it does
     rim_stiffness: float  # [N/m]
     tolerance: float  # share of the energy that smooth steps may gain
     half_separation: float  # of the pivots [m]
@@ -178,6 +182,7 @@ class TipContact(Record):
     rate_theta: float  # [rad/s]
     slide: float  # velocity of what is touched less the tip's, along t [m/s]
     shear: float  # d_t within its limits [m]
+    spread: float  # variance of its layers' shears [m²]
     shear_rate: float  # stick rate of d_t [m/s]
     force: float  # total force on the tip's base, what a pressure grid sums to [N]
     energy: float  # elastic [J]
@@ -252,6 +257,8 @@ class Plant(Record):
     load: Five  # right-hand side of the step's equations
     motor_by_q: Pair  # slopes of the motors' torques for the matrix
     motor_by_rate: Pair
+    layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
+    spread: Pair  # their variance [m²]
     palm_energy: float  # [J]
     tips_near: bool  # the tips on each other were evaluated
     coupled: bool  # an extra row may act in this step

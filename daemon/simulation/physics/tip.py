@@ -2,14 +2,15 @@
 
 All elastic forces are the gradient of one energy, so that the contact can't create any:
 
-    U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + cos θ d_t²/d) ] + U_rim(d, θ)
+    U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + s cos θ d_t²/d) ] + U_rim(d, θ)
 
 U₀ and F are energy and force of the contact table, for a plane face. With a constant modulus E,
 F = πEd²/cos θ and the second term is πE(d² d_t tan θ + d d_t²), the parallel-distributed model's
-tangential energy; for other materials F carries their effective modulus into it. w(θ) is 1 where
-the soft hemisphere is and fades to 0 towards the finger's side. U_rim is a stiff spring between the
-backing plate's rim and the object, met on a plane at d = a(1 − |sin θ|), the end of the soft tip's
-range; just before it, at a(1 − √(sin² θ + 0.03²)), U₀ goes on linearly in d and F stays.
+tangential energy, with s = ``tip_shear_stiffness`` = 1; for other materials F carries their
+effective modulus into it. w(θ) is 1 where the soft hemisphere is and fades to 0 towards the
+finger's side. U_rim is a stiff spring between the backing plate's rim and the object, met on a
+plane at d = a(1 − |sin θ|), the end of the soft tip's range; just before it, at
+a(1 − √(sin² θ + 0.03²)), U₀ goes on linearly in d and F stays.
 
 The tip touches the object's nearest point: on a face, along the face's normal; on a corner, along
 the line to it, as if on the plane normal to that line; on a disc, along the line to its centre. A
@@ -23,10 +24,10 @@ rendered from those springs (`sensor.curved_face`), so its sum differs by as muc
 force goes with d^(3/2) and by √κ, as Hertz's does between a sphere and a cylinder in the limit of
 small d; its frame is the plane's with that share.
 
-Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
-ratio |T|/N can't reach μ (with a constant E it can't exceed 1 at θ = 0), the tip slips at its
-largest ratio. Losses are viscous, each proportional to the soft part's stiffness, so they grow with
-the contact.
+Friction is Coulomb's: d_t stays within the two shears at which |T| = μN; `shear` has what else a
+tip may do. Where the model's own ratio |T|/N can't reach μ (with a constant E and s = 1 it can't
+exceed 1 at θ = 0), the tip slips at its largest ratio. Losses are viscous, each proportional to the
+soft part's stiffness, so they grow with the contact.
 """
 
 from __future__ import annotations
@@ -106,13 +107,14 @@ def clear_contact(tip: TipContact) -> None:
 def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
     """The law of the contact: forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
-    ``share`` is κ. Takes from the tip d, θ, reach, rates, slide, shear and the rim; writes the rest
-    but what is over the coordinates.
+    ``share`` is κ. Takes from the tip d, θ, reach, rates, slide, shear, spread and the rim; writes
+    the rest but what is over the coordinates.
     """
     d = tip.d
     sine = tip.sine
     cosine = tip.cosine
     shear = tip.shear
+    spread = tip.spread
     gain, gain_theta = fade(tip.theta)
     gain *= share
     gain_theta *= share
@@ -169,14 +171,15 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
         )
 
         # T and N are polynomials of the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
-        ratio = cosine * inverse_d
+        firm = p.shear_stiffness
+        ratio = firm * cosine * inverse_d
         t0 = gain * force * sine
         t1 = 2.0 * gain * force * ratio
         n0 = gain * slope - t0 * tangent + along_d
         n1 = gain * d_soft_d * force_d * sine - t1 * tangent
         n2 = gain * d_soft_d * ratio * (force_d - force * inverse_d)
         bend = max(n2, 0.25 * gain * force * ratio * inverse_d)
-        neutral = -0.5 * tangent * d_soft  # where T = 0
+        neutral = -0.5 * tangent * d_soft / firm  # where T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
         # Most steps are far from slip, which two comparisons tell.
         normal = n0 + shear * (n1 + shear * n2)
@@ -191,11 +194,15 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
             shear = min(max(shear, lowest), highest)
             normal = n0 + shear * (n1 + shear * n2)
             tangential = t0 + t1 * shear
+        normal += n2 * spread
 
         # U's second term and its derivatives.
-        stretch = sine * shear + ratio * shear * shear
+        bent = firm * sine * inverse_d
+        stretch = sine * shear + ratio * shear * shear + ratio * spread
         by_soft = force_d * stretch - force * ratio * inverse_d * shear * shear
-        by_theta = force_theta * stretch + force * shear * (cosine - sine * inverse_d * shear)
+        by_soft -= force * ratio * inverse_d * spread
+        by_theta = force_theta * stretch + force * shear * (cosine - bent * shear)
+        by_theta -= force * bent * spread
         soft += force * stretch
         energy += gain * soft
         along_d += gain * (slope + d_soft_d * by_soft)
@@ -331,6 +338,7 @@ def touch_object(
     t_q = side * distance - v_t
     tip.slide = t_q * q_rate - my * x_rate + mx * y_rate + turn_t * turn_rate
     tip.shear = now.shear[finger]
+    tip.spread = plant.spread[finger]
     press(p, table, tip, p.share)
     if rim + reach > 0.0:
         stiffen_by_rim(p, tip)
