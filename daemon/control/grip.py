@@ -13,6 +13,13 @@ and one that moves the object (q1 + δ, q2 − δ), so every law has two parts:
 pivot, ``energy`` the gradient of the tables' energy along the rolling increments, in which the
 tips' moments and shear forces are counted, too. ``position`` commands angles and no torques, for
 comparison.
+
+Two laws are blind: until the object is steered by a command, they don't use its angle. ``blind``
+gives both joints one torque, with damping, as in the literature on blind grasping, and is there for
+comparison, too. ``upright`` makes use of the tips' elastic energy: it adds a spring between the
+fingers that puts the energy's minimum where the object stands upright, whatever shear is stuck in
+the tips (`hand.upright`), and shakes the fingers against each other until nothing but the minimum
+holds the object. Then it keeps the fingers' lean.
 """
 
 from __future__ import annotations
@@ -61,7 +68,27 @@ class Grip:
         law.by_energy = control.law == "energy" and both
         # The torques of joints that are held to angles show no load.
         law.watched = control.law != "position" and both
+        law.upright = control.law == "upright"
+        law.blind = law.upright or control.law == "blind"
+        hand = settings.hand
+        law.half_separation = 0.5 * hand.pivot_separation
+        law.length, law.offset = hand.finger_length, hand.finger_offset
+        law.radius = settings.tip.radius
+        law.dither_torque, law.dither_time = control.dither_torque, control.dither_time
+        law.dither_rate = 2.0 * math.pi * control.dither_frequency
         state.joint_stiffness = control.joint_stiffness
+
+    @property
+    def blind(self) -> bool:
+        """Whether a grip is not to look at the object's angle by itself."""
+        return self._state.law.blind
+
+    @property
+    def shaking(self) -> bool:
+        """Whether the fingers are still to bring the object upright."""
+        state = self._state
+        awaited = state.law.upright and self._alone is None and not state.steering
+        return awaited and state.shaken < state.law.dither_time
 
     @property
     def turning_on(self) -> float:
@@ -80,6 +107,7 @@ class Grip:
     def retarget(self, force: float) -> None:
         """Go to another grip force [N]."""
         self.asked = self._state.asked = force
+        self._state.shaken = 0.0
         self.given = self.force.target = max(force, min(self.slip.needed, self.slip.most))
         least = max(0.1 * force, 0.5 * self._control.grip_raise_max)
         way = max(abs(force - self.force.value), least)

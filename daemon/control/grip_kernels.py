@@ -17,6 +17,7 @@ from softfinger.daemon.control.slip_monitor import SlipState
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
+from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
@@ -43,6 +44,15 @@ class GripLaw(Record):
     rest: float  # what is left of a turning a tick later without frames
     by_energy: bool  # the lever is the tables' energy's
     watched: bool  # the margin against slipping is kept
+    blind: bool  # the object's angle is neither looked at nor kept until it is steered
+    upright: bool  # and the fingers' shaking brings it upright
+    half_separation: float  # of the hand, in m as its other lengths
+    length: float
+    offset: float
+    radius: float
+    dither_torque: float  # [N·m]
+    dither_rate: float  # [rad/s]
+    dither_time: float  # in which it fades [s]
 
 
 class GripState(Record):
@@ -60,6 +70,7 @@ class GripState(Record):
     push: float  # that the joints give, both laws' parts together [N]
     lean: float  # speed of the offset that turns the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
+    shaken: float  # since the dither began [s]
     shift: float  # of the offset, to share the force out between the tips [rad]
     closed: float  # goal of (q1 + q2)/2 in pure position control [rad]
     closing_friction: float  # share of the joints' friction that is given for closing
@@ -78,7 +89,7 @@ def start(
     q = grasps[0].q
     slip_monitor.forget(g.slip)
     setpoint.reset(g.force, force_windows, felt)
-    g.integral = g.shift = g.closing_friction = 0.0
+    g.integral = g.shift = g.closing_friction = g.shaken = 0.0
     g.offset = 0.5 * (q[0] - q[1])
     g.closed = 0.5 * (q[0] + q[1])
     g.steering = False
@@ -111,6 +122,9 @@ def squeeze(
         g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
     g.push = wanted + _correction(g, wanted, _felt(grasp))
+    if g.law.blind and not g.steering:
+        torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
+        return torque1, torque2, g.force.target, g.slip.turned
     lean = 0.0
     if g.steering:
         lean = _steer(g, angle_windows, grasp, turned)
@@ -273,6 +287,44 @@ def _torques(
     lever = grasp.lever if law.by_energy else grasp.arm
     g.torque[0] = lever[0] * g.push + calm + turn + _friction(law, close + lean)
     g.torque[1] = lever[1] * g.push + calm - turn + _friction(law, close - lean)
+    return g.torque[0], g.torque[1]
+
+
+@inner_kernel
+def _equal_torques(
+    g: GripState, grasp: GraspState, wanted: float, dq: tuple[float, float]
+) -> tuple[float, float]:
+    """Torques of two fingers that push alike, whatever the object's angle.
+
+    The upright law adds the spring of `hand.upright` between the fingers, and a dither that fades
+    and so leaves the joints' friction without a bias. Then the joints keep to their lean.
+    """
+    law, q = g.law, grasp.q
+    close = _closing(grasp, g.force.speed, 0.0)
+    g.lean = 0.0
+    g.closing_friction = min(max(close / law.friction_speed, -1.0), 1.0)
+    mean = 0.5 * (q[0] + q[1])
+    arm = law.length * math.cos(mean) - law.offset * math.sin(mean)
+    calm = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
+    push = arm * g.push + calm * (close - 0.5 * (dq[0] + dq[1])) + _friction(law, close)
+    lean = 0.5 * (q[0] - q[1])
+    turn = -0.5 * calm * (dq[0] - dq[1])
+    if not law.upright:
+        g.offset = lean
+    elif g.shaken < law.dither_time:
+        lengths = (law.half_separation, law.length, law.offset, law.radius)
+        depth = 0.5 * (grasp.d[0] + grasp.d[1])
+        spring = min(upright_spring(mean, depth, wanted, lengths), g.joint_stiffness)
+        # What then holds the fingers begins with the torque that the spring has come to.
+        g.offset = lean * (1.0 - spring / g.joint_stiffness)
+        fading = 1.0 - g.shaken / law.dither_time
+        turn = fading * law.dither_torque * math.sin(law.dither_rate * g.shaken) - spring * lean
+        if setpoint.arrived(g.force):
+            g.shaken += law.dt
+    else:
+        turn += g.joint_stiffness * (g.offset - lean)
+    g.torque[0] = push + turn
+    g.torque[1] = push - turn
     return g.torque[0], g.torque[1]
 
 

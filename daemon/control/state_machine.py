@@ -349,10 +349,11 @@ class Control:
         else:
             # The mean, since what the object rubs on may take some force between the tips.
             settled = abs(self._felt() - grip.given) < _SETTLED_FORCE * grip.given
+            settled = settled and not grip.shaking
         self._waiting = self._waiting + dt if settled else 0.0
         if self._waiting <= _SETTLED_FOR:
             return
-        if pose.valid and math.isnan(grip.kept_angle):
+        if pose.valid and math.isnan(grip.kept_angle) and not grip.blind:
             grip.steer(pose.angle, pose.angle)
         grip.begin_holding()
         self._enter(Mode.HOLDING)

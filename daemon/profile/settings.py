@@ -36,6 +36,7 @@ Ratio = Annotated[float, Field(ge=0.1, le=10)]
 Finger = Literal["left", "right"]
 Index = Annotated[int, Field(ge=0, le=255)]
 Cells = tuple[tuple[Index, Index], ...]
+GripLaw = Literal["energy", "two_phase", "upright", "blind", "position"]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
@@ -229,7 +230,7 @@ class Control(Section):
     move_speed: Positive = 1.0  # rad/s
     contact_force: Positive = 0.5  # N at which a finger counts as touching
     force_default: Positive = 5.0  # N, grasp without force=
-    law: Literal["energy", "two_phase", "position"] = "energy"  # "position" is for comparison
+    law: GripLaw = "energy"  # "position" and "blind" are for comparison
     force_time: Seconds = 0.1  # s in which the force goes from what is felt to what is wanted
     smooth_time: Seconds = 0.1  # s over which references are averaged: bounds their jerk
     force_gain: NonNegative = 1.0  # N a N of force error
@@ -237,6 +238,9 @@ class Control(Section):
     rotate_speed: Positive = 1.3  # rad/s of the object's angle
     rotate_bandwidth: NonNegative = 4.0  # Hz of the angle integral
     joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
+    dither_torque: NonNegative = 0.3  # N·m, antisymmetric, by which "upright" frees the joints
+    dither_frequency: Annotated[float, Field(gt=0, le=50)] = 5.0  # Hz
+    dither_time: Delay = 2.0  # s in which it fades
     joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
     damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
     joint_friction: NonNegative = 0.05  # N·m of Coulomb friction, given where motion is wanted

@@ -1,0 +1,87 @@
+"""A held object comes upright without a look at it: the closed form, and the law, on the plant."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.kinematics.hand.upright import resting_share, upright_spring
+from softfinger.tools.benchmarks.control_rig import Watched
+from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make
+
+LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
+START = math.radians(5.0)
+DEPTH, FORCE = 0.0032, 10.0  # where the paper's tip has this force
+spring_of = upright_spring.py_func  # type: ignore[attr-defined]
+
+
+def at_rest(spring: float) -> SimulatedHand:
+    """A hand without friction but the tips', closed slowly to 10 N on an object put askew."""
+    hand = make(
+        PAPER, object_angle=START, joint_friction=0.0, table_friction=0.0, joint_damping=0.1
+    )
+    inwards = LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH
+    full = FORCE * math.sqrt(LENGTHS[1] ** 2 - inwards**2)
+    while hand.t < 8.0:
+        torque = full * min(max(hand.t / 5.0, 0.03), 1.0)
+        apart = spring * torque / full * 0.5 * (hand.q[0] - hand.q[1])
+        for joint, sense in ((0, -1.0), (1, 1.0)):
+            hand.drive(joint, CURRENT, True, 0.0, (torque + sense * apart) / CONSTANT)
+        hand.advance(hand.t + 0.005)
+    assert hand.normal.mean() == pytest.approx(FORCE, rel=0.02)
+    return hand
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 4.0])
+def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) -> None:
+    q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
+    spring = share * spring_of(q, DEPTH, FORCE, LENGTHS)
+    hand = at_rest(spring)
+    expected = resting_share(DEPTH, WIDTH, spring, FORCE, LENGTHS)
+    # Left out of the closed form is q², which is 0.03.
+    assert hand.object_pose[2] / START == pytest.approx(expected, abs=0.03)
+    if share == 1.0:
+        assert expected == pytest.approx(0.0, abs=1e-12)
+    if share == 0.0:
+        assert expected == pytest.approx(-0.73, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "simulation",
+    [
+        {},
+        {"tip_friction": 0.2, "object_mass": 0.2, "modulus_scale": 0.7},
+        {"tip_friction": 0.8, "object_mass": 0.05, "modulus_scale": 1.3},
+        {"tip_creep_time": 20.0, "tip_micro_slip": True, "tip_shear_stiffness": 0.8},
+    ],
+    ids=["as assumed", "slippery, heavy, soft", "rough, light, hard", "relaxing"],
+)
+def test_the_upright_law_needs_no_angle(simulation: dict[str, float]) -> None:
+    for sense, angle_known in ((1.0, False), (-1.0, True)):
+        sections = {
+            "control": {"law": "upright"},
+            "scene": {"object_model": angle_known},
+            "simulation": {"object_angle": sense * START, **simulation},
+        }
+        with Watched(sections) as hand:
+            hand.grasp(FORCE)
+            hand.run(4.5)
+            assert hand.mode == "holding"
+            assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
+            assert np.abs(hand.plant.force / FORCE - 1.0).max() < 0.02
+            if angle_known:
+                hand.command("rotate", angle=0.1)
+                hand.run(2.0)
+                turned = float(hand.plant.object_pose[2])
+                assert turned == pytest.approx(0.1, abs=math.radians(0.2))
+
+
+def test_equal_torques_alone_leave_it_askew() -> None:
+    with Watched({"control": {"law": "blind"}, "simulation": {"object_angle": START}}) as hand:
+        hand.grasp(FORCE)
+        hand.run(4.5)
+        assert hand.mode == "holding"
+        assert math.degrees(hand.plant.object_pose[2]) > 3.0
