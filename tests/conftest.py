@@ -6,6 +6,7 @@ other; whatever a test started, in this process or below it, ends with the test.
 
 from __future__ import annotations
 
+import gc
 import itertools
 import os
 import select
@@ -13,7 +14,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hypothesis
 import pytest
@@ -21,6 +22,7 @@ import zmq
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.cli import main
 from tests.harness import descendants
 from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
@@ -36,10 +38,18 @@ _PORTS = itertools.count(9872)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """End as on Ctrl-C when asked to; orphans of what tests started come to this process."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
+    if not hasattr(config, "workerinput"):
+        descendants.end_with_this_process()
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the million objects of all modules, which are there to stay."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_unconfigure() -> None:
@@ -110,6 +120,33 @@ def start() -> Iterator[Callable[..., Running]]:
     yield run
     for each in started:
         each.kill()
+
+
+class Told(NamedTuple):
+    """What a subcommand left: exit status, standard output and error."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Inline = Callable[..., Told]
+
+
+@pytest.fixture
+def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
+    """Runs a subcommand in this process, for tests of its work and not of its process."""
+    monkeypatch.setattr(os, "nice", lambda _: 0)  # the tests' own priority stays
+
+    def run(*words: object) -> Told:
+        capsys.readouterr()
+        try:
+            status = main(list(map(str, words)))
+        except SystemExit as ended:  # argparse's
+            status = int(ended.code or 0)
+        return Told(status, *capsys.readouterr())
+
+    return run
 
 
 def until(condition: Callable[[], object], seconds: float = 60.0) -> None:

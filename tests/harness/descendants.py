@@ -1,4 +1,8 @@
-"""The processes that tests started, whoever started them: to end what a test left running."""
+"""The processes that tests started, whoever started them: to end what a test left running.
+
+As a program, with a word, it waits for the end of its standard input, and then kills every process
+that has this word in its environment.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import ctypes
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,6 +34,23 @@ def adopt_orphans() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
+def end_with_this_process() -> None:
+    """Have what this process starts from now on killed when it dies, be it by SIGKILL."""
+    word = f"TESTS_OF_PROCESS={os.getpid()}"
+    _watching.append(
+        subprocess.Popen(
+            [sys.executable, "-S", __file__, word],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is not for it
+        )
+    )
+    os.environ["TESTS_OF_PROCESS"] = str(os.getpid())
+
+
+_watching: list[subprocess.Popen[bytes]] = []  # whose standard input ends with this process
+
+
 def running(process: int | None = None) -> set[int]:
     """The children of a process, of this one by default, by their numbers."""
     tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
@@ -48,3 +70,20 @@ def end(processes: set[int]) -> None:
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
         end(below)  # by now they are children of this process
+
+
+def _sweep(word: bytes) -> bool:
+    """Kill every process with ``word`` in its environment; whether there was one."""
+    found = False
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it ended meanwhile, or is another user's
+            if word in (folder / "environ").read_bytes().split(b"\0"):
+                os.kill(int(folder.name), signal.SIGKILL)
+                found = True
+    return found
+
+
+if __name__ == "__main__":
+    sys.stdin.read()
+    while _sweep(sys.argv[1].encode()):
+        pass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import subprocess
 import sys
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from softfinger.daemon.wire.packer import message_maker
 from softfinger.tools.analysis.contacts import analyse, write_csv
 from softfinger.tools.analysis.sources import open_source
 from softfinger.tools.recordings.writer import RecordingWriter
+from tests.conftest import Inline
 from tests.harness.daemon_process import softfinger
 
 TIP, PITCH, SCALE = Fingertip(0.020), 0.058 / 44, 4.0
@@ -121,11 +121,13 @@ def test_a_recorded_hand_of_another_material_needs_no_settings(
         ("none.npz", None, "No such file"),
     ],
 )
-def test_files_that_are_none(tmp_path: Path, name: str, content: bytes | None, reason: str) -> None:
+def test_files_that_are_none(
+    inline: Inline, tmp_path: Path, name: str, content: bytes | None, reason: str
+) -> None:
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    done = softfinger("analyse", str(path))
+    done = inline("analyse", path)
     assert done.returncode == 1
     assert done.stderr.startswith(f"analyse: {path}")
     *before, last = done.stderr.splitlines()
@@ -140,18 +142,13 @@ def test_a_frame_of_another_size_is_told(counts: np.ndarray, tmp_path: Path) -> 
         analyse(open_source(path, Settings(), None, own=True), lambda n: None)
 
 
-def test_wrong_settings_and_a_missing_extra(tmp_path: Path, counts: np.ndarray) -> None:
+def test_wrong_settings_and_a_missing_extra(
+    inline: Inline, tmp_path: Path, counts: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, frames=counts[:3])
-    done = softfinger("analyse", str(path), "--set", "tip.radius=0")
-    assert done.returncode == 2
-    code = (
-        "import sys; sys.modules['matplotlib'] = None\n"
-        "from softfinger.tools.cli import main\n"
-        f"sys.exit(main(['analyse', {str(path)!r}]))"
-    )
-    told = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
+    assert inline("analyse", path, "--set", "tip.radius=0").returncode == 2
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    told = inline("analyse", path)
     assert told.returncode == 0  # the numbers are there
     assert "pip install 'softfinger[plot]'" in told.stderr

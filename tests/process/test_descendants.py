@@ -9,6 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.conftest import until
 from tests.harness import descendants
 
 PARENT = """
@@ -34,6 +35,17 @@ def test_all_that_runs_below_a_test_is_ended(parent: str) -> None:
     descendants.end(descendants.running() - before)
     assert not child.is_running()
     assert not descendants.running() - before
+
+
+def test_what_a_killed_process_had_started_is_killed() -> None:
+    code = f"from tests.harness import descendants\ndescendants.end_with_this_process()\n{PARENT}"
+    words = [sys.executable, "-c", code, "waits"]
+    with descendants.ending(subprocess.Popen(words, stdout=subprocess.PIPE, text=True)) as process:
+        assert process.stdout is not None
+        child = psutil.Process(int(process.stdout.readline()))
+        assert child.is_running()
+        process.kill()
+        until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
 
 
 def test_a_test_that_fails_leaves_nothing_running(pytester: pytest.Pytester) -> None:

