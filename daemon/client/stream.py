@@ -63,7 +63,7 @@ class Gaps:
         return True
 
 
-class Decoder(Generic[_Record]):
+class Unpacker(Generic[_Record]):
     """Turns one topic's messages into records."""
 
     def __init__(self, address: str, topic: bytes) -> None:
@@ -113,7 +113,7 @@ class Subscriber(Generic[_Record]):
         self, context: zmq.Context[Any], address: str, topic: bytes, timeout: float | None
     ) -> None:
         self._timeout = timeout
-        self._decoder = Decoder[_Record](address, topic)
+        self._decoder = Unpacker[_Record](address, topic)
         self._socket: Any = subscribe(context, address, topic)
 
     @property
@@ -163,7 +163,7 @@ class Wait:
     def over(self, address: str) -> NotInTime | NoStream:
         """The exception when no further state came."""
         if self._last is None:
-            return Decoder[HandState](address, STATE).no_stream(self._timeout)
+            return Unpacker[HandState](address, STATE).no_stream(self._timeout)
         return NotInTime(
             f"not within {self._timeout:g} s; the last state: mode {self._last.mode}, "
             f"tick {self._last.seq}"

@@ -14,7 +14,15 @@ from typing import Any, ClassVar
 
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.request_queue import Allowance, Pace
-from softfinger.daemon.gateway.zmtp import GREETING, Broken, Parser, frame, pong, ready, socket_type
+from softfinger.daemon.gateway.zmtp import (
+    GREETING,
+    Broken,
+    FrameParser,
+    frame,
+    pong,
+    ready,
+    socket_type,
+)
 
 _VECTOR = 64  # messages in one call
 
@@ -39,7 +47,7 @@ class Connection:
         self.ready = False  # the handshake is over
         self.resting = False
         self.waiting = 0  # bytes that it has not taken yet
-        self._parser = Parser(limit)
+        self._parser = FrameParser(limit)
         self._controls = Allowance(bounds.CONTROLS)
         self._out: deque[memoryview] = deque()
         self.send(GREETING)

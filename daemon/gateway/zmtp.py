@@ -62,7 +62,7 @@ def socket_type(command: bytes) -> bytes:
     raise Broken("no socket type")
 
 
-class Parser:
+class FrameParser:
     """Takes a connection's bytes, gives its frames. Holds no more than one frame and one read."""
 
     def __init__(self, limit: int) -> None:

@@ -18,7 +18,7 @@ from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.loop import EventSink, Loop
-from softfinger.daemon.loop.warm_up import Scene, warm_up
+from softfinger.daemon.loop.warm_up import WantedScene, warm_up
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_material, make_table
@@ -63,7 +63,7 @@ class Daemon:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
         self.publisher = publisher
-        scene = Scene(settings, cache, on_event)
+        scene = WantedScene(settings, cache, on_event)
         self.models = scene.models
         warm_up(scene)
         self.hand = self._make_hand(cache, on_event)

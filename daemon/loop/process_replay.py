@@ -19,7 +19,7 @@ from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.settings import Settings, Task
+from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
 from softfinger.daemon.wire.command_server import Handler
@@ -35,7 +35,7 @@ class ProcessReplay:
         with tempfile.TemporaryDirectory() as folder:
             settings = with_calibrations(settings, calibrations, Path(folder))
             models = make_models(settings, cache)
-        settings = settings.model_copy(update={"task": Task()})  # its commands are recorded
+        settings = settings.model_copy(update={"task": TaskSettings()})  # its commands are recorded
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None

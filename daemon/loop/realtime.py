@@ -53,7 +53,7 @@ def hold_collector() -> None:
     gc.disable()
 
 
-class Outcome(NamedTuple):
+class Measure(NamedTuple):
     """What became of one measure."""
 
     granted: bool
@@ -72,7 +72,7 @@ class RealTime:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[Measure] = []
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -115,11 +115,11 @@ class RealTime:
         self.close()
 
     def _granted(self, text: str, *undo: Callable[[], object]) -> None:
-        self.outcomes.append(Outcome(True, text))
+        self.outcomes.append(Measure(True, text))
         self._undo += undo
 
     def _refused(self, text: str, remedy: str = "") -> None:
-        self.outcomes.append(Outcome(False, text, remedy))
+        self.outcomes.append(Measure(False, text, remedy))
 
     def _keep_interpreter(self, freeze: bool) -> None:
         """Keep the collector and other threads from delaying the loop.

@@ -27,7 +27,7 @@ Counts = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
 
-class Spread(NamedTuple):
+class TimeSpread(NamedTuple):
     """One time's median, tail and largest value since the start [s]."""
 
     p50: float
@@ -100,11 +100,11 @@ class Statistics:
         """How many were counted."""
         return int(self.counts[0].sum())
 
-    def spreads(self) -> dict[str, Spread]:
+    def spreads(self) -> dict[str, TimeSpread]:
         """What was counted, by the names in `TIMES`; all 0 before the first tick."""
         _quantiles(self.counts, self.largest, self._shares, self._out)
         rows = zip(TIMES, self._out.tolist(), self.largest.tolist(), strict=True)
-        return {name: Spread(row[0], row[1], row[2], largest) for name, row, largest in rows}
+        return {name: TimeSpread(row[0], row[1], row[2], largest) for name, row, largest in rows}
 
     def table(self) -> list[str]:
         """The same for people, in µs."""

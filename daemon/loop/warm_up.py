@@ -26,7 +26,7 @@ from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
 
-class Scene:
+class WantedScene:
     """A scene whose kernels are wanted; ``cache`` is where contact tables are kept.
 
     ``on_event`` takes a warning where a kept table can't be used.
@@ -60,7 +60,7 @@ class Part(NamedTuple):
 
     name: str
     kernels: int  # that it compiles, about: for a progress bar
-    run: Callable[[Scene], None]
+    run: Callable[[WantedScene], None]
     after: str = ""  # the part whose result it needs, if that is to be built as well
 
 
@@ -105,20 +105,20 @@ def _mark(folder: Path, part: Part) -> Path:
     return folder / f"{part.name.replace(' ', '-')}.built"
 
 
-def warm_up(scene: Scene) -> None:
+def warm_up(scene: WantedScene) -> None:
     """Run every part of ``scene``. Raises as `profile.factory` for settings that can't be met."""
     for part in parts(scene.settings):
         part.run(scene)
         mark_built(part)
 
 
-def _table(scene: Scene) -> None:
+def _table(scene: WantedScene) -> None:
     radius = scene.settings.tip.radius
     for model in scene.models:
         model.table(0.2 * radius, 0.1)
 
 
-def _estimator(scene: Scene) -> None:
+def _estimator(scene: WantedScene) -> None:
     settings = scene.settings
     rows, cols = settings.tactile.rows, settings.tactile.cols
     y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : cols * 1j]
@@ -133,13 +133,13 @@ def _estimator(scene: Scene) -> None:
         total_tilt(0.1, 0.1)
 
 
-def _hand(scene: Scene) -> None:
+def _hand(scene: WantedScene) -> None:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
     SimulatedHand(scene.settings, 0.0, scene.models[0].table)
 
 
-def _sensor(scene: Scene) -> None:
+def _sensor(scene: WantedScene) -> None:
     from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 
     if not scene.sensing:
@@ -152,7 +152,7 @@ def _sensor(scene: Scene) -> None:
         model.frame(depth, 0.1, 0.0, counts, bend=1.0 / settings.simulation.object_radius)
 
 
-def _control(scene: Scene) -> None:
+def _control(scene: WantedScene) -> None:
     from softfinger.daemon.control.grip import Grip
     from softfinger.daemon.loop.timing import Statistics
     from softfinger.daemon.perception.contact_filter import ContactFilter
@@ -181,7 +181,7 @@ def _control(scene: Scene) -> None:
         grip.angles(pose)
 
 
-def _many(scene: Scene) -> None:
+def _many(scene: WantedScene) -> None:
     scene.models[0].table(np.zeros(2), np.zeros(2))
 
 

@@ -35,11 +35,11 @@ class CalibrationFileError(TactileError):
     """The file can't be used, or belongs to another sensor. The message says why."""
 
 
-class _Part(BaseModel):
+class _StepModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Sensor(_Part):
+class Sensor(_StepModel):
     """Which sensor it is: under which finger, its label or serial number, and its grid."""
 
     finger: Literal["left", "right"]
@@ -50,7 +50,7 @@ class Sensor(_Part):
     full_count: Annotated[int, Field(ge=1, le=65535)]
 
 
-class TareStep(_Part):
+class TareStep(_StepModel):
     """Mean count of each unloaded cell, and their typical standard deviation [counts]."""
 
     date: str
@@ -59,7 +59,7 @@ class TareStep(_Part):
     frames: int
 
 
-class EquilibrateStep(_Part):
+class EquilibrateStep(_StepModel):
     """Gain of each cell, 0 for a dead one; relative spread before and after."""
 
     date: str
@@ -69,7 +69,7 @@ class EquilibrateStep(_Part):
     residual: Finite
 
 
-class CurveStep(_Part):
+class CurveStep(_StepModel):
     """(exponent, c_1, c_2, c_3) as for sensing.counts.to_pressure; relative residual."""
 
     date: str
@@ -78,7 +78,7 @@ class CurveStep(_Part):
     residual: Finite
 
 
-class CentreStep(_Part):
+class CentreStep(_StepModel):
     """Tip's centre on the sensor [m]; rotation [rad], null where it was not measured."""
 
     date: str
@@ -88,7 +88,7 @@ class CentreStep(_Part):
     residual: Finite
 
 
-class ModulusStep(_Part):
+class ModulusStep(_StepModel):
     """Modulus [Pa], or the points of a law: strain and stress [Pa]; relative residual for E."""
 
     date: str
@@ -105,7 +105,7 @@ class ModulusStep(_Part):
         return Material.constant(self.modulus)
 
 
-class Calibration(_Part):
+class Calibration(_StepModel):
     """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``."""
 
     format: Literal[1] = 1

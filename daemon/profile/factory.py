@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.settings import MaterialLaw, Settings
+from softfinger.daemon.profile.settings import MaterialSettings, Settings
 from softfinger.daemon.profile.table_files import load_or_build
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
@@ -25,7 +25,7 @@ def make_tip(settings: Settings) -> Fingertip:
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base)
 
 
-def make_material(law: MaterialLaw) -> Material:
+def make_material(law: MaterialSettings) -> Material:
     """The settings' stress-strain law. Raises SettingsError for points that are no usable law."""
     if law.law == "constant":
         return Material.constant(law.modulus)

@@ -71,14 +71,14 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class Scene(Section):
+class SceneSettings(Section):
     """What takes part. A backend set to ``none`` takes the servos or the sensors out."""
 
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, max_length=2)] = ("left", "right")
     object_model: bool = True  # estimate the object's angle and width from the two contacts
 
 
-class Hand(Section):
+class GeometrySettings(Section):
     """Two rotational fingers in a plane: pivots at (∓pivot_separation/2, 0), q > 0 closes."""
 
     pivot_separation: Length = 0.100
@@ -89,7 +89,7 @@ class Hand(Section):
     open_angle: tuple[Angle, Angle] = (0.0, 0.0)  # where release goes
 
 
-class Tip(Section):
+class TipSettings(Section):
     """The soft hemispherical fingertip: the paper's springs, or solid rubber."""
 
     radius: Annotated[float, Field(ge=1e-4, le=1)] = 0.020
@@ -98,7 +98,7 @@ class Tip(Section):
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
 
 
-class MaterialLaw(Section):
+class MaterialSettings(Section):
     """Stress-strain law of the tip: the paper's Table I, a constant modulus, or measured points."""
 
     law: Literal["table_i", "constant", "points"] = "table_i"
@@ -107,7 +107,7 @@ class MaterialLaw(Section):
     stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
 
 
-class Table(Section):
+class TableSettings(Section):
     """The contact table: largest relative error of force, energy and their partials."""
 
     tolerance: Annotated[float, Field(ge=1e-13, le=1e-2)] = 1e-9
@@ -167,7 +167,7 @@ class EstimatorSettings(Section):
     free_gain: bool = True  # estimate measured/modelled pressure too
 
 
-class Loop(Section):
+class LoopSettings(Section):
     """The tick and its clock.
 
     ``real`` is this machine's time; ``hand`` a simulated hand's own, which waits while the machine
@@ -179,7 +179,7 @@ class Loop(Section):
     clock: Literal["auto", "hand", "real", "virtual"] = "auto"
 
 
-class Realtime(Section):
+class RealtimeSettings(Section):
     """Measures for a steady tick; the daemon reports what the system refuses and runs without it.
 
     All but the priority are harmless: a program at SCHED_FIFO keeps others off its processor.
@@ -195,7 +195,7 @@ class Realtime(Section):
     spin: Annotated[float, Field(ge=0, le=1e-3)] = 5e-5  # s before a tick that are waited awake
 
 
-class Stream(Section):
+class StreamSettings(Section):
     """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
 
     address: str = STREAM_ADDRESS
@@ -214,14 +214,14 @@ class CommandSettings(Section):
     per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is always heard
 
 
-class Access(Section):
+class AccessSettings(Section):
     """Who may subscribe and command. Addresses off this machine need keys."""
 
     keys: str = ""  # folder that `softfinger keys` made: both sockets take only its clients
     ipc_mode: Literal["0600", "0660", "0666"] = "0600"  # rights of an ipc address's file
 
 
-class Control(Section):
+class ControlSettings(Section):
     """Gains and rates of the control law; each default was chosen in simulation."""
 
     torque_constant: Factor = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
@@ -254,7 +254,7 @@ class Control(Section):
 GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
 
 
-class Safety(Section):
+class SafetySettings(Section):
     """Limits. The goal is bounded by them; crossing a hard one latches a fault."""
 
     current_max: Positive = 1.2  # A
@@ -295,7 +295,7 @@ class ObjectSettings(Section):
     width_min: NonNegative = 0.002  # m; tips nearer to each other hold nothing: the hand opens
 
 
-class Simulation(Section):
+class SimulationSettings(Section):
     """The plant behind simulated backends and the emulator; these defaults are our own choice."""
 
     seed: Annotated[int, Field(ge=0)] = 1
@@ -339,7 +339,7 @@ class Simulation(Section):
     compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only
 
 
-class Task(Section):
+class TaskSettings(Section):
     """What the daemon does by itself after start."""
 
     name: Literal["none", "demo"] = "none"
@@ -350,24 +350,24 @@ class Task(Section):
 class Settings(Section):
     """All sections. ``Settings()`` is the built-in simulated hand."""
 
-    scene: Scene = Scene()
-    hand: Hand = Hand()
-    tip: Tip = Tip()
-    material: MaterialLaw = MaterialLaw()
-    table: Table = Table()
+    scene: SceneSettings = SceneSettings()
+    hand: GeometrySettings = GeometrySettings()
+    tip: TipSettings = TipSettings()
+    material: MaterialSettings = MaterialSettings()
+    table: TableSettings = TableSettings()
     servos: ServoSettings = ServoSettings()
     tactile: TactileSettings = TactileSettings()
     estimator: EstimatorSettings = EstimatorSettings()
-    loop: Loop = Loop()
-    realtime: Realtime = Realtime()
-    stream: Stream = Stream()
+    loop: LoopSettings = LoopSettings()
+    realtime: RealtimeSettings = RealtimeSettings()
+    stream: StreamSettings = StreamSettings()
     commands: CommandSettings = CommandSettings()
-    access: Access = Access()
-    control: Control = Control()
-    safety: Safety = Safety()
+    access: AccessSettings = AccessSettings()
+    control: ControlSettings = ControlSettings()
+    safety: SafetySettings = SafetySettings()
     object: ObjectSettings = ObjectSettings()
-    simulation: Simulation = Simulation()
-    task: Task = Task()
+    simulation: SimulationSettings = SimulationSettings()
+    task: TaskSettings = TaskSettings()
 
     @property
     def simulated(self) -> bool:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.profile.settings import Hand, ServoSettings
+from softfinger.daemon.profile.settings import GeometrySettings, ServoSettings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import REBOOT_FIX, check_angle
@@ -40,7 +40,7 @@ class Torque:
         line: ServoLine,
         model: ServoModel,
         servos: ServoSettings,
-        hand: Hand,
+        hand: GeometrySettings,
         joints: Sequence[Joint],
     ) -> None:
         self.goals: GroupWrite | None = None

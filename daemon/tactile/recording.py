@@ -31,7 +31,7 @@ _FULL = 65535
 
 
 @dataclass(frozen=True)
-class Recording:
+class FrameRecording:
     """Counts uint16 [n, rows, cols] at times t float64 [n], rising from 0 [s].
 
     ``live`` [rows, cols] is False where the sensor has no cell; ``truths`` is the true contact.
@@ -44,7 +44,7 @@ class Recording:
     pitch: tuple[float, float] | None = None  # x and y [m], where the file has it
 
 
-def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recording:
+def load_recording(path: Path, pascal_per_count: float, rate: float) -> FrameRecording:
     """Read a recording; without times its frames come at ``rate`` [Hz]. Raises RecordingError."""
     try:
         if path.is_dir():
@@ -61,7 +61,7 @@ def load_recording(path: Path, pascal_per_count: float, rate: float) -> Recordin
         raise RecordingError(f"{path}: {reason}") from None
 
 
-def _folder(path: Path, scale: float, rate: float) -> Recording:
+def _folder(path: Path, scale: float, rate: float) -> FrameRecording:
     def order(file: Path) -> list[tuple[int, str]]:
         parts = re.findall(r"\d+|\D+", file.stem)
         return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
@@ -88,14 +88,14 @@ def _frames(path: Path) -> NDArray[Any]:
     return array.reshape(-1, *array.shape[-2:])
 
 
-def _export(path: Path, scale: float, rate: float) -> Recording:
+def _export(path: Path, scale: float, rate: float) -> FrameRecording:
     export = tekscan.parse(path.read_text(encoding="latin-1"), 1.0 / rate)
     held: dict[str, NDArray[Any]] = {"frames": export.values, "t": export.t, "live": export.live}
     recording = _checked(held, 1.0 if export.raw else scale, rate)
     return recording if math.isnan(sum(export.pitch)) else replace(recording, pitch=export.pitch)
 
 
-def _checked(held: dict[str, NDArray[Any]], scale: float, rate: float) -> Recording:
+def _checked(held: dict[str, NDArray[Any]], scale: float, rate: float) -> FrameRecording:
     if "frames" not in held:
         raise ValueError("no array 'frames' in it")
     frames = held["frames"]
@@ -118,7 +118,7 @@ def _checked(held: dict[str, NDArray[Any]], scale: float, rate: float) -> Record
         if live.shape != frames.shape[1:]:
             raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
     truths = {name: _row(held, name, count) for name in TRUTHS if name in held}
-    return Recording(np.ascontiguousarray(frames, np.uint16), t - t[0], live, truths)
+    return FrameRecording(np.ascontiguousarray(frames, np.uint16), t - t[0], live, truths)
 
 
 def _row(held: dict[str, NDArray[Any]], name: str, count: int) -> FloatArray:

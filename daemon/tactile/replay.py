@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile.recording import Recording, load_recording
+from softfinger.daemon.tactile.recording import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
 
@@ -65,7 +65,7 @@ class ReplayTactile:
                 f"expected: set tactile.rows and tactile.cols"
             )
         self.live: NDArray[np.bool_] = recording.live
-        self._recording: Recording = recording
+        self._recording: FrameRecording = recording
         self._again = settings.replay_again
         self._clock = clock
         self._latency = settings.latency

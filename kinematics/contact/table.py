@@ -35,7 +35,7 @@ from softfinger.kinematics.contact.table_build import build
 FloatArray = NDArray[np.float64]
 
 
-class Contact(NamedTuple):
+class ContactForces(NamedTuple):
     """What a table returns; arrays of the broadcast shape of d and θ, NumPy numbers for floats."""
 
     force: FloatArray  # F [N]
@@ -61,7 +61,7 @@ class Certificate(NamedTuple):
 
 
 # For numbers, which the fields' types do not name; a call's overhead counts there.
-_contact: Any = Contact
+_contact: Any = ContactForces
 
 _MAGIC = b"SFTIPTAB"
 _CHECK = 32  # bytes of a SHA-256
@@ -159,7 +159,7 @@ class ContactTable:
         """The tip that it was built for."""
         return Fingertip(self.header.radius)
 
-    def __call__(self, d: ArrayLike, theta: ArrayLike) -> Contact:
+    def __call__(self, d: ArrayLike, theta: ArrayLike) -> ContactForces:
         """Look up at displacement d [m] and tilt θ [rad]; they broadcast.
 
         Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged. Raises
@@ -168,13 +168,15 @@ class ContactTable:
         if type(d) is float and type(theta) is float:
             *six, inside = lookup(self.data, d, theta)
             numbers = map(np.float64, six)
-            return cast(Contact, _contact(*numbers, np.bool_(inside), self.max_error))
+            return cast(ContactForces, _contact(*numbers, np.bool_(inside), self.max_error))
         shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)
         (solid_lookups if self.is_solid else lookups)(self.data, depth, tilt, out, within)
         f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
-        return Contact(f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error)
+        return ContactForces(
+            f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error
+        )
 
 
 def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:

@@ -64,7 +64,7 @@ class _Worst(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Law:
+class LawTerms:
     """A material as the quadrature's kernels take it."""
 
     material: Material
@@ -74,7 +74,7 @@ class Law:
     modulus: float
 
     @classmethod
-    def of(cls, material: Material) -> Law:
+    def of(cls, material: Material) -> LawTerms:
         """Rules and expansions for ``material``."""
         return cls(
             material,
@@ -92,7 +92,7 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
     names = [known.name for known in FORMS]
     if form is not None and form not in names:
         raise TableError(f"no form is called {form!r}; there are {', '.join(names)}")
-    law = Law.of(material)
+    law = LawTerms.of(material)
     numbers = CHEAPEST_FIRST if form is None else (names.index(form),)
     possible = [number for number in numbers if number != CLOSED or material.is_linear]
     for number in possible:
@@ -108,7 +108,7 @@ def build(tip: Fingertip, material: Material, tolerance: float, form: str | None
 
 
 def _made(
-    tip: Fingertip, law: Law, number: int, tolerance: float, limit: float
+    tip: Fingertip, law: LawTerms, number: int, tolerance: float, limit: float
 ) -> FloatArray | None:
     """The array of one form; None where it is too large, or its error's bound above ``limit``."""
     data = _header(tip, law, number, tolerance)
@@ -128,7 +128,7 @@ def _made(
     return data
 
 
-def _header(tip: Fingertip, law: Law, number: int, tolerance: float) -> FloatArray:
+def _header(tip: Fingertip, law: LawTerms, number: int, tolerance: float) -> FloatArray:
     """The array with its header filled in, coefficients zero."""
     pieces = _h_pieces(FORMS[number]) * FORMS[number].y_pieces
     corner = START + pieces * SIZES[number]
@@ -152,7 +152,7 @@ def _h_piece(form: Form, i: int) -> tuple[float, float]:
     return base + part * width, base + (part + 1) * width
 
 
-def _filled(data: FloatArray, law: Law, number: int) -> Iterator[_Worst]:
+def _filled(data: FloatArray, law: LawTerms, number: int) -> Iterator[_Worst]:
     """Fill in a form's coefficients piece by piece; yields the bound of each piece's error."""
     form, columns = FORMS[number], SHAPES[number]
     # More than needed in each direction, for what is left out.
@@ -267,7 +267,7 @@ def _tilt(at: _Worst) -> float:
     return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / rest), 1.0))
 
 
-def _ratios_at(law: Law, h: FloatArray, y: FloatArray) -> FloatArray:
+def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
     """Ratios [5, …] at the table's broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
@@ -280,7 +280,7 @@ def _ratios_at(law: Law, h: FloatArray, y: FloatArray) -> FloatArray:
     return out.reshape(LANES, *h.shape)
 
 
-def _corner(law: Law, piece: int) -> FloatArray:
+def _corner(law: LawTerms, piece: int) -> FloatArray:
     """Chebyshev coefficients [2, 5, h, y] of A and B, of one piece over y of the corner.
 
     A and B of R = A + B log h are found by least squares in h at each node of y. Only their sum is
@@ -303,7 +303,7 @@ def _corner(law: Law, piece: int) -> FloatArray:
     return np.asarray(np.einsum("bj,pikj->pkib", in_y, terms, optimize=True))
 
 
-def _corner_bounds(law: Law, piece: int, fitted: FloatArray) -> Iterator[_Worst]:
+def _corner_bounds(law: LawTerms, piece: int, fitted: FloatArray) -> Iterator[_Worst]:
     """Bounds of the corner's error, in pieces of log h down to the least h, and at d = a itself.
 
     In log h what is left of the ratios is smooth: powers of h are exponentials, and towards h = 0

@@ -11,7 +11,7 @@ from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kerne
 from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
 from softfinger.kinematics.compiled.simd_sums import LANES, weighted
 from softfinger.kinematics.estimation.packing import PLACE_BITS
-from softfinger.kinematics.estimation.state import READING, WEIGHT, State
+from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
 from softfinger.kinematics.sensing.footprint import FloatArray
 
@@ -52,7 +52,7 @@ def _read(row: Pointer, live: Pointer, scale: float, n: int, size: int, out: Poi
 
 
 @fast_inner_kernel
-def _locate(state: State, places: IntPointer) -> tuple[int, int, int, int]:
+def _locate(state: EstimatorState, places: IntPointer) -> tuple[int, int, int, int]:
     """Turn ``places`` into those in the scratch of :func:`spread`; the box they lie in.
 
     There, columns of one remainder by the parts of a cell stand together.
@@ -76,7 +76,7 @@ def _locate(state: State, places: IntPointer) -> tuple[int, int, int, int]:
 
 
 @inner_kernel
-def spread(state: State, frame: Pointer, arena: Pointer, places: IntPointer) -> None:
+def spread(state: EstimatorState, frame: Pointer, arena: Pointer, places: IntPointer) -> None:
     """Blur the first four planes of packed parts of cells, and average them over cells.
 
     ``places`` are the parts' rows and columns, see PLACE_BITS. The packed cells are then all cells

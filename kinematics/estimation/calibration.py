@@ -99,7 +99,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 
 @dataclass(frozen=True)
-class Curve:
+class SensorCurve:
     """``coefficients`` (exponent, c_1, c_2, c_3) as for `sensing.counts.to_pressure`.
 
     ``errors`` [n]: relative error of each known force; ``residual`` their rms.
@@ -111,7 +111,9 @@ class Curve:
     residual: float
 
 
-def fit_curve(kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float) -> Curve:
+def fit_curve(
+    kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float
+) -> SensorCurve:
     """The curve whose pressure over all cells makes the known forces.
 
     ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
@@ -133,7 +135,7 @@ def fit_curve(kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, fu
         coefficients, errors = _power(x, known, area, full)
     else:
         coefficients, errors = _cubic(x, known, area, full)
-    return Curve(kind, coefficients, errors, _rms(errors))
+    return SensorCurve(kind, coefficients, errors, _rms(errors))
 
 
 def _cubic(
@@ -292,7 +294,7 @@ def fit_modulus(
 
 
 @dataclass(frozen=True)
-class Law:
+class MeasuredLaw:
     """Measured points of σ(ε): strain [m], stress [m] Pa; ``residual``: rms of the cells [Pa]."""
 
     strain: FloatArray
@@ -308,7 +310,7 @@ def fit_law(
     tip: Fingertip,
     grid: SensorGrid,
     used: NDArray[np.bool_] | None = None,
-) -> Law:
+) -> MeasuredLaw:
     """σ(ε) from a compression run: each cell under the tip is a measured point of it.
 
     ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
@@ -345,7 +347,7 @@ def fit_law(
     except (ValueError, IndexError) as error:
         raise CalibrationError(f"modulus: the run makes no stress-strain law: {error}") from None
     residual = _rms(material.stress(strain) - stress)
-    return Law(means[:, 0], means[:, 1], material, residual)
+    return MeasuredLaw(means[:, 0], means[:, 1], material, residual)
 
 
 def _rising(bands: list[tuple[FloatArray, FloatArray]]) -> FloatArray:

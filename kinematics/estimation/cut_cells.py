@@ -24,7 +24,7 @@ from softfinger.kinematics.estimation.state import (
     SHARE,
     VARIANCE,
     WEIGHT,
-    State,
+    EstimatorState,
     Strips,
 )
 from softfinger.kinematics.sensing.footprint import GAUSS_NODES, GAUSS_WEIGHTS, Face, Grid
@@ -124,7 +124,7 @@ def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> Non
 
 
 @inner_kernel
-def flush(state: State, level: int, packed: Pointer) -> None:
+def flush(state: EstimatorState, level: int, packed: Pointer) -> None:
     """Sum the strips of one level's cut cells into the cells' places in ``packed``; empties it."""
     strips = state.strips[level]
     grid = state.model

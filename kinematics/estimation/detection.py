@@ -10,7 +10,7 @@ import math
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.cell_centres import next_above, totals
-from softfinger.kinematics.estimation.state import State
+from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.footprint import (
     Grid,
     band_columns,
@@ -45,7 +45,7 @@ def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float
 
 
 @inner_kernel
-def activity(state: State, frame: Pointer, height: Pointer) -> None:
+def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
     """Cheap test of the frame, into ``state.signal``.
 
     A contact is a cell of ``peak_level`` · noise or more whose neighbours' weighted sum, itself
@@ -82,7 +82,7 @@ def activity(state: State, frame: Pointer, height: Pointer) -> None:
 
 
 @inner_kernel
-def presses_outside(state: State, frame: Pointer, height: Pointer, level: float) -> bool:
+def presses_outside(state: EstimatorState, frame: Pointer, height: Pointer, level: float) -> bool:
     """Whether a cell of ``level`` or more, and not it alone, lies two cells off the footprint.
 
     Three standard deviations of the blur are added to the two cells. ``level`` is in the frame's

@@ -22,7 +22,7 @@ from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
-from softfinger.kinematics.estimation.state import PLANES, State
+from softfinger.kinematics.estimation.state import PLANES, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import LIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -151,7 +151,7 @@ class ContactEstimator:
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
-        state = self._state = State()
+        state = self._state = EstimatorState()
         options = self._options = state.options
         options.noise = noise
         options.saturation = math.inf
@@ -228,7 +228,7 @@ class ContactEstimator:
         self._seq = None
 
     @property
-    def state(self) -> State:
+    def state(self) -> EstimatorState:
         """The memory of :func:`estimation.frame_pipeline.estimate_frame`, for compiled callers."""
         return self._state
 
@@ -288,7 +288,7 @@ def _integrals(grid: SensorGrid, tip: Fingertip) -> FloatArray:
 
 
 def _lay_out(
-    state: State, grid: SensorGrid, tip: Fingertip, live: NDArray[np.bool_]
+    state: EstimatorState, grid: SensorGrid, tip: Fingertip, live: NDArray[np.bool_]
 ) -> tuple[FloatArray, IntArray | None]:
     """The arena of a grid, and scratch for the places of a blurred one's parts; see `state`."""
     geometry = grid.on(tip)

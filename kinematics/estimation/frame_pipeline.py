@@ -15,7 +15,7 @@ from softfinger.kinematics.estimation.detection import presses_outside
 from softfinger.kinematics.estimation.gauss_newton import fit
 from softfinger.kinematics.estimation.moments import refine, start_from_frame
 from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
-from softfinger.kinematics.estimation.state import OUTLIERS_MAX, State
+from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 
 # Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
@@ -25,7 +25,7 @@ D_MAX = 0.75  # of the radius
 
 
 @inner_kernel
-def _take_moments(state: State) -> None:
+def _take_moments(state: EstimatorState) -> None:
     """The moments' contact becomes the estimate."""
     estimate = state.estimate
     estimate.d = state.moments.d
@@ -35,7 +35,7 @@ def _take_moments(state: State) -> None:
 
 
 @inner_kernel
-def _start(state: State, frame: Pointer, centres: Pointer) -> None:
+def _start(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
     """The estimate from the frame's moments alone."""
     start_from_frame(state, frame, centres)
     _take_moments(state)
@@ -43,7 +43,7 @@ def _start(state: State, frame: Pointer, centres: Pointer) -> None:
 
 
 @inner_kernel
-def _track_moments(state: State, frame: Pointer, centres: Pointer) -> bool:
+def _track_moments(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
     """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
     estimate = state.estimate
     m = state.moments
@@ -66,7 +66,7 @@ def _track_moments(state: State, frame: Pointer, centres: Pointer) -> bool:
 
 @inner_kernel
 def _likelihood(
-    state: State, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
+    state: EstimatorState, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
 ) -> bool:
     """Maximum likelihood from the last estimate, or from the frame's moments if that fails."""
     estimate = state.estimate
@@ -102,7 +102,7 @@ def _likelihood(
 
 
 @inner_kernel
-def _to_tilts(state: State) -> None:
+def _to_tilts(state: EstimatorState) -> None:
     """Turn the estimate from normals in the sensor's axes to tilts in the finger's."""
     estimate = state.estimate
     covariance = state.fit.covariance
@@ -132,7 +132,7 @@ def _to_tilts(state: State) -> None:
 
 @inner_kernel
 def _estimate(
-    state: State, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
+    state: EstimatorState, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
 ) -> bool:
     """The estimate of a frame with a contact; whether it can be used."""
     estimate = state.estimate
@@ -151,7 +151,7 @@ def _estimate(
 
 
 @inner_kernel
-def _begin(state: State, scale: float, step: float) -> None:
+def _begin(state: EstimatorState, scale: float, step: float) -> None:
     """Take the frame's unit and clear what the last one left but the contact."""
     options = state.options
     signal = state.signal
@@ -179,7 +179,7 @@ def _begin(state: State, scale: float, step: float) -> None:
 
 @kernel
 def estimate_frame(
-    states: Records[State],
+    states: Records[EstimatorState],
     frame: FloatArray,
     scale: float,
     step: float,

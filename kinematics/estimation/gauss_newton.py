@@ -14,7 +14,7 @@ from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.blurred_cells import spread
 from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, press
 from softfinger.kinematics.estimation.packing import pack
-from softfinger.kinematics.estimation.state import Fit, State
+from softfinger.kinematics.estimation.state import EstimatorState, Fit
 from softfinger.kinematics.sensing.footprint import IntArray, set_face
 
 # Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
@@ -143,7 +143,7 @@ def free_noise(square: float, floor: float) -> float:
 
 
 @inner_kernel
-def _clip_noise(state: State, packed: Pointer, energy: float) -> float:
+def _clip_noise(state: EstimatorState, packed: Pointer, energy: float) -> float:
     """Noise [Pa] of the cells that end at the floor, by those that nothing presses.
 
     These show how much of the noise there is; where a board sends none at all there is nothing to
@@ -181,7 +181,7 @@ def _take_step(fit: Fit, a: float) -> bool:
 
 
 @inner_kernel
-def _finish(state: State, iterations: int) -> bool:
+def _finish(state: EstimatorState, iterations: int) -> bool:
     """The estimate and its covariance at the fit's end; whether there are cells enough."""
     fit = state.fit
     estimate = state.estimate
@@ -217,7 +217,7 @@ def _finish(state: State, iterations: int) -> bool:
 
 @inner_kernel
 def fit(
-    state: State,
+    state: EstimatorState,
     frame: Pointer,
     arena: Pointer,
     places: IntArray | None,

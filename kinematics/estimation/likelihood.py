@@ -25,8 +25,8 @@ from softfinger.kinematics.estimation.state import (
     SHARE,
     VARIANCE,
     WEIGHT,
+    EstimatorState,
     Law,
-    State,
 )
 from softfinger.kinematics.sensing.footprint import FloatArray
 
@@ -72,7 +72,7 @@ def set_law(law: Law, coefficients: FloatArray) -> None:
 
 
 @fast_inner_kernel
-def footprint_energy(state: State, packed: Pointer) -> tuple[float, float]:
+def footprint_energy(state: EstimatorState, packed: Pointer) -> tuple[float, float]:
     """Σ W p² [Pa²] and Σ W over the packed cells."""
     size = state.model.rows * state.model.cols
     energy = 0.0
@@ -129,7 +129,7 @@ def _compared(
 
 
 @fast_inner_kernel
-def press(state: State, packed: Pointer) -> None:
+def press(state: EstimatorState, packed: Pointer) -> None:
     """Put the material into the packed cells, in place.
 
     STRESS takes the mean stress over each cell, BY_U, BY_V and BY_W its derivatives by −u, v and w:
@@ -175,7 +175,7 @@ def press(state: State, packed: Pointer) -> None:
 
 
 @fast_inner_kernel
-def accumulate(state: State, packed: Pointer) -> None:
+def accumulate(state: EstimatorState, packed: Pointer) -> None:
     """Sums for one Gauss-Newton step over the pressed cells, into ``state.fit.sums``.
 
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a

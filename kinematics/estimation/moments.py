@@ -28,7 +28,7 @@ from softfinger.kinematics.estimation.cell_centres import (
     sums_inside,
 )
 from softfinger.kinematics.estimation.detection import neighbourhood
-from softfinger.kinematics.estimation.state import RATIO_POINTS, Moments, State
+from softfinger.kinematics.estimation.state import RATIO_POINTS, EstimatorState, Moments
 from softfinger.kinematics.sensing.footprint import (
     FloatArray,
     Grid,
@@ -104,7 +104,7 @@ def _ratio(m: Moments, a: float, d: float, column: int) -> float:
 
 
 @inner_kernel
-def footprint_moments(state: State, frame: Pointer, centres: Pointer, own: float) -> None:
+def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, own: float) -> None:
     """Σp, centroid, trace of the covariance and number of the cells that ``moments.face`` presses.
 
     Those whose centre lies in the footprint; all 0 but the number where nothing presses. ``own``
@@ -148,7 +148,7 @@ def _d_from_extent(m: Moments, a: float, reach: float) -> float:
 
 
 @inner_kernel
-def start_from_frame(state: State, frame: Pointer, centres: Pointer) -> None:
+def start_from_frame(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
     """First estimate from the frame alone: its strongest cells, then twice their moments."""
     m = state.moments
     signal = state.signal
@@ -171,7 +171,7 @@ def start_from_frame(state: State, frame: Pointer, centres: Pointer) -> None:
 
 
 @inner_kernel
-def _sums_of_weak(state: State, frame: Pointer, centres: Pointer) -> None:
+def _sums_of_weak(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
     """As :func:`sums_above` for pressures of a few times the noise, where lone cells mislead.
 
     Over cells of twice the noise whose neighbourhood stands out as a contact's.
@@ -220,7 +220,7 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 
 @inner_kernel
-def refine(state: State, frame: Pointer, centres: Pointer) -> None:
+def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
     """Contact in ``state.moments`` anew, from the moments over its footprint, a cell wider.
 
     Where the gain is fixed the displacement comes from the force, otherwise from the extent, and
@@ -248,7 +248,7 @@ def refine(state: State, frame: Pointer, centres: Pointer) -> None:
 
 
 @inner_kernel
-def _set_contact(state: State) -> None:
+def _set_contact(state: EstimatorState) -> None:
     """What :func:`refine` finds, from the moments."""
     m = state.moments
     grid = state.grid

@@ -5,14 +5,14 @@ from __future__ import annotations
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.detection import activity
-from softfinger.kinematics.estimation.state import OUTLIERS_MAX, State
+from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
 
 _DEAD = 1e3  # m below: no face is ever there
 
 
 @inner_kernel
-def _is_outlier(state: State, frame: Pointer, height: Pointer) -> bool:
+def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
     """Whether the largest cell stands alone as no contact can.
 
     A contact about as wide as a cell could press ``signal.confined`` at most: a wider one never has
@@ -38,7 +38,7 @@ def _is_outlier(state: State, frame: Pointer, height: Pointer) -> bool:
 
 
 @inner_kernel
-def without_outliers(state: State, frame: Pointer, cells: Pointer, height: Pointer) -> int:
+def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, height: Pointer) -> int:
     """The number of outliers; ``state.signal`` is what :func:`activity` finds without them.
 
     They are marked dead until :func:`restore_outliers`.
@@ -64,7 +64,7 @@ def without_outliers(state: State, frame: Pointer, cells: Pointer, height: Point
 
 
 @inner_kernel
-def restore_outliers(state: State, rejected: int, cells: Pointer, height: Pointer) -> None:
+def restore_outliers(state: EstimatorState, rejected: int, cells: Pointer, height: Pointer) -> None:
     """Make the outliers live again."""
     cols = state.grid.cols
     for k in range(rejected):

@@ -29,7 +29,7 @@ from softfinger.kinematics.estimation.state import (
     STRIPS,
     VARIANCE,
     WEIGHT,
-    State,
+    EstimatorState,
 )
 from softfinger.kinematics.sensing.cell_integrals import (
     CELL_PLANES,
@@ -57,7 +57,7 @@ PLACE_BITS = 16  # of the column in a place; the row is above
 
 @inner_kernel
 def pack(
-    state: State, cells: Pointer, frame: Pointer, arena: Pointer, places: IntPointer | None
+    state: EstimatorState, cells: Pointer, frame: Pointer, arena: Pointer, places: IntPointer | None
 ) -> None:
     """Gather the footprint's cells of the model's grid, their number into ``state.fit.count``.
 
@@ -141,7 +141,7 @@ def pack(
 
 
 @inner_kernel
-def _is_low(state: State) -> bool:
+def _is_low(state: EstimatorState) -> bool:
     """Whether the outline's lowest point over the base plane comes near to the rim."""
     face = state.fit.face
     a = state.model.radius
@@ -151,7 +151,7 @@ def _is_low(state: State) -> bool:
 
 
 @fast_inner_kernel
-def _copy_whole(state: State, cells: Pointer, row: Pointer, n: int, out: Pointer) -> None:
+def _copy_whole(state: EstimatorState, cells: Pointer, row: Pointer, n: int, out: Pointer) -> None:
     """``n`` whole cells, planes from ``cells`` and readings from ``row`` on, into ``out``."""
     cols = state.model.cols
     size = state.model.rows * cols

@@ -197,7 +197,7 @@ class Places(Record):
     half: int  # [width]
 
 
-class State(Record):
+class EstimatorState(Record):
     """All of it."""
 
     options: Options

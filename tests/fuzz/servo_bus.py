@@ -15,7 +15,7 @@ from typing import NamedTuple
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.simulation.servo_model import framing
-from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Parser, frame
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME, EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import make_bus
@@ -85,7 +85,7 @@ def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """To a ping, with the others unplugged: by now they may all have one ID."""
     for each in bus.servos:
         each.silent = each is not servo
-    found = Parser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
+    found = PacketParser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
     return [packet.id for packet in found] == [servo.id]
 
 

@@ -9,28 +9,28 @@ from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import address
 from softfinger.kinematics.estimation import blurred_cells, detection, likelihood
-from softfinger.kinematics.estimation.state import PLANES, State
+from softfinger.kinematics.estimation.state import PLANES, EstimatorState
 
 FloatArray = NDArray[np.float64]
 
 
-def state_for(packed: FloatArray) -> State:
+def state_for(packed: FloatArray) -> EstimatorState:
     """A state whose model has as many cells as ``packed`` [PLANES, n], all of them packed."""
     assert len(packed) == PLANES
-    state = State()
+    state = EstimatorState()
     state.model.rows, state.model.cols = 1, packed.shape[1]
     state.fit.count = packed.shape[1]
     return state
 
 
 @kernel
-def activity(states: Records[State], frame: FloatArray, centres: FloatArray) -> None:
+def activity(states: Records[EstimatorState], frame: FloatArray, centres: FloatArray) -> None:
     """:func:`detection.activity`."""
     detection.activity(states[0], address(frame), address(centres))
 
 
 @kernel
-def press_and_accumulate(states: Records[State], packed: FloatArray) -> None:
+def press_and_accumulate(states: Records[EstimatorState], packed: FloatArray) -> None:
     """:func:`likelihood.press`, then :func:`likelihood.accumulate`."""
     likelihood.press(states[0], address(packed))
     likelihood.accumulate(states[0], address(packed))
@@ -38,7 +38,7 @@ def press_and_accumulate(states: Records[State], packed: FloatArray) -> None:
 
 @kernel
 def spread(
-    states: Records[State], frame: FloatArray, arena: FloatArray, places: NDArray[np.int64]
+    states: Records[EstimatorState], frame: FloatArray, arena: FloatArray, places: NDArray[np.int64]
 ) -> None:
     """:func:`blurred_cells.spread`."""
     blurred_cells.spread(states[0], address(frame), address(arena), address(places))

@@ -24,7 +24,7 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.servo_model import framing, servo
-from softfinger.daemon.simulation.servo_model.framing import Parser, frame
+from softfinger.daemon.simulation.servo_model.framing import PacketParser, frame
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.free_joints import FreeJoints
@@ -106,7 +106,7 @@ class BusClient:
         self, instruction: int, parameters: bytes = b"", packet_id: int = 1
     ) -> tuple[int, bytes]:
         """(error byte, data) of the one reply."""
-        (packet,) = Parser().feed(self.send(packet_id, instruction, parameters), 0.0)
+        (packet,) = PacketParser().feed(self.send(packet_id, instruction, parameters), 0.0)
         assert packet.valid
         assert packet.instruction == framing.STATUS
         return packet.parameters[0], packet.parameters[1:]

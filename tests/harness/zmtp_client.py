@@ -9,7 +9,7 @@ from typing import Any
 
 import msgpack
 
-from softfinger.daemon.gateway.zmtp import GREETING, Parser, frame
+from softfinger.daemon.gateway.zmtp import GREETING, FrameParser, frame
 
 
 def ready(kind: bytes) -> bytes:
@@ -31,7 +31,7 @@ class RawClient:
             self.socket = socket.create_connection((host, int(port)))
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.socket.setblocking(False)
-        self._parser = Parser(1 << 20)
+        self._parser = FrameParser(1 << 20)
         self.send(GREETING + ready(kind) if first is None else first)
 
     def send(self, data: bytes) -> None:

@@ -13,9 +13,9 @@ import pytest
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.safety.limits import LIMITS
 from softfinger.tools.benchmarks.campaigns import faults, faults_trials
-from softfinger.tools.benchmarks.campaigns.faults_cases import CASES, Case
+from softfinger.tools.benchmarks.campaigns.faults_cases import CASES, FaultCase
 from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, judge_wire
-from softfinger.tools.benchmarks.framework.campaign import Outcome
+from softfinger.tools.benchmarks.framework.campaign import Tally
 from softfinger.tools.benchmarks.framework.rigs import HIL
 
 BY_NAME = {case.name: case for case in CASES}
@@ -118,7 +118,7 @@ def test_a_case_is_summed_up_by_counts_and_times() -> None:
     trials = [
         Trial(k, fault="tactile.silent", fault_s=0.1, safe_s=0.1 + 0.01 * k) for k in range(3)
     ]
-    outcome = Outcome([*trials, Trial(3, missed="no fault")], passed=3, disturbed=2)
+    outcome = Tally([*trials, Trial(3, missed="no fault")], passed=3, disturbed=2)
     row = faults.summary("board silent", "fault", 0.14, outcome)
     assert (row["passed"], row["trials"], row["disturbed"]) == (3, 4, 2)
     assert (row["fault ms"], row["motors off ms at most"]) == (
@@ -133,6 +133,6 @@ def test_every_fault_that_latches_has_a_time_and_names_that_exist() -> None:
     rows = {row.name for row in LIMITS}
     assert len({case.name for case in CASES}) == len(CASES)
     for case in CASES:
-        assert isinstance(case, Case)
+        assert isinstance(case, FaultCase)
         assert set(case.names) <= rows
         assert (case.expect in ("fault", "dies")) <= (case.within > 0.0)

@@ -22,7 +22,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
-from softfinger.daemon.simulation.emulator.emulator import ServoLine
+from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
 from tests.harness.descendants import ending
@@ -37,7 +37,7 @@ class Hand:
         self.folder = folder
         self.settings = load(HIL, folder)
         self._stack = contextlib.ExitStack()
-        line = ServoLine(**options)
+        line = EmulatedServos(**options)
         running = emulated(folder, settings=self.settings, line=line)
         self.emulator = self._stack.enter_context(running)
 

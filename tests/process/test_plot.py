@@ -16,7 +16,7 @@ from matplotlib.text import Text
 
 from softfinger.daemon.wire import schema
 from softfinger.tools.analysis import plot, plots, plots_model
-from softfinger.tools.analysis.plots_data import MODES, Missing, Run, load_run
+from softfinger.tools.analysis.plots_data import MODES, Missing, RecordedRun, load_run
 from softfinger.tools.cli import main
 from softfinger.tools.paper import style
 from softfinger.tools.recordings.reader import Recording
@@ -42,11 +42,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(path: Path) -> Run:
+def run(path: Path) -> RecordedRun:
     return load_run(Recording(path), -math.inf, math.inf, None)
 
 
-def drawn(run: Run, page: str) -> Figure:
+def drawn(run: RecordedRun, page: str) -> Figure:
     with style.settings():
         figure = plots.PAGES[page](run)
         figure.draw_without_rendering()
@@ -106,7 +106,7 @@ def test_help_names_the_pages_there_are() -> None:
     assert tuple(plot.PAGES) == tuple(plots.PAGES)
 
 
-def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: Run, path: Path) -> None:
+def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: RecordedRun, path: Path) -> None:
     seq, mode = run.states["seq"], run.modes
     force, angle = run.requested_force(), run.requested_angle()
     gripping = run.gripping
@@ -122,7 +122,7 @@ def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: Run, path: Pat
     assert set(np.unique(part.requested_angle())) == {0.1}
 
 
-def test_time_page_shows_force_at_its_target(run: Run) -> None:
+def test_time_page_shows_force_at_its_target(run: RecordedRun) -> None:
     figure = drawn(run, "time")
     said = texts(figure)
     for part in ("force F [N]", "energy U [mJ]", "displacement d [mm]", "rotating", "goal"):
@@ -135,7 +135,7 @@ def test_time_page_shows_force_at_its_target(run: Run) -> None:
     assert np.isnan(force[0])  # nothing is drawn where nothing touches
 
 
-def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: Run) -> None:
+def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: RecordedRun) -> None:
     states = dict(run.states)
     asked = run.requested_force()
     raised = (run.t > 1.3) & (run.t < 1.5)
@@ -147,7 +147,7 @@ def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: Run
     assert np.isnan(wanted[np.searchsorted(t, 1.2)])
 
 
-def test_model_page_has_points_on_the_models_curves(run: Run) -> None:
+def test_model_page_has_points_on_the_models_curves(run: RecordedRun) -> None:
     figure = drawn(run, "angle")
     assert "measured over" in texts(figure)
     force = figure.axes[0]
@@ -168,7 +168,7 @@ def test_depths_of_the_curves_are_round_and_span_the_data() -> None:
         assert [float(f"{d:g}") for d in depths] == pytest.approx(list(depths), abs=1e-12)
 
 
-def test_landscape_shows_the_local_minimum_and_the_path(run: Run) -> None:
+def test_landscape_shows_the_local_minimum_and_the_path(run: RecordedRun) -> None:
     figure = drawn(run, "landscape")
     (theta, d) = lines(figure, "local minimum over θ")[0]
     assert np.abs(theta).max() < 0.2  # the paper's claim, found on the table's numbers
@@ -182,7 +182,7 @@ def test_landscape_shows_the_local_minimum_and_the_path(run: Run) -> None:
     assert angle[known].max() > 5.0
 
 
-def test_a_deep_landscape_marks_where_the_backing_touches(run: Run) -> None:
+def test_a_deep_landscape_marks_where_the_backing_touches(run: RecordedRun) -> None:
     assert run.models is not None
     with style.settings():
         figure = style.new_figure(5, 4)
@@ -191,7 +191,7 @@ def test_a_deep_landscape_marks_where_the_backing_touches(run: Run) -> None:
     assert "rim of the backing touches" in figure.axes[0].get_legend_handles_labels()[1]
 
 
-def test_error_page_tells_errors_and_how_honest_the_spread_is(run: Run) -> None:
+def test_error_page_tells_errors_and_how_honest_the_spread_is(run: RecordedRun) -> None:
     figure = drawn(run, "error")
     said = texts(figure)
     assert "estimate minus truth" in said
@@ -204,29 +204,29 @@ def test_error_page_tells_errors_and_how_honest_the_spread_is(run: Run) -> None:
     assert 0.0 < np.nanstd(error[holding]) < 60.0
 
 
-def test_timing_page_of_a_real_clock_and_of_none(run: Run) -> None:
+def test_timing_page_of_a_real_clock_and_of_none(run: RecordedRun) -> None:
     assert "none above 0" in texts(drawn(run, "timing"))  # virtual time costs none
     rng = np.random.default_rng(5)
     late = rng.lognormal(-12.0, 1.0, run.t.size)
     busy = run.states | {"wake_late_s": late, "compute_s": 3.0 * late, "tick_s": 0.002 + late}
-    changed = Run(**{**vars_of(run), "states": busy})
+    changed = RecordedRun(**{**vars_of(run), "states": busy})
     figure = drawn(changed, "timing")
     assert f"median {np.median(late) * 1e6:.3g}" in texts(figure)
     (table,) = figure.axes[-1].tables
     cells = [cell.get_text().get_text() for cell in table.get_celld().values()]
     assert {"p99.9 [µs]", "publish"} <= set(cells)
-    without = Run(**{**vars_of(run), "stats": None})
+    without = RecordedRun(**{**vars_of(run), "stats": None})
     assert len(drawn(without, "timing").axes) == 3
 
 
-def vars_of(run: Run) -> dict[str, object]:
-    return {name: getattr(run, name) for name in Run.__dataclass_fields__}
+def vars_of(run: RecordedRun) -> dict[str, object]:
+    return {name: getattr(run, name) for name in RecordedRun.__dataclass_fields__}
 
 
-def test_a_gap_in_the_stream_breaks_the_line(run: Run) -> None:
+def test_a_gap_in_the_stream_breaks_the_line(run: RecordedRun) -> None:
     keep = (run.t < 1.0) | (run.t > 1.5)
     states = {name: values[keep] for name, values in run.states.items()}
-    part = Run(**{**vars_of(run), "states": states, "modes": run.modes[keep]})
+    part = RecordedRun(**{**vars_of(run), "states": states, "modes": run.modes[keep]})
     t, force = part.gapped(part.states["left.force"])
     (at,) = np.flatnonzero(np.isnan(force))
     assert (round(t[at], 1), round(t[at + 1], 1)) == (1.0, 1.5)
@@ -247,8 +247,10 @@ def test_pages_are_left_out_with_a_word(tmp_path: Path, call: Call) -> None:
     assert status == 1
 
 
-def test_without_settings_there_is_no_model(path: Path, run: Run) -> None:
-    bare = Run(**{**vars_of(run), "settings": None, "models": None, "why_no_model": "no reason"})
+def test_without_settings_there_is_no_model(path: Path, run: RecordedRun) -> None:
+    bare = RecordedRun(
+        **{**vars_of(run), "settings": None, "models": None, "why_no_model": "no reason"}
+    )
     for page in ("angle", "landscape"):
         with pytest.raises(Missing, match="no reason"):
             plots.PAGES[page](bare)

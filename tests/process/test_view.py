@@ -27,7 +27,7 @@ from softfinger.daemon.wire.packer import pack
 from softfinger.tools import cli
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.bridge import TOPICS, Bridge
-from softfinger.tools.viewing.page import Page, ViewError, policy
+from softfinger.tools.viewing.page import ViewError, WebPage, policy
 from softfinger.tools.viewing.session import LiveStream
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
@@ -443,11 +443,11 @@ class _Source(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
+def page() -> Iterator[WebPage]:
     source = ThreadingHTTPServer(("127.0.0.1", 0), _Source)
     thread = threading.Thread(target=source.serve_forever, daemon=True)
     thread.start()
-    page = Page(0, source.server_address[1], 4321)
+    page = WebPage(0, source.server_address[1], 4321)
     yield page
     page.close()
     source.shutdown()
@@ -455,7 +455,7 @@ def page() -> Iterator[Page]:
     thread.join(5.0)
 
 
-def got(page: Page, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, str], bytes]:
+def got(page: WebPage, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, str], bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=60)
     connection.putrequest("GET", path, skip_host=True)
     connection.putheader("Host", f"{host}:{page.port}")
@@ -466,7 +466,7 @@ def got(page: Page, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, 
     return result
 
 
-def test_the_page_is_handed_on_with_a_policy_that_keeps_it_on_this_machine(page: Page) -> None:
+def test_the_page_is_handed_on_with_a_policy_that_keeps_it_on_this_machine(page: WebPage) -> None:
     status, headers, body = got(page, "/re_viewer_bg.wasm")
     assert (status, body) == (200, b"of /re_viewer_bg.wasm")
     assert headers["Content-Type"] == "application/wasm"
@@ -479,7 +479,7 @@ def test_the_page_is_handed_on_with_a_policy_that_keeps_it_on_this_machine(page:
     assert got(page, headers["Location"])[0] == 200
 
 
-def test_the_page_answers_this_machine_alone_and_no_other_path(page: Page) -> None:
+def test_the_page_answers_this_machine_alone_and_no_other_path(page: WebPage) -> None:
     assert got(page, "/", host="evil.example")[0] == 403
     assert got(page, "/", host="localhost")[0] == 302
     assert got(page, "/none")[0] == 404
@@ -490,7 +490,7 @@ def test_the_page_answers_this_machine_alone_and_no_other_path(page: Page) -> No
     ]
     assert {each.laddr.ip for each in listening if each.status == "LISTEN"} == {"127.0.0.1"}
     with pytest.raises(ViewError, match=f"port {page.port}"):
-        Page(page.port, 1, 1)
+        WebPage(page.port, 1, 1)
 
 
 def test_the_viewer_ends_with_its_parent_and_listens_on_the_loopback_alone(recorded: Path) -> None:

@@ -17,7 +17,7 @@ from softfinger.tools.benchmarks.campaigns import accuracy
 from softfinger.tools.benchmarks.framework import interleaved
 from softfinger.tools.benchmarks.framework.campaign import RigError, run_trials, upper_bound
 from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Row, Table, figure, slower
+from softfinger.tools.benchmarks.framework.report import Report, Row, figure, slower
 
 REPORT = """\
 # /dev/cpu_dma_latency set to 0us
@@ -38,7 +38,7 @@ def test_a_table_is_aligned_and_leaves_out_what_is_missing() -> None:
         {"name": "a", "x µs": 7.8e-6, "n": 3},
         {"name": "longer", "x µs": math.nan, "what": "w"},
     ]
-    assert str(Table("times", rows, notes=("a note",))).splitlines() == [
+    assert str(Report("times", rows, notes=("a note",))).splitlines() == [
         "times      x µs  n  what",
         "a       7.8e-06  3",
         "longer              w",
@@ -142,7 +142,7 @@ def canned(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 
     def set_time(micros: float) -> None:
         rows = [figure("pipeline alone, nobody subscribed", "µs", [micros] * 5)]
-        monkeypatch.setattr(tick, "measure", lambda brief: [Table(tick.TITLE, rows, "error")])
+        monkeypatch.setattr(tick, "measure", lambda brief: [Report(tick.TITLE, rows, "error")])
 
     monkeypatch.setattr(bench, "PAGE", ("tick",))
     set_time(20.0)
@@ -171,7 +171,7 @@ def test_a_measurement_that_fails_leaves_the_others(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def let_go(brief: bool) -> list[Table]:
+    def let_go(brief: bool) -> list[Report]:
         raise RuntimeError("the hand let go")
 
     monkeypatch.setattr(wakeup, "measure", let_go)
@@ -186,9 +186,9 @@ def test_a_failed_campaign_is_no_success(
 ) -> None:
     asked: list[tuple[int | None, str]] = []
 
-    def measure(trials: int | None, only: str) -> list[Table]:
+    def measure(trials: int | None, only: str) -> list[Report]:
         asked.append((trials, only))
-        return [Table("part", [{"name": "x"}], failed=trials == 7)]
+        return [Report("part", [{"name": "x"}], failed=trials == 7)]
 
     monkeypatch.setattr(accuracy, "measure", measure)
     assert cli.main(["bench", "campaign", "accuracy"]) == 0

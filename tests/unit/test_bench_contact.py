@@ -15,16 +15,16 @@ from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks import contact, contact_scipy
 from softfinger.tools.benchmarks.contact import CONSTANT, ERROR, LAW, MODES, TIP
-from softfinger.tools.benchmarks.framework.report import Table, draw
+from softfinger.tools.benchmarks.framework.report import Report, draw
 
 
 @pytest.fixture(scope="module")
-def tables() -> list[Table]:
+def tables() -> list[Report]:
     """The short form of the bench."""
     return contact.measure(brief=True, rounds=1, count=32)
 
 
-def test_errors_are_those_of_each_representation(tables: list[Table]) -> None:
+def test_errors_are_those_of_each_representation(tables: list[Report]) -> None:
     errors = {row["name"]: row[ERROR] for table in tables[:-1] for row in table.rows}
     assert errors["closed form, constant E"] < 4e-15
     assert errors["table to 1e-09"] <= 1e-9
@@ -34,7 +34,7 @@ def test_errors_are_those_of_each_representation(tables: list[Table]) -> None:
     assert 1e-12 < errors["RectBivariateSpline.ev: 64², degree 3, F and U"] < 1e-7
 
 
-def test_every_way_of_calling_has_a_table_and_the_page_its_rows(tables: list[Table]) -> None:
+def test_every_way_of_calling_has_a_table_and_the_page_its_rows(tables: list[Report]) -> None:
     assert [table.title for table in tables[:-1]] == list(MODES.values())
     for title, names in contact.PAGE.items():
         (table,) = (table for table in tables if table.title == title)
@@ -46,7 +46,7 @@ def test_every_way_of_calling_has_a_table_and_the_page_its_rows(tables: list[Tab
             assert 0.0 < row["median"] <= row["aim ≤"]
 
 
-def test_the_picture_is_drawn(tables: list[Table], tmp_path: Path) -> None:
+def test_the_picture_is_drawn(tables: list[Report], tmp_path: Path) -> None:
     from matplotlib.image import imread
 
     draw(tables[3:4], tmp_path / "bench.png")

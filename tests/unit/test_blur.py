@@ -19,7 +19,7 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.packing import PLACE_BITS
-from softfinger.kinematics.estimation.state import READING, WEIGHT, State
+from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
 from softfinger.kinematics.sensing.blur import stencil
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -115,7 +115,7 @@ def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
     cells = np.zeros((rows, CELL_PLANES, cols))
     cells[:, LIVE] = rng.random((rows, cols)) > 0.1
     padded = parts * (cols + 2 * LANES) + len(whole)
-    state = State()
+    state = EstimatorState()
     state.grid.rows, state.grid.cols = rows, cols
     state.model.rows, state.model.cols = high, wide
     state.signal.scale = 2.0

@@ -10,7 +10,7 @@ import pytest
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.cell_centres import cell_centres
 from softfinger.kinematics.estimation.likelihood import set_law
-from softfinger.kinematics.estimation.state import PLANES, Law, State
+from softfinger.kinematics.estimation.state import PLANES, EstimatorState, Law
 from tests.harness.estimator_kernels import activity, press_and_accumulate, state_for
 
 LINEAR = Material.constant(0.304e6)
@@ -24,7 +24,7 @@ def test_activity_matches_its_plain_twin():
     # Columns 2 … 21 are in reach, and rows 2 … 17.
     live = np.zeros((20, 24), bool)
     live[2:18, 2:22] = True
-    state = State()
+    state = EstimatorState()
     grid = state.grid
     grid.radius, grid.pitch_x, grid.pitch_y, grid.rows, grid.cols = 1.0, 0.01, 0.01, 20, 24
     state.options.peak_level, state.signal.patch_level, state.signal.noise = 3.0, 4.0, 1.0

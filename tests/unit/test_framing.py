@@ -11,7 +11,7 @@ from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import (
     BROADCAST,
-    Parser,
+    PacketParser,
     frame,
     status,
 )
@@ -121,7 +121,7 @@ def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
     while at >= 0:
         assert packet[at + 3] == 0xFD
         at = packet.find(b"\xff\xff\xfd", at + 1)
-    (parsed,) = Parser().feed(packet, 0.0)
+    (parsed,) = PacketParser().feed(packet, 0.0)
     assert parsed.parameters == body
 
 
@@ -130,7 +130,7 @@ def test_stuffing_of_goal_current_minus_one_and_goal_velocity_minus_three() -> N
     packet = frame(1, framing.WRITE, b"\x66\x00" + goals)
     assert packet[8:-2] == bytes.fromhex("6600 FFFF FDFD FFFFFF")
     assert packet[5] == len(packet) - 7
-    (parsed,) = Parser().feed(packet, 0.0)
+    (parsed,) = PacketParser().feed(packet, 0.0)
     assert parsed.parameters[2:] == goals
 
 
@@ -142,7 +142,7 @@ def test_parser_finds_every_packet_however_the_bytes_come(
     contents: list[tuple[int, int, bytes]], data: st.DataObject
 ) -> None:
     stream = b"".join(frame(*content) for content in contents)
-    parser = Parser()
+    parser = PacketParser()
     found = []
     at = 0
     while at < len(stream):
@@ -157,7 +157,7 @@ def test_parser_finds_every_packet_however_the_bytes_come(
 @settings(max_examples=200)
 @given(st.binary(max_size=60), payloads)
 def test_parser_recovers_after_any_noise(noise: bytes, body: bytes) -> None:
-    parser = Parser(gap=0.0015)
+    parser = PacketParser(gap=0.0015)
     parser.feed(noise, 0.0)
     found = parser.feed(frame(7, framing.WRITE, body), 1.0)
     assert [(p.id, p.parameters, p.valid) for p in found] == [(7, body, True)]
@@ -165,7 +165,7 @@ def test_parser_recovers_after_any_noise(noise: bytes, body: bytes) -> None:
 
 def test_a_cut_packet_does_not_swallow_the_next() -> None:
     whole = frame(1, framing.WRITE, bytes(20))
-    found = Parser().feed(whole[:15] + frame(2, framing.PING), 0.0)
+    found = PacketParser().feed(whole[:15] + frame(2, framing.PING), 0.0)
     assert [(p.id, p.instruction) for p in found] == [(2, framing.PING)]
 
 
@@ -173,19 +173,19 @@ def test_an_unstuffed_packet_is_not_obeyed() -> None:
     goals = bytes.fromhex("6600 FFFF FDFFFFFF")
     raw = b"\xff\xff\xfd\x00\x01" + (len(goals) + 3).to_bytes(2, "little") + b"\x03" + goals
     raw += crc16(raw).to_bytes(2, "little")
-    assert Parser().feed(raw, 0.0) == []
+    assert PacketParser().feed(raw, 0.0) == []
 
 
 def test_a_damaged_packet_is_told_apart() -> None:
     damaged = bytearray(frame(1, framing.READ, bytes(4)))
     damaged[9] ^= 4
-    (packet,) = Parser().feed(bytes(damaged), 0.0)
+    (packet,) = PacketParser().feed(bytes(damaged), 0.0)
     assert not packet.valid
 
 
 def test_silence_within_a_packet_ends_it() -> None:
     packet = frame(1, framing.PING)
-    parser = Parser(gap=0.0015)
+    parser = PacketParser(gap=0.0015)
     assert parser.feed(packet[:6], 0.0) == []
     assert parser.feed(packet[6:], 0.002) == []
     assert parser.dropped == len(packet)
@@ -194,4 +194,4 @@ def test_silence_within_a_packet_ends_it() -> None:
 
 @pytest.mark.parametrize("bad_id", [0xFD, 0xFF])
 def test_ids_that_no_servo_may_have(bad_id: int) -> None:
-    assert Parser().feed(frame(bad_id, framing.PING), 0.0) == []
+    assert PacketParser().feed(frame(bad_id, framing.PING), 0.0) == []

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.clock import VirtualClock
-from softfinger.daemon.gateway.zmtp import GREETING, Broken, Parser, frame
+from softfinger.daemon.gateway.zmtp import GREETING, Broken, FrameParser, frame
 from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import EVENT, STATE
@@ -206,7 +206,7 @@ def test_who_comes_after_a_stop_is_heard_while_others_still_wait_to_be_let_in(
 @given(st.lists(st.binary(max_size=40), max_size=8), st.integers(1, 30))
 def test_a_message_arrives_whole_however_it_is_cut(parts: list[bytes], cut: int) -> None:
     wire = GREETING + b"".join(frame(part, more=True) for part in parts) + frame(b"x" * 300)
-    parser, found = Parser(300), []
+    parser, found = FrameParser(300), []
     for at in range(0, len(wire), cut):
         found += parser.feed(wire[at : at + cut])
     assert found == [*((False, True, part) for part in parts), (False, False, b"x" * 300)]
@@ -216,7 +216,7 @@ def test_a_message_arrives_whole_however_it_is_cut(parts: list[bytes], cut: int)
 @given(st.binary(max_size=300))
 def test_any_bytes_are_frames_or_break_the_protocol(data: bytes) -> None:
     for begin in (b"", GREETING):
-        parser = Parser(100)
+        parser = FrameParser(100)
         try:
             frames = parser.feed(begin + data)
         except Broken:

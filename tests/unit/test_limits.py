@@ -12,7 +12,7 @@ import pytest
 
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
-from softfinger.daemon.profile.settings import Safety as Limits
+from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS
 from softfinger.daemon.types import State
 from softfinger.kinematics.estimation.estimator import ContactEstimate

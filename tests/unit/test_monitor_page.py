@@ -15,9 +15,9 @@ from rich.cells import cell_len
 from rich.segment import Segment
 
 from softfinger.tools.terminal.feed import HISTORY_STEP, Feed
-from softfinger.tools.terminal.feed_sockets import Reply
-from softfinger.tools.terminal.monitor_page import Page
-from softfinger.tools.terminal.terminal import Keys
+from softfinger.tools.terminal.feed_sockets import ShownReply
+from softfinger.tools.terminal.monitor_page import MonitorPage
+from softfinger.tools.terminal.terminal import KeyDecoder
 from tests.harness import fake_daemon
 
 
@@ -36,7 +36,7 @@ def give(feed: Feed, topic: bytes, record: object, now: float = 0.0) -> None:
 
 def shown(feed: Feed, now: float = 0.0, width: int = 80, height: int = 24, **more: Any) -> str:
     reply = more.pop("reply", None)
-    lines = Page(feed, "tcp://127.0.0.1:9872", **more).lines(width, height, now, reply)
+    lines = MonitorPage(feed, "tcp://127.0.0.1:9872", **more).lines(width, height, now, reply)
     return check(lines, width, height)
 
 
@@ -118,7 +118,7 @@ def test_long_and_wide_texts_are_cut() -> None:
     feed = fed()
     give(feed, b"hand/event", fake_daemon.event(1, "kind" * 9, "手指 force ÷ " * 40, "error"))
     give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"fault": "過 " * 90, "mode": "m" * 99})
-    text = shown(feed, reply=Reply(0.0, False, "grasp: " + "長い " * 60))
+    text = shown(feed, reply=ShownReply(0.0, False, "grasp: " + "長い " * 60))
     assert "…" in text
     assert "✗ grasp" in text
     assert "c clears it" in text
@@ -203,7 +203,7 @@ def test_temperature_of_a_servo() -> None:
     warned = json.dumps({"safety": {"temperature_warn": 70.0}, "commands": {"lease": 5.0}})
 
     def style_of_the_hot_one() -> object:
-        lines = Page(feed, "").lines(80, 24, 0.0, None)
+        lines = MonitorPage(feed, "").lines(80, 24, 0.0, None)
         return next(part.style for each in lines for part in each if "71.5" in part.text)
 
     before = style_of_the_hot_one()
@@ -256,7 +256,7 @@ def test_long_reasons_are_shown_in_full_at_the_least_size(keys: bool) -> None:
     fault = "left: no sound tactile frame for 0.31 s while gripping, more than 0.3 s: torque is off"
     give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"mode": "fault", "fault": fault})
     why = "clear: left: no sound tactile frame for 12.42 s while gripping, more than 0.3 s allowed"
-    text = shown(feed, reply=Reply(0.0, False, why), keys=keys)
+    text = shown(feed, reply=ShownReply(0.0, False, why), keys=keys)
     flat = " ".join(text.split())
     assert fault in flat
     assert ("c clears it" if keys else "softfinger send clear") in flat
@@ -320,7 +320,7 @@ def test_a_frame_that_lies_about_its_size_is_skipped() -> None:
 
 
 def test_keys() -> None:
-    keys = Keys()
+    keys = KeyDecoder()
     assert keys.decode(b"ag \x1b[C\x1bOD\x1b[A\x1b[1;5Cq\xc3\xa9\x07") == [
         *("a", "g", " "),
         *("right", "left", "q"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.clock import VirtualClock
-from softfinger.daemon.profile.settings import Settings, Simulation
+from softfinger.daemon.profile.settings import Settings, SimulationSettings
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
@@ -32,7 +32,7 @@ HAND = ReferenceHand()
 
 
 def shape(**simulation):
-    return shape_of(Simulation(**simulation))
+    return shape_of(SimulationSettings(**simulation))
 
 
 # Shapes.

@@ -15,7 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.collision import collide, overlay
-from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Parser, frame
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.fuzz.servo_bus import fuzz
 from tests.harness.free_joints import FreeJoints
@@ -169,7 +169,7 @@ def test_broadcast_reads_and_writes_are_not_answered() -> None:
 
 def test_a_missing_servo_silences_those_named_after_it() -> None:
     c = client(ids=(1, 2, 3))
-    packets = Parser().feed(
+    packets = PacketParser().feed(
         c.send(BROADCAST, framing.SYNC_READ, struct.pack("<HH", 132, 4) + bytes((1, 9, 3))), 0.0
     )
     assert [packet.id for packet in packets] == [1]
@@ -334,7 +334,7 @@ def test_any_packets_are_survived_and_answered_in_form(
     for step, content in enumerate(packets):
         reply = bus.feed(frame(*content), step * 0.02)
         if content[1] not in (framing.FAST_SYNC_READ, framing.FAST_BULK_READ):
-            parser = Parser()
+            parser = PacketParser()
             found = parser.feed(reply, 0.0)
             assert sum(packet.size for packet in found) == len(reply)
             assert all(p.valid and p.instruction == framing.STATUS for p in found)

@@ -18,7 +18,7 @@ from softfinger.tools.viewing.bridge import statistics_table
 from softfinger.tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
 from softfinger.tools.viewing.known import read_settings
 from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
-from softfinger.tools.viewing.planar import Contact, HeldObject, finger_lines, tip_axes
+from softfinger.tools.viewing.planar import HeldObject, Touch, finger_lines, tip_axes
 from tests.harness.reference_hand import ReferenceHand
 
 TIP = Fingertip(radius=0.020)
@@ -98,7 +98,7 @@ def held() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 @pytest.mark.parametrize("finger", [0, 1])
 def test_a_pressed_tip_ends_at_the_objects_face(finger: int) -> None:
     d, theta = held()
-    lines = finger_lines(HAND, finger, Q[finger], Contact(d[finger], theta[finger], 8.0))
+    lines = finger_lines(HAND, finger, Q[finger], Touch(d[finger], theta[finger], 8.0))
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
     outwards = -n if finger == 0 else n  # of the object, through this face
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from softfinger.tools.analysis.plots_data import Run
+from softfinger.tools.analysis.plots_data import RecordedRun
 from softfinger.tools.analysis.plots_error import draw_error
 from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
 from softfinger.tools.analysis.plots_time import draw_joints, draw_time
@@ -14,7 +14,7 @@ from softfinger.tools.analysis.plots_timing import draw_timing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAGES: dict[str, Callable[[Run], Figure]] = {
+PAGES: dict[str, Callable[[RecordedRun], Figure]] = {
     "time": draw_time,
     "angle": draw_angle,
     "landscape": draw_landscape,

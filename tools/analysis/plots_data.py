@@ -50,7 +50,7 @@ class Missing(SoftfingerError):
 
 
 @dataclass(frozen=True)
-class Run:
+class RecordedRun:
     """A recording, or a part of it. SI units; ``t`` counts from the recording's first message.
 
     ``states`` and ``truth`` are one array a field, by the names of the stream, nested ones with a
@@ -162,7 +162,7 @@ def load_run(
     end: float,
     cache: Path | None,
     progress: Callable[[int], None] | None = None,
-) -> Run:
+) -> RecordedRun:
     """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
     states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT})
     truth = _Columns(("seq", "mono_ns"), {**dict.fromkeys(FINGERS, _TRUE), "object": _TRUE_OBJECT})
@@ -186,7 +186,7 @@ def load_run(
         if message.get("ok") is True and isinstance(message.get("tick"), int):
             commands.append(message)
     settings, models, why = _model(recording, cache)
-    return Run(
+    return RecordedRun(
         recording.path.name,
         settings,
         models,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softfinger.daemon.types import FINGERS
-from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, Run
+from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, RecordedRun
 from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
 from softfinger.tools.paper import style
 
@@ -25,7 +25,7 @@ _ROWS = (
 )
 
 
-def draw_error(run: Run) -> Figure:
+def draw_error(run: RecordedRun) -> Figure:
     """Estimate minus truth over time within ± 2σ as reported, and histograms."""
     run.need_states()
     if not run.truth:
@@ -61,7 +61,7 @@ def draw_error(run: Run) -> Figure:
     return figure
 
 
-def _spread(run: Run, finger: str, field: str) -> FloatArray:
+def _spread(run: RecordedRun, finger: str, field: str) -> FloatArray:
     """The reported standard deviation; a force's from those of d and θ, NaN without a model."""
     if field != "force":
         return run.states[f"{finger}.{field}_std"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.analysis.plots_data import FloatArray, Run
+from softfinger.tools.analysis.plots_data import FloatArray, RecordedRun
 from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
 from softfinger.tools.paper import style
 
@@ -36,7 +36,7 @@ def _some(indices: NDArray[np.intp], count: int = _POINTS) -> NDArray[np.intp]:
 
 
 def _groups(
-    run: Run, fingers: list[str], models: tuple[FingerModel, FingerModel]
+    run: RecordedRun, fingers: list[str], models: tuple[FingerModel, FingerModel]
 ) -> list[tuple[list[str], ContactTable]]:
     """Fingers that share a contact table, and the table."""
     groups: list[tuple[list[str], ContactTable]] = []
@@ -51,7 +51,7 @@ def _groups(
     return groups
 
 
-def draw_angle(run: Run) -> Figure:
+def draw_angle(run: RecordedRun) -> Figure:
     """F and U against θ beside the model's curves at fixed d, and measured over modelled force."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
@@ -96,7 +96,7 @@ def draw_angle(run: Run) -> Figure:
 
 
 def _against_angle(
-    panel: Axes, run: Run, names: list[str], table: ContactTable, field: str, factor: float
+    panel: Axes, run: RecordedRun, names: list[str], table: ContactTable, field: str, factor: float
 ) -> Any:
     """Points coloured by d over the model's curves; returns the colour bar's mappable."""
     import matplotlib
@@ -161,7 +161,7 @@ def _depths(d: FloatArray) -> FloatArray:
     return depths
 
 
-def draw_landscape(run: Run) -> Figure:
+def draw_landscape(run: RecordedRun) -> Figure:
     """Paths over U(d, θ) with its minimum over θ, and their height above it over time."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
@@ -189,7 +189,7 @@ def draw_landscape(run: Run) -> Figure:
     return figure
 
 
-def _path(run: Run, finger: str) -> tuple[FloatArray, FloatArray]:
+def _path(run: RecordedRun, finger: str) -> tuple[FloatArray, FloatArray]:
     """d and θ at each state, NaN without contact."""
     touching = run.touching(finger)
     d = np.where(touching, run.states[f"{finger}.d"], np.nan)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softfinger.tools.analysis.plots_data import MODES, FloatArray, Run
+from softfinger.tools.analysis.plots_data import MODES, FloatArray, RecordedRun
 from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ _JOINT = (
 _RAISED = 0.01  # of the request: by more than that the goal differs from it
 
 
-def draw_time(run: Run) -> Figure:
+def draw_time(run: RecordedRun) -> Figure:
     """Force, energy, displacement and the object's angle over time, with their goals."""
     run.need_contact()
     figure, strip, panels = _sheet(run, 4, 7.6)
@@ -69,7 +69,7 @@ def draw_time(run: Run) -> Figure:
     return figure
 
 
-def _goals(panel: Axes, run: Run, goal: FloatArray, requested: FloatArray) -> None:
+def _goals(panel: Axes, run: RecordedRun, goal: FloatArray, requested: FloatArray) -> None:
     """The hand's goal, and the request where it differs."""
     _line(panel, run, goal, label="goal", **GOAL)
     other = np.where(np.abs(requested - goal) > _RAISED * np.abs(requested), requested, np.nan)
@@ -78,7 +78,7 @@ def _goals(panel: Axes, run: Run, goal: FloatArray, requested: FloatArray) -> No
         _line(panel, run, other, label="requested", **look)
 
 
-def draw_joints(run: Run) -> Figure:
+def draw_joints(run: RecordedRun) -> Figure:
     """Joint angles and currents with their goals, and the servos' temperature, over time."""
     run.need_states()
     figure, strip, panels = _sheet(run, 3, 6.2)
@@ -98,7 +98,7 @@ def draw_joints(run: Run) -> Figure:
     return figure
 
 
-def _sheet(run: Run, count: int, height: float) -> tuple[Figure, Axes, list[Axes]]:
+def _sheet(run: RecordedRun, count: int, height: float) -> tuple[Figure, Axes, list[Axes]]:
     figure = style.new_figure(7.0, height)
     axes = figure.subplots(
         1 + count, 1, sharex=True, gridspec_kw={"height_ratios": [0.13, *[1.0] * count]}
@@ -106,11 +106,11 @@ def _sheet(run: Run, count: int, height: float) -> tuple[Figure, Axes, list[Axes
     return figure, axes[0], list(axes[1:])
 
 
-def _line(panel: Axes, run: Run, values: FloatArray, **look: Any) -> None:
+def _line(panel: Axes, run: RecordedRun, values: FloatArray, **look: Any) -> None:
     panel.plot(*run.gapped(values), **look)
 
 
-def _finish(figure: Figure, run: Run, strip: Axes, panels: list[Axes]) -> None:
+def _finish(figure: Figure, run: RecordedRun, strip: Axes, panels: list[Axes]) -> None:
     from matplotlib.patches import Patch
 
     _draw_modes(strip, run)
@@ -150,12 +150,12 @@ def time_axis(panel: Axes, t: FloatArray) -> None:
     panel.set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
 
 
-def titled(figure: Figure, run: Run, text: str) -> None:
+def titled(figure: Figure, run: RecordedRun, text: str) -> None:
     """The recording's name and ``text`` above a figure."""
     figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
-def _draw_modes(strip: Axes, run: Run) -> None:
+def _draw_modes(strip: Axes, run: RecordedRun) -> None:
     """The hand's modes as one band."""
     edges = np.flatnonzero(np.diff(run.modes)) + 1
     starts = [0, *edges.tolist()]

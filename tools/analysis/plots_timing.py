@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softfinger.tools.analysis.plots_data import FloatArray, Run
+from softfinger.tools.analysis.plots_data import FloatArray, RecordedRun
 from softfinger.tools.analysis.plots_time import titled
 from softfinger.tools.paper import style
 
@@ -20,7 +20,7 @@ _PARTS = ("wake", "compute", "bus", "publish")
 _SHARES = (("p50", "median"), ("p99", "p99"), ("p999", "p99.9"), ("max", "max"))
 
 
-def draw_timing(run: Run) -> Figure:
+def draw_timing(run: RecordedRun) -> Figure:
     """Tick, compute and wake-up times, and the last ``hand/stats``."""
     run.need_states()
     heights = [1.0] if run.stats is None else [1.0, 0.42]

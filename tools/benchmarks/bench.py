@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.own_files import write_text
 
 if TYPE_CHECKING:
-    from softfinger.tools.benchmarks.framework.report import Row, Table
+    from softfinger.tools.benchmarks.framework.report import Report, Row
 
 MEASUREMENTS = {
     "contact": "the contact model, run time against error, beside SciPy",
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the files that were asked for."""
-    from softfinger.tools.benchmarks.framework.report import Table, slower, yardstick
+    from softfinger.tools.benchmarks.framework.report import Report, slower, yardstick
 
     campaign = arguments.names[:1] == [_CAMPAIGN]
     texts = CAMPAIGNS if campaign else MEASUREMENTS
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"bench: {error}", file=sys.stderr)
         return 2
     rows: list[Row] = []
-    drawn: list[Table] = []
+    drawn: list[Report] = []
     page: list[Row] = []
     failed = False
     for name in names:
@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"bench: {name}: {error}", file=sys.stderr)
             failed = True
             continue
-        for table in [*tables, Table("", [yardstick()])]:
+        for table in [*tables, Report("", [yardstick()])]:
             head = {"measurement": name, "table": table.title}
             # JSON knows no NaN, which alone differs from itself.
             rows += [
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             page += _key_figures(tables, module.PAGE)
     if page:
-        print(Table("", page))
+        print(Report("", page))
     if arguments.json:
         content = {
             "machine": platform.machine(),
@@ -163,7 +163,7 @@ def _read(path: Path) -> list[Row]:
     return found
 
 
-def _key_figures(tables: list[Table], chosen: dict[str, tuple[str, ...]]) -> list[Row]:
+def _key_figures(tables: list[Report], chosen: dict[str, tuple[str, ...]]) -> list[Row]:
     """Rows of the page: those whose names begin as ``chosen`` has it, by the table's title."""
     return [
         {"name": f"{table.title}: {row['name']}"}

@@ -31,7 +31,7 @@ from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks import contact_scipy
 from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, Row, figure
 
 FloatArray = NDArray[np.float64]
 Built = dict[float, tuple[ContactTable, list[float]]]
@@ -62,7 +62,7 @@ _TILES = 8  # a batch is this many times the points
 
 
 @dataclass
-class _Case:
+class _Way:
     """A representation: its subjects by mode, and its error."""
 
     name: str
@@ -71,7 +71,7 @@ class _Case:
     facts: Row = field(default_factory=dict)
 
 
-def measure(brief: bool = False, rounds: int = 25, count: int = 512) -> list[Table]:
+def measure(brief: bool = False, rounds: int = 25, count: int = 512) -> list[Report]:
     """One table a way of calling, then what has an aim. ``count`` of points: a power of two."""
     d, theta = points(count)
     built = {tolerance: _built(tolerance, 1 if brief else 5) for tolerance in _TOLERANCES}
@@ -81,10 +81,10 @@ def measure(brief: bool = False, rounds: int = 25, count: int = 512) -> list[Tab
     }
     times = interleave(subjects, 10 if brief else rounds)
     tables = [
-        Table(title, [_row(case, mode, times) for case in cases if mode in case.subjects], ERROR)
+        Report(title, [_row(case, mode, times) for case in cases if mode in case.subjects], ERROR)
         for mode, title in MODES.items()
     ]
-    return [*tables, Table("contact, what has an aim", list(_aims(built, times)))]
+    return [*tables, Report("contact, what has an aim", list(_aims(built, times)))]
 
 
 def _built(tolerance: float, repeats: int) -> tuple[ContactTable, list[float]]:
@@ -126,10 +126,10 @@ def _error(got: Any, expected: FloatArray) -> float:
     return max(float(np.max(np.abs((value - true) / true))) for value, true in pairs)
 
 
-def _cases(brief: bool, built: Built, d: FloatArray, theta: FloatArray) -> Iterator[_Case]:
+def _cases(brief: bool, built: Built, d: FloatArray, theta: FloatArray) -> Iterator[_Way]:
     error = _error(closed_forms(MODULUS, d, theta), reference(CONSTANT, d, theta))
     calls = partial(closed_form, MODULUS), partial(closed_forms, MODULUS)
-    yield _compiled(_Case(_CLOSED, error), CLOSED_KERNELS, MODULUS, calls, d, theta)
+    yield _compiled(_Way(_CLOSED, error), CLOSED_KERNELS, MODULUS, calls, d, theta)
     yield _table("table, constant E", ContactTable.build(TIP, CONSTANT), CONSTANT, d, theta)
     for tolerance, (table, _) in built.items():
         yield _table(f"table to {tolerance:g}", table, LAW, d, theta)
@@ -155,18 +155,18 @@ def _cases(brief: bool, built: Built, d: FloatArray, theta: FloatArray) -> Itera
         call = partial(integrate, TIP, LAW, nodes=nodes)
         error = _error(call(d, theta), expected)
         modes = {"python": _single(call, d, theta), "batch": _batch(call, d, theta)}
-        yield _Case(f"quadrature: {nodes} nodes a piece", error, modes)
+        yield _Way(f"quadrature: {nodes} nodes a piece", error, modes)
     yield from _scipy(d, theta, expected)
 
 
 def _compiled(
-    case: _Case,
+    case: _Way,
     kernels: dict[str, Callable[..., None]],
     argument: Any,
     calls: tuple[Callable[..., object], Callable[..., object]],
     d: FloatArray,
     theta: FloatArray,
-) -> _Case:
+) -> _Way:
     """With the subjects of a compiled representation: ``calls`` as kernel and as Python API."""
     out = np.empty((d.size, 6))
     for mode in ("loop", "chain"):
@@ -186,15 +186,15 @@ def _run(kernel: Callable[..., None], *arguments: Any) -> None:
 
 def _table(
     name: str, table: ContactTable, material: Material, d: FloatArray, theta: FloatArray
-) -> _Case:
+) -> _Way:
     facts = {"error bound": table.max_error, "KiB": table.data.nbytes / 1024}
-    case = _Case(name, _error(table(d, theta), reference(material, d, theta)), facts=facts)
+    case = _Way(name, _error(table(d, theta), reference(material, d, theta)), facts=facts)
     return _compiled(
         case, LOOKUP_KERNELS, table.data, (partial(lookup, table.data), table), d, theta
     )
 
 
-def _scipy(d: FloatArray, theta: FloatArray, expected: FloatArray) -> Iterator[_Case]:
+def _scipy(d: FloatArray, theta: FloatArray, expected: FloatArray) -> Iterator[_Way]:
     try:
         import scipy  # noqa: F401
     except ImportError:
@@ -215,7 +215,7 @@ def _scipy(d: FloatArray, theta: FloatArray, expected: FloatArray) -> Iterator[_
             got = np.array([method.call(float(d[i]), float(theta[i])) for i in range(_FEW)]).T
             error = _error(got, expected[:, :_FEW])
             modes = {"python": _single(method.call, d[:1], theta[:1])}
-        yield _Case(method.name, error, modes, facts)
+        yield _Way(method.name, error, modes, facts)
 
 
 def _single(call: Callable[..., object], d: FloatArray, theta: FloatArray) -> Subject:
@@ -241,7 +241,7 @@ def _batch(call: Callable[..., object], d: FloatArray, theta: FloatArray) -> Sub
     return Subject(run, depth.size)
 
 
-def _row(case: _Case, mode: str, times: dict[str, FloatArray]) -> Row:
+def _row(case: _Way, mode: str, times: dict[str, FloatArray]) -> Row:
     taken, base = times[f"{mode} {case.name}"], times[f"{mode} {_CLOSED}"]
     row = figure(case.name, "ns", taken)
     del row["aim ≤"]

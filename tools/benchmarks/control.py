@@ -14,7 +14,7 @@ import numpy as np
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.benchmarks.control_rig import Watched, push_along
-from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, Row, figure
 
 Sections = dict[str, dict[str, Any]]
 Samples = defaultdict[str, list[float]]
@@ -72,7 +72,7 @@ FIGURES = {
 }
 
 
-def measure(brief: bool = False) -> list[Table]:
+def measure(brief: bool = False) -> list[Report]:
     """All that the control is judged by; p99 of a few trials is about the worst of them."""
     off = _OFF[1:2] if brief else _OFF
     cases = dict(list(CASES.items())[:1]) if brief else CASES
@@ -84,10 +84,10 @@ def measure(brief: bool = False) -> list[Table]:
             for text, (unit, aim) in FIGURES.items()
             if samples[text]
         ]
-        tables.append(Table(f"control, {name}", rows))
+        tables.append(Report(f"control, {name}", rows))
     for name, sections in {} if brief else _PROFILES.items():
         rows = [*_light(sections), *_loaded(sections), *_pushed(sections)]
-        tables.append(Table(f"control under loads, {name}", rows))
+        tables.append(Report(f"control under loads, {name}", rows))
     return tables
 
 

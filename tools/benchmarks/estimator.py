@@ -27,7 +27,7 @@ from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
-from softfinger.kinematics.estimation.state import State
+from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.campaigns import accuracy_envelope
 from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
@@ -42,7 +42,7 @@ from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
 )
 from softfinger.tools.benchmarks.estimator_rivals import rivals
 from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, figure
 
 FloatArray = NDArray[np.float64]
 Truth: TypeAlias = tuple[float, float, float]  # d [m], tilt_x, tilt_y [rad]
@@ -70,14 +70,14 @@ _DECODERS: dict[str, Callable[[int, int], Decoder]] = {
 
 
 @dataclass
-class _Case:
+class _Timed:
     subject: Subject
     found: Callable[[], FloatArray] | None = None  # estimates [n, 3]
     aim_us: float | None = None
     truth: Truth = _TRUTH
 
 
-def measure(brief: bool = False, rounds: int = 25, frames: int = 500) -> list[Table]:
+def measure(brief: bool = False, rounds: int = 25, frames: int = 500) -> list[Report]:
     """Times with errors; unless ``brief`` the errors over the envelope, ``frames`` a contact."""
     random = np.random.default_rng(4)
     noise = random.standard_normal((_FRAMES, SIZE, SIZE))
@@ -97,14 +97,14 @@ def measure(brief: bool = False, rounds: int = 25, frames: int = 500) -> list[Ta
     sigma = np.sqrt(np.diag(bound(jacobian(_PLACE), _NOISE, True)))
     limit = {D_ERROR: 1e6 * float(sigma[0]), TILT_ERROR: math.degrees(math.hypot(*sigma[1:3]))}
     rows.append({"name": "Cramér-Rao bound, gain free"} | limit)
-    tables = [Table(TITLE, rows, D_ERROR)]
+    tables = [Report(TITLE, rows, D_ERROR)]
     if brief:
         return tables
     sweep = accuracy_envelope.Sweep(1, frames, 3, 4 * frames, degrees=(0.0, 10.0, 20.0, 30.0))
     return tables + accuracy_envelope.against_the_bound(sweep)
 
 
-def _errors(case: _Case) -> dict[str, float]:
+def _errors(case: _Timed) -> dict[str, float]:
     if case.found is None:
         return {}
     off = case.found()[:, :3] - np.array(case.truth)
@@ -121,7 +121,7 @@ def _loop(
     repeat: int,
     frames: FloatArray,
     cold: bool,
-    states: Records[State],
+    states: Records[EstimatorState],
     arena: FloatArray,
     places: NDArray[np.int64] | None,
     out: FloatArray,
@@ -137,17 +137,17 @@ def _loop(
             out[k, 2] = estimate.tilt_y
 
 
-def _kernel(estimator: ContactEstimator, frames: FloatArray, cold: bool = False) -> _Case:
+def _kernel(estimator: ContactEstimator, frames: FloatArray, cold: bool = False) -> _Timed:
     """The compiled entry, from the last estimate or from each frame alone."""
     out = np.zeros((len(frames), 3))
 
     def run(repeat: int) -> None:
         _loop(repeat, frames, cold, estimator.state.array, *estimator.arena, out)
 
-    return _Case(Subject(run, len(frames)), lambda: out)
+    return _Timed(Subject(run, len(frames)), lambda: out)
 
 
-def _methods(frames: FloatArray) -> dict[str, _Case]:
+def _methods(frames: FloatArray) -> dict[str, _Timed]:
     """Each method, from the last estimate and from the frame alone."""
     cases = {}
     for name, options, warm, cold in (
@@ -162,7 +162,7 @@ def _methods(frames: FloatArray) -> dict[str, _Case]:
     return cases
 
 
-def _call(estimator: ContactEstimator, frames: FloatArray) -> _Case:
+def _call(estimator: ContactEstimator, frames: FloatArray) -> _Timed:
     def run(repeat: int) -> None:
         for _ in range(repeat):
             for frame in frames:
@@ -172,10 +172,10 @@ def _call(estimator: ContactEstimator, frames: FloatArray) -> _Case:
         estimates = (estimator.update(frame) for frame in frames)
         return np.array([(e.d, e.tilt_x, e.tilt_y) for e in estimates])
 
-    return _Case(Subject(run, len(frames)), found)
+    return _Timed(Subject(run, len(frames)), found)
 
 
-def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Case]:
+def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Timed]:
     """What is skipped, on and off."""
     always, exact = _estimator(), _estimator()
     always.state.options.peak_level = always.state.options.patch_level = -1e9
@@ -191,14 +191,14 @@ def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Case]:
             _kernel(_estimator(), empty), found=None, aim_us=0.3
         ),
         "no contact: fitted all the same, kernel": replace(_kernel(always, empty), found=None),
-        "frame already seen: call": _Case(Subject(again)),
+        "frame already seen: call": _Timed(Subject(again)),
         "ml, gain free: warm, no early stop, kernel": _kernel(exact, frames),
     }
 
 
-def _elsewhere(noise: FloatArray) -> dict[str, _Case]:
+def _elsewhere(noise: FloatArray) -> dict[str, _Timed]:
     """The same at the envelope's costliest corner, with Table I's law, and with a blur."""
-    cases: dict[str, _Case] = {}
+    cases: dict[str, _Timed] = {}
 
     def add(name: str, truth: Truth, material: Material, grid: SensorGrid, **options: Any) -> None:
         deviation = _SHARE * material.reference_modulus
@@ -222,7 +222,7 @@ def _elsewhere(noise: FloatArray) -> dict[str, _Case]:
     return cases
 
 
-def _decode(framing: str, frames: FloatArray) -> _Case:
+def _decode(framing: str, frames: FloatArray) -> _Timed:
     """A framing's bytes, as a board sends them, to counts."""
     encode = ENCODERS[framing].encode
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
@@ -234,10 +234,10 @@ def _decode(framing: str, frames: FloatArray) -> _Case:
             for packet in packets:
                 decoder.feed(packet, 0.0)
 
-    return _Case(Subject(run, len(packets)), aim_us=20.0)
+    return _Timed(Subject(run, len(packets)), aim_us=20.0)
 
 
-def _rivals(frames: FloatArray, brief: bool) -> dict[str, _Case]:
+def _rivals(frames: FloatArray, brief: bool) -> dict[str, _Timed]:
     cases = {}
     methods, missing = rivals(TIP, LINEAR, GRID, _NOISE)
     if missing:
@@ -255,5 +255,5 @@ def _rivals(frames: FloatArray, brief: bool) -> dict[str, _Case]:
             for _ in range(repeat):
                 found()
 
-        cases[name] = _Case(Subject(run, len(chosen)), found)
+        cases[name] = _Timed(Subject(run, len(chosen)), found)
     return cases

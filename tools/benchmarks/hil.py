@@ -9,7 +9,7 @@ from typing import Any
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
-from softfinger.tools.benchmarks.framework.report import Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, figure
 from softfinger.tools.benchmarks.framework.rigs import HIL, emulator
 
 PAGE = {"hardware in the loop": ("tick",)}
@@ -19,7 +19,7 @@ _SCRIPT: tuple[tuple[float, dict[str, Any]], ...] = (
 )
 
 
-def measure(brief: bool = False) -> list[Table]:
+def measure(brief: bool = False) -> list[Report]:
     """Ticks of a hand that grasps and holds over ptys, unpaced [µs]."""
     seconds = 3.0 if brief else 10.0
     with tempfile.TemporaryDirectory() as name, emulator(Path(name), HIL):
@@ -49,4 +49,4 @@ def measure(brief: bool = False) -> list[Table]:
                 figure("wake-up after the deadline", "µs", late),
                 figure("processor share of the daemon's process", "%", [100.0 * share]),
             ]
-    return [Table("hardware in the loop", rows)]
+    return [Report("hardware in the loop", rows)]

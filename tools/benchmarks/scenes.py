@@ -22,7 +22,7 @@ from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, Row, figure
 from softfinger.tools.benchmarks.framework.rigs import Sections, can, hold, virtual_daemon
 
 _TICKS = 20  # of a call: whole periods of the frames, as of the published topics
@@ -30,7 +30,7 @@ _SURE = 3.0  # times its own error that a saving must have to be called one
 
 
 @dataclass(frozen=True)
-class Scene:
+class TimedScene:
     """A daemon to tick: its settings, whether it holds, a subscribed topic, what is altered."""
 
     sections: Sections = field(default_factory=dict)
@@ -50,14 +50,14 @@ TWO, TWO_CONSTANT = (
 )
 STATE_ONLY = "two fingers holding, state subscribed"
 SCENES = {
-    IDLE: Scene(holds=False),
-    ONE_FINGER: Scene(ONE, holds=False),
-    "servos without sensors, idle": Scene(SERVOS_ONLY, holds=False),
-    "sensors without servos, one tip touched": Scene(SENSORS_ONLY, holds=False),
-    TWO: Scene(),
-    TWO_CONSTANT: Scene(CONSTANT),
-    STATE_ONLY: Scene(topic="hand/state"),
-    "two fingers holding, all subscribed": Scene(topic="hand"),
+    IDLE: TimedScene(holds=False),
+    ONE_FINGER: TimedScene(ONE, holds=False),
+    "servos without sensors, idle": TimedScene(SERVOS_ONLY, holds=False),
+    "sensors without servos, one tip touched": TimedScene(SENSORS_ONLY, holds=False),
+    TWO: TimedScene(),
+    TWO_CONSTANT: TimedScene(CONSTANT),
+    STATE_ONLY: TimedScene(topic="hand/state"),
+    "two fingers holding, all subscribed": TimedScene(topic="hand"),
 }
 
 
@@ -113,22 +113,22 @@ def _tabulated(daemon: Daemon) -> None:
 
 
 # A step: the scene that has it, and the same without it.
-STEPS: dict[str, tuple[str, Scene]] = {
-    "no estimate for a frame already seen": (TWO, Scene(alter=_every_tick_estimated)),
-    "no contact, no fit": (IDLE, Scene(holds=False, alter=_always_fitted)),
-    "the fit starts from the last contact": (TWO, Scene(alter=_always_cold)),
-    "no contact, no prediction published": (IDLE, Scene(holds=False, alter=_always_predicted)),
-    "closed form for a constant modulus": (TWO_CONSTANT, Scene(CONSTANT, alter=_tabulated)),
-    "topics without subscribers are not packed": (TWO, Scene(alter=_always_packed)),
+STEPS: dict[str, tuple[str, TimedScene]] = {
+    "no estimate for a frame already seen": (TWO, TimedScene(alter=_every_tick_estimated)),
+    "no contact, no fit": (IDLE, TimedScene(holds=False, alter=_always_fitted)),
+    "the fit starts from the last contact": (TWO, TimedScene(alter=_always_cold)),
+    "no contact, no prediction published": (IDLE, TimedScene(holds=False, alter=_always_predicted)),
+    "closed form for a constant modulus": (TWO_CONSTANT, TimedScene(CONSTANT, alter=_tabulated)),
+    "topics without subscribers are not packed": (TWO, TimedScene(alter=_always_packed)),
     "state published at 100 Hz, not each tick": (
         STATE_ONLY,
-        Scene({"stream": {"state_rate": 500.0}}, topic="hand/state"),
+        TimedScene({"stream": {"state_rate": 500.0}}, topic="hand/state"),
     ),
     "an absent finger costs nothing": (ONE_FINGER, SCENES[IDLE]),
 }
 
 
-def measure(brief: bool = False, rounds: int = 1000) -> list[Table]:
+def measure(brief: bool = False, rounds: int = 1000) -> list[Report]:
     """All scenes and steps in turns."""
     scenes = SCENES | {f"without: {name}": scene for name, (_, scene) in STEPS.items()}
     with contextlib.ExitStack() as stack:
@@ -138,10 +138,10 @@ def measure(brief: bool = False, rounds: int = 1000) -> list[Table]:
     savings = []
     for name, (base, _) in STEPS.items():
         savings.append(saving(name, 1e-3 * times[base], 1e-3 * times[f"without: {name}"]))
-    return [Table("mean tick of each scene", costs), Table("skipping step, µs a tick", savings)]
+    return [Report("mean tick of each scene", costs), Report("skipping step, µs a tick", savings)]
 
 
-def _subject(scene: Scene, stack: contextlib.ExitStack) -> Subject:
+def _subject(scene: TimedScene, stack: contextlib.ExitStack) -> Subject:
     topics = [scene.topic] if scene.topic else []
     daemon = stack.enter_context(virtual_daemon(scene.sections, *topics))
     loop, clock = daemon.loop, daemon.clock

@@ -23,7 +23,7 @@ from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.simulation.emulator.control_port import send_words
 from softfinger.daemon.types import Goal, Reading
 from softfinger.tools.benchmarks.framework.interleaved import timed
-from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, Row, figure
 from softfinger.tools.benchmarks.framework.rigs import emulator
 
 TITLE = "read + write of two servos"
@@ -41,7 +41,7 @@ _RATES = (1, 2, 3, 4)  # Mbaud
 _PATIENCE = 0.2  # s for a reply, where its deadline is not what is measured
 
 
-def measure(brief: bool = False) -> list[Table]:
+def measure(brief: bool = False) -> list[Report]:
     """Wall and processor time a cycle, and what a missing reply costs.
 
     With the real-time measures that the daemon takes by default.
@@ -52,7 +52,7 @@ def measure(brief: bool = False) -> list[Table]:
         for baud in _RATES[1:2] if brief else _RATES:
             rows += at_rate(baud, paced)
         rows.append(missing_reply(misses))
-    return [Table(TITLE, rows)]
+    return [Report(TITLE, rows)]
 
 
 def unpaced(turns: int) -> list[Row]:

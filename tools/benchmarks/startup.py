@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import zmq
 
-from softfinger.tools.benchmarks.framework.report import Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, figure
 
 TITLE = "start to the first state"
 PAGE = {TITLE: ("time", "daemon's peak memory")}
@@ -29,7 +29,7 @@ class _Start(NamedTuple):
     worker: float  # MB
 
 
-def measure(brief: bool = False) -> list[Table]:
+def measure(brief: bool = False) -> list[Report]:
     """Seconds to the first ``hand/state`` of the built-in simulated hand, and what it takes."""
     with tempfile.TemporaryDirectory() as name:
         cold = _start(Path(name))
@@ -43,7 +43,7 @@ def measure(brief: bool = False) -> list[Table]:
         figure("a compiling process's peak memory", "MB", [cold.worker]),
         figure("kept on disk", "MB", [kept / 1e6]),
     ]
-    return [Table(TITLE, rows)]
+    return [Report(TITLE, rows)]
 
 
 def _start(folder: Path) -> _Start:

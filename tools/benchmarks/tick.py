@@ -9,7 +9,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.framework.interleaved import timed
-from softfinger.tools.benchmarks.framework.report import Row, Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, Row, figure
 from softfinger.tools.benchmarks.framework.rigs import can, hold, virtual_daemon
 
 TITLE = "tick, back to back"
@@ -21,7 +21,7 @@ _SUBSCRIBERS: dict[tuple[bytes, ...], str] = {
 }
 
 
-def measure(brief: bool = False) -> list[Table]:
+def measure(brief: bool = False) -> list[Report]:
     """Ticks of a hand that holds an object [µs], and a second on virtual time [ms]."""
     ticks, seconds = (2_000, 3) if brief else (20_000, 20)
     rows: list[Row] = []
@@ -35,7 +35,7 @@ def measure(brief: bool = False) -> list[Table]:
             aim = 20.0 if len(topics) < 3 else None
             rows.append(figure(f"pipeline alone, {words}", "µs", _ticks(daemon, ticks), aim))
             rows.append(physics)
-    return [Table(TITLE, rows)]
+    return [Report(TITLE, rows)]
 
 
 def _virtual_seconds(daemon: Daemon, seconds: int) -> Iterator[Row]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.benchmarks.framework.report import Table, figure
+from softfinger.tools.benchmarks.framework.report import Report, figure
 
 TITLE = "wake-up after the deadline, at 1 kHz"
 PAGE = {TITLE: ("",)}
@@ -36,10 +36,10 @@ Samples = NDArray[np.float64]
 Turn = Callable[[float], Samples]
 
 
-def measure(brief: bool = False) -> list[Table]:
+def measure(brief: bool = False) -> list[Report]:
     """All subjects in turns, with the usual scheduling and, where it is allowed, SCHED_FIFO."""
     rounds, seconds = (3, 0.5) if brief else (8, 2.0)
-    return [Table(TITLE, _rows(_taken(rounds, seconds)))]
+    return [Report(TITLE, _rows(_taken(rounds, seconds)))]
 
 
 def _taken(rounds: int, seconds: float) -> dict[str, Samples]:

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from softfinger.tools.paper.model_pages import CIRCLE, ENERGY, MILLI, MODULUS, TIP
-from softfinger.tools.paper.sheets import Curve, Erratum, FloatArray, Page, Panel, Sheet, sheet
+from softfinger.tools.paper.sheets import (
+    DrawnCurve,
+    Erratum,
+    FigurePage,
+    FloatArray,
+    Panel,
+    Sheet,
+    sheet,
+)
 from softfinger.tools.paper.style import GREY, INK, KINDS
 
 if TYPE_CHECKING:
@@ -88,20 +96,20 @@ def _appendix() -> tuple[Sheet, ...]:
     return (sheet("fig11", *columns),)
 
 
-def _section(_: Sheet) -> Iterator[Curve]:
+def _section(_: Sheet) -> Iterator[DrawnCurve]:
     """The tip cut along its axis, pressed to 8 mm."""
     a, h = 1e3 * TIP.radius, 1e3 * TIP.radius - _SHOWN
     angle = np.linspace(0.0, np.pi, 181)
     x, z = a * np.cos(angle), a * np.sin(angle)
-    yield Curve(x, np.minimum(z, h), {"color": INK})
+    yield DrawnCurve(x, np.minimum(z, h), {"color": INK})
     above = z >= h
-    yield Curve(x[above], z[above], {"color": GREY, "linestyle": ":"})
-    yield Curve([-a, a], [0.0, 0.0], {"color": INK})
-    yield Curve([-1.1 * a, 1.1 * a], [h, h], {"color": KINDS[1], "linewidth": 0.9})
+    yield DrawnCurve(x[above], z[above], {"color": GREY, "linestyle": ":"})
+    yield DrawnCurve([-a, a], [0.0, 0.0], {"color": INK})
+    yield DrawnCurve([-1.1 * a, 1.1 * a], [h, h], {"color": KINDS[1], "linewidth": 0.9})
     rim = np.sqrt(a**2 - h**2)
-    yield Curve([0.0, 0.0], [0.0, a], {"color": GREY, "linewidth": 0.7})
-    yield Curve([0.0, rim], [0.0, h], {"color": KINDS[0], "linewidth": 0.9})
-    yield Curve([0.0, 0.55 * rim], [0.0, h], {"color": KINDS[0], "linewidth": 0.9})
+    yield DrawnCurve([0.0, 0.0], [0.0, a], {"color": GREY, "linewidth": 0.7})
+    yield DrawnCurve([0.0, rim], [0.0, h], {"color": KINDS[0], "linewidth": 0.9})
+    yield DrawnCurve([0.0, 0.55 * rim], [0.0, h], {"color": KINDS[0], "linewidth": 0.9})
 
 
 def _names(axes: Axes, _: Sheet) -> None:
@@ -126,20 +134,20 @@ def _names(axes: Axes, _: Sheet) -> None:
     axes.set(aspect="equal", ylim=(-1.5, a + 4.5))
 
 
-def _sums(numbers: Sheet) -> Iterator[Curve]:
+def _sums(numbers: Sheet) -> Iterator[DrawnCurve]:
     d = numbers["d"]
     for name, color, dash in zip(_TERMS, KINDS, ("--", "-.", ":"), strict=False):
         look = {"color": color, "linestyle": dash}
-        yield Curve(d, numbers[f"{name} term as printed"], look, f"{name} term")
+        yield DrawnCurve(d, numbers[f"{name} term as printed"], look, f"{name} term")
         mark = CIRCLE | {"ms": 4, "mec": color}
-        yield Curve(d[9::10], numbers[f"{name} term integrated"][9::10], mark)
-    yield Curve(d, ENERGY.at_zero_tilt(d), {"color": INK}, "sum: πEd³/3, eq. 20")
+        yield DrawnCurve(d[9::10], numbers[f"{name} term integrated"][9::10], mark)
+    yield DrawnCurve(d, ENERGY.at_zero_tilt(d), {"color": INK}, "sum: πEd³/3, eq. 20")
     mark = CIRCLE | {"ms": 4, "mec": INK}
-    yield Curve(d[9::10], numbers["U integrated"][9::10], mark, "by quadrature of eq. 12")
+    yield DrawnCurve(d[9::10], numbers["U integrated"][9::10], mark, "by quadrature of eq. 12")
 
 
 PAGES = {
-    "fig11": Page(
+    "fig11": FigurePage(
         "Fig. 11 and the appendix: U(d, 0) = πEd³/3 from eq. 12's three terms",
         (7.4, 4.0),
         _appendix,

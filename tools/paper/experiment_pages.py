@@ -17,7 +17,15 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.paper.model_pages import CIRCLE, DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
-from softfinger.tools.paper.sheets import Curve, Erratum, FloatArray, Page, Panel, Sheet, sheet
+from softfinger.tools.paper.sheets import (
+    DrawnCurve,
+    Erratum,
+    FigurePage,
+    FloatArray,
+    Panel,
+    Sheet,
+    sheet,
+)
 from softfinger.tools.paper.style import GREY, INK, KINDS, ordered
 
 if TYPE_CHECKING:
@@ -59,18 +67,18 @@ def compression() -> tuple[Sheet, ...]:
     return (sheet("fig7", *columns),)
 
 
-def _one_tilt(tilt: int, numbers: Sheet) -> Iterator[Curve]:
+def _one_tilt(tilt: int, numbers: Sheet) -> Iterator[DrawnCurve]:
     d = numbers["d"]
-    yield Curve(d, numbers[f"F at {tilt} deg"], {"color": KINDS[0]}, "E = 0.304 MPa")
+    yield DrawnCurve(d, numbers[f"F at {tilt} deg"], {"color": KINDS[0]}, "E = 0.304 MPa")
     sensed = numbers[f"F through the sensor at {tilt} deg"]
-    yield Curve(d[::8], sensed[::8], CIRCLE | {"ms": 4, "mec": INK}, "through 44 × 44 cells")
+    yield DrawnCurve(d[::8], sensed[::8], CIRCLE | {"ms": 4, "mec": INK}, "through 44 × 44 cells")
     law = numbers[f"F of Table I's law at {tilt} deg"]
-    yield Curve(d, law, {"linestyle": "--", "color": KINDS[1]}, "Table I's law")
+    yield DrawnCurve(d, law, {"linestyle": "--", "color": KINDS[1]}, "Table I's law")
 
 
-def _all_tilts(numbers: Sheet) -> Iterator[Curve]:
+def _all_tilts(numbers: Sheet) -> Iterator[DrawnCurve]:
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
-        yield Curve(numbers["d"], numbers[f"F at {tilt} deg"], style, end=f"{tilt}°")
+        yield DrawnCurve(numbers["d"], numbers[f"F at {tilt} deg"], style, end=f"{tilt}°")
 
 
 def _compression_panels() -> Iterator[Panel]:
@@ -118,29 +126,29 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
     return sheet("fig10a", *first), sheet("fig10b", *second)
 
 
-def _rotation(rotation: Sheet, _: Sheet) -> Iterator[Curve]:
+def _rotation(rotation: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
     thin = {"color": GREY, "linewidth": 0.7}
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
-        yield Curve(rotation["theta"], rotation[f"F, d up to {d} mm"], style, end=f"to {d} mm")
-        yield Curve(rotation["theta"], rotation[f"F at d = {d} mm"], thin)
-    yield Curve([], [], {"color": INK}, "d rises from first touch")
-    yield Curve([], [], thin, "d held at its last value")
+        yield DrawnCurve(rotation["theta"], rotation[f"F, d up to {d} mm"], style, end=f"to {d} mm")
+        yield DrawnCurve(rotation["theta"], rotation[f"F at d = {d} mm"], thin)
+    yield DrawnCurve([], [], {"color": INK}, "d rises from first touch")
+    yield DrawnCurve([], [], thin, "d held at its last value")
 
 
-def _rolling(_: Sheet, rolling: Sheet) -> Iterator[Curve]:
+def _rolling(_: Sheet, rolling: Sheet) -> Iterator[DrawnCurve]:
     theta = rolling["theta"]
-    yield Curve(
+    yield DrawnCurve(
         theta, rolling["F/F(0) at d = 4 mm"], {"color": INK}, "constant E, every d: 1/cos θ"
     )
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         if d in (DEPTHS[0], DEPTHS[-1]):
             law = rolling[f"F/F(0) of Table I's law at d = {d} mm"]
-            yield Curve(theta, law, style | {"linewidth": 1.1}, f"Table I's law, d = {d} mm")
+            yield DrawnCurve(theta, law, style | {"linewidth": 1.1}, f"Table I's law, d = {d} mm")
     radial = rolling["F of radial springs at d = 4 mm"]
     dotted = {"color": KINDS[1], "linestyle": ":"}
-    yield Curve(theta, radial / radial[theta == 0.0], dotted, "radial springs: flat")
+    yield DrawnCurve(theta, radial / radial[theta == 0.0], dotted, "radial springs: flat")
     least = {"marker": "v", "ms": 7, "color": INK, "linestyle": "none"}
-    yield Curve(0.0, 1.0, least, "minimum at 0°")
+    yield DrawnCurve(0.0, 1.0, least, "minimum at 0°")
 
 
 def _path(axes: Axes, _: Sheet, rolling: Sheet) -> None:
@@ -162,7 +170,7 @@ def _path(axes: Axes, _: Sheet, rolling: Sheet) -> None:
 
 
 PAGES = {
-    "fig7": Page(
+    "fig7": FigurePage(
         "Fig. 7: translational contact, force over the displacement at each angle",
         (7.6, 5.2),
         compression,
@@ -183,7 +191,7 @@ PAGES = {
             "The paper's measured points, off by a near-constant amount, are not reproduced.",
         ),
     ),
-    "fig10": Page(
+    "fig10": FigurePage(
         "Fig. 10: rotational and rolling contact",
         (7.6, 4.3),
         tilt_and_roll,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from softfinger.tools.paper.sheets import Page
+    from softfinger.tools.paper.sheets import FigurePage
 
 NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def pages() -> dict[str, Page]:
+def pages() -> dict[str, FigurePage]:
     """All figures by name."""
     from softfinger.tools.paper import appendix, experiment_pages, model_pages, run_pages
 
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def write(chosen: dict[str, Page], folder: Path) -> None:
+def write(chosen: dict[str, FigurePage], folder: Path) -> None:
     """Write these pages into ``folder`` and print each file's path. Raises OSError."""
     from softfinger.tools.extras import MissingExtra
     from softfinger.tools.paper import style

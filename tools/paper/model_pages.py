@@ -22,10 +22,10 @@ from softfinger.kinematics.contact.material import (
 )
 from softfinger.tools.paper.integrals import double_integrals
 from softfinger.tools.paper.sheets import (
-    Curve,
+    DrawnCurve,
     Erratum,
+    FigurePage,
     FloatArray,
-    Page,
     Panel,
     Sheet,
     sheet,
@@ -77,17 +77,17 @@ def law() -> tuple[Sheet, ...]:
     return curve, table
 
 
-def _stress(curve: Sheet, _: Sheet) -> Iterator[Curve]:
+def _stress(curve: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
     blue, orange = {"color": KINDS[0]}, {"color": KINDS[1], "linestyle": "--"}
-    yield Curve(curve["strain"], curve["stress"], blue, "law through Table I")
+    yield DrawnCurve(curve["strain"], curve["stress"], blue, "law through Table I")
     constant = curve["stress at constant 0.304 MPa"]
-    yield Curve(curve["strain"], constant, orange, "constant modulus, 0.304 MPa")
+    yield DrawnCurve(curve["strain"], constant, orange, "constant modulus, 0.304 MPa")
 
 
-def _slope(curve: Sheet, table: Sheet) -> Iterator[Curve]:
-    yield Curve(curve["strain"], curve["modulus"], {"color": KINDS[0]}, "slope of the law")
+def _slope(curve: Sheet, table: Sheet) -> Iterator[DrawnCurve]:
+    yield DrawnCurve(curve["strain"], curve["modulus"], {"color": KINDS[0]}, "slope of the law")
     look = {"marker": "o", "linestyle": "none", "color": "white", "mec": KINDS[0], "mew": 1.4}
-    yield Curve(table["strain"], table["modulus in the paper"], look, "Table I")
+    yield DrawnCurve(table["strain"], table["modulus in the paper"], look, "Table I")
 
 
 def _entries(axes: Axes, curve: Sheet, table: Sheet) -> None:
@@ -111,7 +111,7 @@ def _entries(axes: Axes, curve: Sheet, table: Sheet) -> None:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Plotted:
     """Force or energy, as the figures name it."""
 
     symbol: str
@@ -156,13 +156,13 @@ class Quantity:
         ]
 
 
-FORCE = Quantity("F", "total elastic force", "N", 1.0, 0, 2, 3, "πEd²", "1/cos θ", np.pi)
-ENERGY = Quantity(
+FORCE = Plotted("F", "total elastic force", "N", 1.0, 0, 2, 3, "πEd²", "1/cos θ", np.pi)
+ENERGY = Plotted(
     "U", "elastic potential energy", "mJ", 1e3, 1, 3, 10, "πEd³/3", "1/cos² θ", np.pi / 3
 )
 
 
-def over_tilt(name: str, quantity: Quantity) -> tuple[Sheet, ...]:
+def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     """Over θ from −25° to 25° at each displacement."""
     theta = np.arange(-50, 51) / 2.0
     columns: list[tuple[str, str, FloatArray]] = [("theta", "deg", theta)]
@@ -171,7 +171,7 @@ def over_tilt(name: str, quantity: Quantity) -> tuple[Sheet, ...]:
     return (sheet(name, *columns),)
 
 
-def over_depth(name: str, quantity: Quantity) -> tuple[Sheet, ...]:
+def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     """Over d up to 8 mm at each tilt, with the factor to the power at θ = 0; and the exponents.
 
     Factor and exponent come from the double integral, so that they owe the closed form nothing.
@@ -194,37 +194,37 @@ def over_depth(name: str, quantity: Quantity) -> tuple[Sheet, ...]:
     return sheet(name, *columns), summary(f"{name}_exponents", heads, rows)
 
 
-def _key(quantity: Quantity) -> Iterator[Curve]:
-    yield Curve([], [], {"color": INK}, "closed form")
-    yield Curve([], [], CIRCLE | {"ms": 4, "mec": INK}, f"eq. {quantity.equation}")
+def _key(quantity: Plotted) -> Iterator[DrawnCurve]:
+    yield DrawnCurve([], [], {"color": INK}, "closed form")
+    yield DrawnCurve([], [], CIRCLE | {"ms": 4, "mec": INK}, f"eq. {quantity.equation}")
 
 
-def _tilt_curves(quantity: Quantity, numbers: Sheet) -> Iterator[Curve]:
+def _tilt_curves(quantity: Plotted, numbers: Sheet) -> Iterator[DrawnCurve]:
     theta = numbers["theta"]
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         closed = numbers[f"{quantity.symbol} at d = {d} mm"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at d = {d} mm"]
-        yield Curve(theta, closed, style, end=f"d = {d} mm")
+        yield DrawnCurve(theta, closed, style, end=f"d = {d} mm")
         look = CIRCLE | {"ms": 4, "mec": style["color"], "clip_on": False}
-        yield Curve(theta[::10], integral[::10], look)
+        yield DrawnCurve(theta[::10], integral[::10], look)
         least = {"marker": "v", "ms": 6, "color": style["color"]}
-        yield Curve(0.0, closed[theta == 0.0], least)
+        yield DrawnCurve(0.0, closed[theta == 0.0], least)
     yield from _key(quantity)
     look = {"marker": "v", "ms": 6, "color": INK, "linestyle": "none"}
-    yield Curve([], [], look, "minimum")
+    yield DrawnCurve([], [], look, "minimum")
 
 
-def _depth_curves(quantity: Quantity, numbers: Sheet, _: Sheet) -> Iterator[Curve]:
+def _depth_curves(quantity: Plotted, numbers: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
     d = numbers["d"]
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at {tilt} deg"]
-        yield Curve(d, numbers[f"{quantity.symbol} at {tilt} deg"], style, end=f"{tilt}°")
+        yield DrawnCurve(d, numbers[f"{quantity.symbol} at {tilt} deg"], style, end=f"{tilt}°")
         look = CIRCLE | {"ms": 3.5, "mec": style["color"], "clip_on": False}
-        yield Curve(d[10::10], integral[10::10], look)
+        yield DrawnCurve(d[10::10], integral[10::10], look)
     yield from _key(quantity)
 
 
-def _straight(quantity: Quantity, axes: Axes, numbers: Sheet, _: Sheet) -> None:
+def _straight(quantity: Plotted, axes: Axes, numbers: Sheet, _: Sheet) -> None:
     axes.annotate(
         f"continuous line:\n{quantity.symbol}(d, 0) = {quantity.power}",
         (6.0, float(numbers[f"{quantity.symbol} at 0 deg"][60])),
@@ -235,19 +235,19 @@ def _straight(quantity: Quantity, axes: Axes, numbers: Sheet, _: Sheet) -> None:
     )
 
 
-def _factors(numbers: Sheet, _: Sheet) -> Iterator[Curve]:
+def _factors(numbers: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
         factor = numbers[f"factor at {tilt} deg"]
-        yield Curve(numbers["d"][1:], factor[1:], style, end=f"{tilt}°: {factor[-1]:.3f}")
+        yield DrawnCurve(numbers["d"][1:], factor[1:], style, end=f"{tilt}°: {factor[-1]:.3f}")
 
 
-def _fitted(quantity: Quantity, axes: Axes, _: Sheet, exponents: Sheet) -> None:
+def _fitted(quantity: Plotted, axes: Axes, _: Sheet, exponents: Sheet) -> None:
     off = np.max(np.abs(exponents["fitted exponent of d"] - quantity.exponent))
     text = f"exponents fitted to the integrals:\n{quantity.exponent} ± {off:.0e}"
     axes.text(0.03, 0.94, text, transform=axes.transAxes, va="top", fontsize=7.5)
 
 
-def _tilt_page(name: str, title: str, height: float, quantity: Quantity, **more: Any) -> Page:
+def _tilt_page(name: str, title: str, height: float, quantity: Plotted, **more: Any) -> FigurePage:
     panel = Panel(
         partial(_tilt_curves, quantity),
         "θ [deg]",
@@ -255,10 +255,10 @@ def _tilt_page(name: str, title: str, height: float, quantity: Quantity, **more:
         more={"xlim": (-25, 25), "ylim": (0, 1.16 * quantity.most(25.0))},
         legend={"loc": "upper center", "ncols": 3},
     )
-    return Page(title, (5.2, height), partial(over_tilt, name, quantity), (panel,), **more)
+    return FigurePage(title, (5.2, height), partial(over_tilt, name, quantity), (panel,), **more)
 
 
-def _depth_page(name: str, title: str, quantity: Quantity, **more: Any) -> Page:
+def _depth_page(name: str, title: str, quantity: Plotted, **more: Any) -> FigurePage:
     left = Panel(
         partial(_depth_curves, quantity),
         "displacement d [mm]",
@@ -277,7 +277,7 @@ def _depth_page(name: str, title: str, quantity: Quantity, **more: Any) -> Page:
     )
     sheets = partial(over_depth, name, quantity)
     layout = {"width_ratios": (1.15, 1.0)}
-    return Page(title, (7.4, 4.1), sheets, (left, right), layout=layout, **more)
+    return FigurePage(title, (7.4, 4.1), sheets, (left, right), layout=layout, **more)
 
 
 _CLOSED = Erratum(
@@ -289,7 +289,7 @@ _CLOSED = Erratum(
 _TIP = "Tip of radius 20 mm, E = 0.304 MPa, as in the paper."
 
 PAGES = {
-    "fig3": Page(
+    "fig3": FigurePage(
         "Fig. 3 and Table I: stress-strain law of the tip's material",
         (7.0, 3.6),
         law,

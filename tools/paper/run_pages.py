@@ -10,8 +10,16 @@ import numpy as np
 
 from softfinger.tools.paper import runs
 from softfinger.tools.paper.model_pages import CIRCLE, DEPTHS, MILLI, TILTS
-from softfinger.tools.paper.runs import Run
-from softfinger.tools.paper.sheets import Curve, FloatArray, Page, Panel, Sheet, sheet, summary
+from softfinger.tools.paper.runs import SimulatedRun
+from softfinger.tools.paper.sheets import (
+    DrawnCurve,
+    FigurePage,
+    FloatArray,
+    Panel,
+    Sheet,
+    sheet,
+    summary,
+)
 from softfinger.tools.paper.style import GREY, INK, KINDS, label_ends, ordered
 
 if TYPE_CHECKING:
@@ -25,7 +33,9 @@ _PATH = {"xlim": (-12.5, 10.5)}
 _ANGLE = "relative angle θ [deg]"
 
 
-def _columns(run: Run, suffix: str, sign: float = 1.0) -> list[tuple[str, str, FloatArray]]:
+def _columns(
+    run: SimulatedRun, suffix: str, sign: float = 1.0
+) -> list[tuple[str, str, FloatArray]]:
     """A run's columns in the figures' units; ``sign`` is that of the paper's angle."""
     return [
         (f"d{suffix}", "mm", 1e3 * run.d),
@@ -76,12 +86,12 @@ def compression() -> tuple[Sheet, ...]:
     return (*sheets, summary("fig7_run_errors", heads, rows))
 
 
-def _forces(*sheets: Sheet) -> Iterator[Curve]:
+def _forces(*sheets: Sheet) -> Iterator[DrawnCurve]:
     for style, run in zip(ordered(len(TILTS)), sheets, strict=False):
-        yield Curve(run["d"], run["F"], style)
-        yield Curve(run["d estimated"][::6], run["F estimated"][::6], _DOT)
-    yield Curve([], [], {"color": INK}, "model")
-    yield Curve([], [], CIRCLE | {"ms": 3, "mec": INK}, "estimated from the frames")
+        yield DrawnCurve(run["d"], run["F"], style)
+        yield DrawnCurve(run["d estimated"][::6], run["F estimated"][::6], _DOT)
+    yield DrawnCurve([], [], {"color": INK}, "model")
+    yield DrawnCurve([], [], CIRCLE | {"ms": 3, "mec": INK}, "estimated from the frames")
 
 
 def _angles(axes: Axes, *_: Sheet) -> None:
@@ -89,7 +99,7 @@ def _angles(axes: Axes, *_: Sheet) -> None:
     label_ends(axes, 8.0, ends, [f"{tilt}°" for tilt in TILTS], gap=0.07)
 
 
-def _errors(symbol: str, *sheets: Sheet) -> Iterator[Curve]:
+def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
     """Of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
     for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
         deep = run["d"] > _SURE
@@ -98,7 +108,7 @@ def _errors(symbol: str, *sheets: Sheet) -> Iterator[Curve]:
             off = 100.0 * (found / truth - 1.0)
         else:
             off = (found - truth) * (1e3 if symbol == "d" else 1.0)
-        yield Curve(run["d"][deep], off, style | {"linewidth": 0.9}, f"{tilt}°")
+        yield DrawnCurve(run["d"][deep], off, style | {"linewidth": 0.9}, f"{tilt}°")
 
 
 def _zero(axes: Axes, *_: Sheet) -> None:
@@ -158,24 +168,24 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
     return float(-0.5 * b / a), float(np.sqrt(slope @ covariance @ slope))
 
 
-def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[Curve]:
+def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
     """Along the path: the rotation, then the rolling at 4 mm."""
     for part, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),
     ):
-        yield Curve(part[f"theta{at}"], part[f"{symbol}{at}"], {"color": color}, name)
+        yield DrawnCurve(part[f"theta{at}"], part[f"{symbol}{at}"], {"color": color}, name)
         theta, found = part[f"theta estimated{at}"], part[f"{symbol} estimated{at}"]
-        yield Curve(theta[::4], found[::4], _DOT, "estimated" if at else "")
+        yield DrawnCurve(theta[::4], found[::4], _DOT, "estimated" if at else "")
 
 
-def _over_upright(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[Curve]:
+def _over_upright(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[DrawnCurve]:
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
         found = rolling[f"U estimated at {depth} mm"]
-        yield Curve(theta, found / level, style | {"linewidth": 0.9})
-        yield Curve(theta, model / level, {"color": GREY, "linewidth": 0.7})
+        yield DrawnCurve(theta, found / level, style | {"linewidth": 0.9})
+        yield DrawnCurve(theta, model / level, {"color": GREY, "linewidth": 0.7})
 
 
 def _least(axes: Axes, _: Sheet, rolling: Sheet, least: Sheet) -> None:
@@ -192,15 +202,15 @@ def _least(axes: Axes, _: Sheet, rolling: Sheet, least: Sheet) -> None:
     inset.tick_params(labelsize=7, pad=1)
 
 
-def _angle_errors(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[Curve]:
+def _angle_errors(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[DrawnCurve]:
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         theta = rolling[f"theta at {depth} mm"]
         off = rolling[f"theta estimated at {depth} mm"] - theta
-        yield Curve(theta, off, style | {"linewidth": 0.9}, f"d = {depth} mm")
+        yield DrawnCurve(theta, off, style | {"linewidth": 0.9}, f"d = {depth} mm")
 
 
 PAGES = {
-    "fig7_run": Page(
+    "fig7_run": FigurePage(
         "Fig. 7 run in simulation: compression to 8 mm, through sensor and estimator",
         (7.6, 6.2),
         compression,
@@ -226,7 +236,7 @@ PAGES = {
             "offset, which comes from the material, does not appear.",
         ),
     ),
-    "fig10_run": Page(
+    "fig10_run": FigurePage(
         "Figs. 8 to 10 run in simulation: the finger rotates 11.5°, the object rolls 20.7°",
         (7.6, 6.2),
         tilt_and_roll,

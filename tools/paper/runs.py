@@ -41,7 +41,7 @@ _LATE = 2  # frames that are on their way
 
 
 @dataclass(frozen=True)
-class Run:
+class SimulatedRun:
     """One row a frame: truth and estimate of d [m], θ [rad], force [N] and energy [J]."""
 
     d: FloatArray
@@ -54,7 +54,7 @@ class Run:
     energy_found: FloatArray
 
 
-def compression(tilt: float) -> Run:
+def compression(tilt: float) -> SimulatedRun:
     """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
     x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
     sections: Sections = {
@@ -70,7 +70,7 @@ def compression(tilt: float) -> Run:
         return _collect(_frames(daemon, round(seconds / SCAN)), daemon)
 
 
-def rotation() -> Run:
+def rotation() -> SimulatedRun:
     """Turn the finger by 11.5° about its root against a fixed object, from first touch on.
 
     The root is so far that d is 4 mm at the end. The servo moves the joint; d and θ are
@@ -102,7 +102,7 @@ def rotation() -> Run:
         return _collect(iter(rows), daemon)
 
 
-def rolling(d: float) -> Run:
+def rolling(d: float) -> SimulatedRun:
     """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held."""
     sections: Sections = {
         "servos": {"backend": "none"},
@@ -160,13 +160,13 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
     return contact.d, contact.theta, contact.force, contact.energy
 
 
-def _collect(rows: Iterator[Row], daemon: Daemon) -> Run:
+def _collect(rows: Iterator[Row], daemon: Daemon) -> SimulatedRun:
     found = list(rows)
     truth = np.array([each for each, _ in found])
     estimates = np.array([each for _, each in found])
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)
-    return Run(d, theta, contact.force, contact.energy, *estimates.T)
+    return SimulatedRun(d, theta, contact.force, contact.energy, *estimates.T)
 
 
 def _roll(hand: SimulatedHand, d: float, angle: float) -> None:

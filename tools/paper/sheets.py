@@ -76,7 +76,7 @@ class Erratum:
 
 
 @dataclass(frozen=True)
-class Curve:
+class DrawnCurve:
     """A line or a row of markers; ``end`` is written beside its last point."""
 
     x: ArrayLike
@@ -90,7 +90,7 @@ class Curve:
 class Panel:
     """Axes of a figure: the curves by the page's sheets, and the words around them."""
 
-    curves: Callable[..., Iterable[Curve]]
+    curves: Callable[..., Iterable[DrawnCurve]]
     xlabel: str
     ylabel: str
     title: str = ""
@@ -117,7 +117,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Page:
+class FigurePage:
     """One figure: its numbers, its panels, and what in the paper's version is mistaken."""
 
     title: str
@@ -140,7 +140,7 @@ class Page:
         caption(figure, [*lines, *self.notes])
 
 
-def errata_sheet(pages: dict[str, Page]) -> Sheet:
+def errata_sheet(pages: dict[str, FigurePage]) -> Sheet:
     """The errata of these pages, one a row."""
     rows = [(name, each) for name, page in pages.items() for each in page.errata]
     return sheet(

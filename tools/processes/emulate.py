@@ -141,19 +141,20 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     hold_collector()
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
+        EmulatedServos,
         Emulator,
         EmulatorError,
-        ServoLine,
         with_board,
     )
     from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
 
     build_kernels(with_board(settings), print_event, EMULATED)
+    servos = EmulatedServos(arguments.baud, arguments.latency, arguments.factory, arguments.ids)
     try:
         emulator = Emulator(
             settings,
             arguments.dir,
-            line=ServoLine(arguments.baud, arguments.latency, arguments.factory, arguments.ids),
+            line=servos,
             faults=arguments.fault,
             table_cache=table_cache(),
             undisturbed=signals.held,

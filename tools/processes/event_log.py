@@ -56,7 +56,7 @@ class EventLog:
 
     def take_over_logging(self) -> None:
         """Take all modules' warnings and errors from Python's logging."""
-        handler = _Handler(self)
+        handler = _LogHandler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
 
@@ -86,7 +86,7 @@ class EventLog:
         return f"{level:7} {kind:8} {text}" if kind else text
 
 
-class _Handler(logging.Handler):
+class _LogHandler(logging.Handler):
     """Python's logging into an event log."""
 
     def __init__(self, log: EventLog) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from softfinger.daemon.loop.warm_up import Part, Scene, is_built, mark_built, named, parts
+from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.kernel_cache import kernel_folder, user_cache
 from softfinger.tools.terminal.progress import Progress
@@ -265,7 +265,7 @@ def main() -> None:
         return
     settings = Settings.model_validate_json(head)
     cache = sys.stdin.readline().rstrip("\n")
-    scene = Scene(settings, Path(cache) if cache else None)
+    scene = WantedScene(settings, Path(cache) if cache else None)
     for line in sys.stdin:
         part = named(line.rstrip("\n"))
         try:

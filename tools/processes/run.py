@@ -13,7 +13,7 @@ from typing import Any
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.sd_notify import Service
-from softfinger.daemon.profile.settings import Settings, Task
+from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.tools.arguments import add_profile, profile, seconds
 from softfinger.tools.ending import Interrupted, Signals
 from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     settings = profile(arguments)
     if arguments.no_task:
-        settings = settings.model_copy(update={"task": Task()})
+        settings = settings.model_copy(update={"task": TaskSettings()})
     signals = Signals()
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is something to stop
     try:

@@ -13,7 +13,7 @@ from softfinger.daemon.errors import AddressError, RecordingError
 from softfinger.daemon.gateway.config import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.own_files import write_text
-from softfinger.daemon.profile.settings import Settings, Stream
+from softfinger.daemon.profile.settings import Settings, StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``replay``."""
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
-    parser.add_argument("--address", default=Stream().address, help="where to publish")
+    parser.add_argument("--address", default=StreamSettings().address, help="where to publish")
     parser.add_argument(
         "--keys",
         type=Path,

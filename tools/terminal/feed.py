@@ -88,7 +88,7 @@ class ShownFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class ShownEvent:
     """One line of hand/event."""
 
     timestamp: float  # Unix s, NaN when unknown
@@ -105,7 +105,7 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class TickStatistics:
+class RecentTicks:
     """Medians and worst values over the last second; NaN when unknown."""
 
     messages: float = math.nan  # states a second
@@ -143,8 +143,8 @@ class Feed:
         self.state: dict[str, Any] | None = None
         self.state_at = -math.inf
         self.frames: dict[str, ShownFrame] = {}
-        self.events: list[Event] = []
-        self._news: deque[Event] = deque(maxlen=EVENTS)
+        self.events: list[ShownEvent] = []
+        self._news: deque[ShownEvent] = deque(maxlen=EVENTS)
         self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
         self.times: LoopTimes | None = None
         self.warm = math.inf  # °C from which a servo's temperature is warned about
@@ -238,7 +238,7 @@ class Feed:
             return
         self._heard.append(name)
         self._happened(
-            Event(
+            ShownEvent(
                 number(record, "timestamp"),
                 text(record, "level"),
                 text(record, "kind"),
@@ -246,7 +246,7 @@ class Feed:
             )
         )
 
-    def _happened(self, event: Event) -> None:
+    def _happened(self, event: ShownEvent) -> None:
         self._news.append(event)
         if math.isnan(event.timestamp):
             self.events.append(event)
@@ -270,7 +270,7 @@ class Feed:
             why = text(record, "error")
             by = f" (to {client})" if client else ""
             when = number(record, "timestamp")
-            self._happened(Event(when, "warning", "refused", f"{why}{by}"))
+            self._happened(ShownEvent(when, "warning", "refused", f"{why}{by}"))
             return
         if name == "grasp":
             force = number(json.loads(text(record, "request") or "{}"), "force")
@@ -287,7 +287,7 @@ class Feed:
         self.force_most = math.inf if math.isnan(most) else GRIP_SHARE * most
         self.warm = math.inf if math.isnan(warm) else warm
 
-    def news(self) -> list[Event]:
+    def news(self) -> list[ShownEvent]:
         """The events that have come since the last call."""
         fresh = list(self._news)
         self._news.clear()
@@ -318,15 +318,15 @@ class Feed:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
 
-    def statistics(self, now: float) -> TickStatistics:
+    def statistics(self, now: float) -> RecentTicks:
         """Statistics of the last second's states."""
         while self._ticks and self._ticks[0][0] < now - WINDOW:
             self._ticks.popleft()
         if not self._ticks:
-            return TickStatistics()
+            return RecentTicks()
         _, tick, compute, late = zip(*self._ticks, strict=True)
         period = _median(tick)
-        return TickStatistics(
+        return RecentTicks(
             messages=len(self._ticks) / WINDOW,
             rate=1.0 / period if period > 0.0 else math.nan,
             compute=_median(compute),

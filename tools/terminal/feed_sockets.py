@@ -1,6 +1,6 @@
 """The sockets of one who looks at the hand and commands it, without waiting.
 
-`Subscriber` takes the stream into a feed, `Commander` sends what a person asks for.
+`FeedSubscriber` takes the stream into a feed, `Commander` sends what a person asks for.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the pa
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
-class Subscriber:
+class FeedSubscriber:
     """The stream's socket: everything that waits is taken into a feed."""
 
     def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
@@ -38,7 +38,7 @@ class Subscriber:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class ShownReply:
     """What came of a command, for the page."""
 
     at: float
@@ -71,12 +71,12 @@ class Commander:
         self._address = address
         self._envelope = {"client": client} if client else {}
         self._pending: list[_Pending] = []
-        self.reply: Reply | None = None
+        self.reply: ShownReply | None = None
 
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
         """Send ``command`` with ``fields``; the reply is shown under ``label``."""
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
-            self.reply = Reply(now, False, f"{label}: dropped, the daemon doesn't answer")
+            self.reply = ShownReply(now, False, f"{label}: dropped, the daemon doesn't answer")
             return
         if command == "stop":
             stopped = stop_locally(self._address, LOCALLY)
@@ -92,7 +92,7 @@ class Commander:
 
     def refuse(self, now: float, why: str) -> None:
         """Say that a key was not turned into a command."""
-        self.reply = Reply(now, False, why)
+        self.reply = ShownReply(now, False, why)
 
     def collect(self, now: float) -> None:
         """Take the replies that came, give up on those that are overdue."""
@@ -106,7 +106,7 @@ class Commander:
                     each.warned = True
                     so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
                     late = f"{each.label}: no answer from {self._address} {so_far}"
-                    self.reply = Reply(now, False, late)
+                    self.reply = ShownReply(now, False, late)
                 if not overdue:
                     waiting.append(each)
                     continue
@@ -115,7 +115,7 @@ class Commander:
             each.socket.close()
         self._pending = waiting
 
-    def _read(self, now: float, label: str, payload: bytes) -> Reply:
+    def _read(self, now: float, label: str, payload: bytes) -> ShownReply:
         try:
             record = msgpack.unpackb(payload)
         except (ValueError, RecursionError, msgpack.UnpackException):
@@ -123,14 +123,14 @@ class Commander:
         return self._judge(now, label, record)
 
     @staticmethod
-    def _judge(now: float, label: str, record: Any) -> Reply:
+    def _judge(now: float, label: str, record: Any) -> ShownReply:
         if field(record, "ok") is True:
             if text(record, "torque_off") == "unconfirmed":
-                return Reply(now, False, f"{label}: {UNCONFIRMED}")
-            return Reply(now, True, f"{label}: ok")
+                return ShownReply(now, False, f"{label}: {UNCONFIRMED}")
+            return ShownReply(now, True, f"{label}: ok")
         why = text(record, "error") or "an answer that can't be read"
         named = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
-        return Reply(now, False, why if named else f"{label}: {why}")
+        return ShownReply(now, False, why if named else f"{label}: {why}")
 
     def close(self) -> None:
         """Close what is open; commands that were not taken yet are dropped."""

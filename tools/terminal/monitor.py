@@ -32,10 +32,10 @@ from softfinger.tools.arguments import (
     to_stderr,
 )
 from softfinger.tools.terminal.feed import Feed, number, text
-from softfinger.tools.terminal.feed_sockets import Commander, Subscriber
+from softfinger.tools.terminal.feed_sockets import Commander, FeedSubscriber
 from softfinger.tools.terminal.monitor_keys import HandKeys
-from softfinger.tools.terminal.monitor_page import Page
-from softfinger.tools.terminal.terminal import Keys, Terminal, TerminalGone
+from softfinger.tools.terminal.monitor_page import MonitorPage
+from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
 REDRAW = 1.0 / 15.0  # s between redraws at most
 PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
@@ -79,11 +79,11 @@ def run(args: argparse.Namespace) -> int:
     try:
         if keys is not None:
             keys.guard(context)
-        subscriber = Subscriber(context, state, feed)
+        subscriber = FeedSubscriber(context, state, feed)
         commander = Commander(context, commands, args.client)
         with _Ending(args) as ending:
             if _is_page(args):
-                page = Page(feed, state, guarded=keys is not None)
+                page = MonitorPage(feed, state, guarded=keys is not None)
                 _run_page(page, subscriber, commander, ending)
             else:
                 _run_plain(state, subscriber, ending)
@@ -183,7 +183,9 @@ class _Ending:
         self.over = bool(self.why)
 
 
-def _run_page(page: Page, subscriber: Subscriber, commander: Commander, ending: _Ending) -> None:
+def _run_page(
+    page: MonitorPage, subscriber: FeedSubscriber, commander: Commander, ending: _Ending
+) -> None:
     keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
     page.keys = keyboard is not None
     terminal = Terminal(sys.stdout.fileno(), keyboard, suspendable=not ending.beside)
@@ -201,14 +203,14 @@ def _run_page(page: Page, subscriber: Subscriber, commander: Commander, ending: 
 
 
 def _page_loop(
-    page: Page,
+    page: MonitorPage,
     terminal: Terminal,
     keyboard: int | None,
-    subscriber: Subscriber,
+    subscriber: FeedSubscriber,
     commander: Commander,
     ending: _Ending,
 ) -> None:
-    keys = Keys()
+    keys = KeyDecoder()
     hand = HandKeys(page.feed, commander)
     due = time.monotonic()
     while not (ending.over or ending.suspend):
@@ -241,7 +243,7 @@ def _read(keyboard: int) -> bytes:
         return b""
 
 
-def _run_plain(address: str, subscriber: Subscriber, ending: _Ending) -> None:
+def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> None:
     feed = subscriber.feed
     with contextlib.suppress(BrokenPipeError):
         said_status, due = "live", 0.0

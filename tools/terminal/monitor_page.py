@@ -16,9 +16,9 @@ from rich.style import Style
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, TickStatistics, number, text
+from softfinger.tools.terminal.feed import Feed, RecentTicks, number, text
 from softfinger.tools.terminal.feed import field as value_at
-from softfinger.tools.terminal.feed_sockets import Reply
+from softfinger.tools.terminal.feed_sockets import ShownReply
 from softfinger.tools.terminal.monitor_keys import key_line
 from softfinger.tools.terminal.typeset import (
     DIM,
@@ -80,7 +80,7 @@ _ROWS = (
 
 
 @dataclass
-class Page:
+class MonitorPage:
     """The page of a feed. ``now`` is monotonic seconds."""
 
     feed: Feed
@@ -95,10 +95,10 @@ class Page:
     _force: heatmap.FullScale = field(
         default_factory=lambda: heatmap.FullScale(least=1.0, patience=0.0)
     )
-    _statistics: TickStatistics = field(default_factory=TickStatistics)
+    _statistics: RecentTicks = field(default_factory=RecentTicks)
     _statistics_at: float = -math.inf
 
-    def lines(self, width: int, height: int, now: float, reply: Reply | None) -> list[Line]:
+    def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Line]:
         """The page as ``height`` lines of exactly ``width`` columns."""
         if width < WIDTH or height < HEIGHT:
             return _too_small(width, height)
@@ -340,7 +340,7 @@ class Page:
         named = [*slim[:3], Segment(f"  p50/{'/'.join(words[1:])}", DIM), *slim[3:]]
         return next((line for line in (full, named) if length(line) <= width), slim)
 
-    def _messages(self, width: int, count: int, now: float, reply: Reply | None) -> list[Line]:
+    def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Line]:
         """A rule with the commander and the last reply, texts cut above in full, then events."""
         who = self.feed.commander(now)
         title = "events" if not who else f"events ─ {cut(who, 16)} commands the hand"
@@ -405,7 +405,7 @@ def _too_small(width: int, height: int) -> list[Line]:
     return [exactly(line, width) for line in lines[:height]]
 
 
-def _reply(reply: Reply | None, now: float) -> Line:
+def _reply(reply: ShownReply | None, now: float) -> Line:
     if reply is None or now - reply.at > REPLY_TIME:
         return []
     return [Segment(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)]

@@ -44,7 +44,7 @@ class TerminalGone(SoftfingerError):
     """The terminal can't be written to any more, or a signal ended a blocked write."""
 
 
-class Keys:
+class KeyDecoder:
     """Decodes a terminal's bytes to names of keys. Pasted text is ignored."""
 
     def __init__(self) -> None:

@@ -22,7 +22,7 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.terminal.feed import field, number, printable, text
 from softfinger.tools.viewing import layout
 from softfinger.tools.viewing.drawing import Drawing
-from softfinger.tools.viewing.known import Hand, read_settings
+from softfinger.tools.viewing.known import ShownHand, read_settings
 
 TOPICS = (
     schema.SETTINGS,
@@ -68,7 +68,7 @@ class Bridge:
         self._truth: dict[str, Any] | None = None
         self._statistics: dict[str, Any] | None = None
         self._gaps = {topic: Gaps() for topic in TOPICS}
-        self._hand = Hand()
+        self._hand = ShownHand()
         self._known = False  # the settings have arrived
         self._drawing: Drawing | None = None
         self._waited = 0  # states
@@ -161,7 +161,7 @@ class Bridge:
             keys = printable(", ".join(unknown))
             self._say(f"settings of {version} that are not known here: {keys}")
         if not self._known or settings != self._hand.settings:
-            self._hand = Hand(settings)
+            self._hand = ShownHand(settings)
             self._known = True
             self._drawing = None
 

@@ -20,9 +20,9 @@ from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.terminal.feed import field, number
 from softfinger.tools.viewing import layout
 from softfinger.tools.viewing.footprint import Footprint, footprint, grid_of, tip_circle
-from softfinger.tools.viewing.known import Hand
+from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.landscape import Landscape
-from softfinger.tools.viewing.planar import Contact, FingerLines, HeldObject, finger_lines
+from softfinger.tools.viewing.planar import FingerLines, HeldObject, Touch, finger_lines
 
 _TRAIL = 160  # points in a trail on the landscape
 _ARROW = 1.6e-3  # m of a force's arrow a newton
@@ -34,7 +34,7 @@ _LEAST_PEAK = 8.0  # standard deviations of the noise: the least end of the colo
 class Drawing:
     """One hand's pictures. Logs at once what stands still: the palm and the landscape."""
 
-    def __init__(self, recording: rr.RecordingStream, hand: Hand) -> None:
+    def __init__(self, recording: rr.RecordingStream, hand: ShownHand) -> None:
         self._recording = recording
         self._hand = hand
         self._object = HeldObject(hand.geometry)
@@ -117,7 +117,7 @@ class Drawing:
                 radii.append(0.25 + 0.35 * share)
         self._recording.log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
 
-    def _contacts(self, lines: list[FingerLines], contacts: list[Contact | None]) -> None:
+    def _contacts(self, lines: list[FingerLines], contacts: list[Touch | None]) -> None:
         faces, origins, vectors, labels, colours, normals = [], [], [], [], [], []
         touching = zip(self._hand.fingers, lines, contacts, strict=True)
         for name, finger, contact in touching:
@@ -150,7 +150,7 @@ class Drawing:
             ),
         )
 
-    def _held(self, state: dict[str, Any], contacts: list[Contact | None]) -> None:
+    def _held(self, state: dict[str, Any], contacts: list[Touch | None]) -> None:
         left, right = contacts if len(contacts) == 2 else (None, None)
         width = number(state, "object", "width")
         outlines = []
@@ -181,7 +181,7 @@ class Drawing:
             "hand/simulated", rr.LineStrips2D(strips, colors=[layout.GOAL], radii=[0.3])
         )
 
-    def _points(self, contacts: list[Contact | None]) -> None:
+    def _points(self, contacts: list[Touch | None]) -> None:
         if self.landscape is None:
             return
         trails, now, colours, shades = [], [], [], []
@@ -273,14 +273,14 @@ class Drawing:
         self._recording.log(entity, what, static=True)
 
 
-def _contact(state: dict[str, Any] | None, name: str) -> Contact | None:
+def _contact(state: dict[str, Any] | None, name: str) -> Touch | None:
     """One tip's contact, None where there is none."""
     if field(state, name, "contact") is not True:
         return None
     d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))
     if not (math.isfinite(d) and math.isfinite(theta) and d > 0.0):
         return None
-    return Contact(d, theta, force if math.isfinite(force) else 0.0)
+    return Touch(d, theta, force if math.isfinite(force) else 0.0)
 
 
 def _outline(

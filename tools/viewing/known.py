@@ -22,7 +22,7 @@ from softfinger.tools.viewing.landscape import Landscape
 _TOLERANCE = 1e-6  # relative error of a table for a picture
 
 
-class Hand:
+class ShownHand:
     """Its fingers, geometry and energy landscape."""
 
     def __init__(self, settings: Settings | None = None) -> None:
@@ -51,7 +51,7 @@ class Hand:
 
 def warm_up() -> None:
     """Do what takes long the first time, before messages wait for it."""
-    landscape = Hand().landscape()
+    landscape = ShownHand().landscape()
     if landscape is not None:
         landscape.picture()
         landscape.contours()

@@ -12,7 +12,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from softfinger.tools.viewing.known import Hand
+from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.landscape import HEIGHT, WIDTH
 
 TIME = "time"  # the timeline: Unix time of the daemon
@@ -62,7 +62,7 @@ class Plot:
         )
 
 
-def plots(hand: Hand) -> dict[str, Plot]:
+def plots(hand: ShownHand) -> dict[str, Plot]:
     """The plots of a hand, by name; each has a line for each finger that takes part."""
     fingers: list[Line] = [(name, COLOURS[name], 2.0) for name in hand.fingers]
     goals: list[Line] = [(f"{name} goal", _pale(COLOURS[name]), 1.0) for name in hand.fingers]
@@ -82,7 +82,7 @@ def plots(hand: Hand) -> dict[str, Plot]:
     return shown
 
 
-def blueprint(hand: Hand) -> rrb.Blueprint:
+def blueprint(hand: ShownHand) -> rrb.Blueprint:
     """The layout for a hand, without views for what its scene lacks."""
     shown = plots(hand)
     pictures: list[Any] = [_hand_view(hand)]
@@ -128,7 +128,7 @@ def blueprint(hand: Hand) -> rrb.Blueprint:
     )
 
 
-def _map_view(hand: Hand, name: str) -> rrb.Spatial2DView:
+def _map_view(hand: ShownHand, name: str) -> rrb.Spatial2DView:
     tactile = hand.settings.tactile
     return rrb.Spatial2DView(
         origin=f"pressure/{name}",
@@ -140,7 +140,7 @@ def _map_view(hand: Hand, name: str) -> rrb.Spatial2DView:
     )
 
 
-def _hand_view(hand: Hand) -> rrb.Spatial2DView:
+def _hand_view(hand: ShownHand) -> rrb.Spatial2DView:
     geometry = hand.geometry
     a = 1e3 * geometry.tip_radius
     half = 1e3 * geometry.half_separation + 1.3 * a

@@ -25,7 +25,7 @@ class ViewError(SoftfingerError):
     """Nothing can be shown. The message says why, and what to do."""
 
 
-class Page:
+class WebPage:
     """Serves in a thread of its own until closed. ``port`` is the one it got."""
 
     def __init__(self, port: int, source: int, receiver: int) -> None:
@@ -34,7 +34,7 @@ class Page:
         ``receiver`` is the port from which the page gets its data. Raises ViewError when the port
         is taken.
         """
-        handler = type("Handler", (_Handler,), {"source": source, "receiver": receiver})
+        handler = type("Handler", (_PageHandler,), {"source": source, "receiver": receiver})
         try:
             self._server = ThreadingHTTPServer((LOOPBACK, port), handler)
         except (OSError, OverflowError) as error:
@@ -61,7 +61,7 @@ def policy(receiver: int) -> str:
     )
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _PageHandler(BaseHTTPRequestHandler):
     source = 0
     receiver = 0
     protocol_version = "HTTP/1.0"  # one answer a connection: its end is the answer's

@@ -22,7 +22,7 @@ _ANGLES = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 
 
 @dataclass(frozen=True)
-class Contact:
+class Touch:
     """One tip's contact: d [m], θ [rad], F [N]."""
 
     d: float
@@ -45,7 +45,7 @@ class FingerLines:
 
 
 def finger_lines(
-    hand: HandGeometry, finger: int, q: float, contact: Contact | None = None
+    hand: HandGeometry, finger: int, q: float, contact: Touch | None = None
 ) -> FingerLines:
     """The lines of finger 0 (left) or 1 (right) at joint angle ``q`` [rad]."""
     a = hand.tip_radius

@@ -21,7 +21,7 @@ from typing import IO
 
 import rerun_cli
 
-from softfinger.tools.viewing.page import LOOPBACK, Page, ViewError
+from softfinger.tools.viewing.page import LOOPBACK, ViewError, WebPage
 
 _START = 20.0  # s that a viewer may take until it listens
 _NOWHERE = f"http://{LOOPBACK}:9"  # no proxy listens there: nothing gets out
@@ -44,7 +44,7 @@ class Viewer:
         Raises ViewError when it does not start.
         """
         self.address = ""
-        self._page: Page | None = None
+        self._page: WebPage | None = None
         if window and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             raise ViewError("no display for a window here: add --web, or --save FILE.rrd")
         self.receiver, source = _free_port(), _free_port()
@@ -69,7 +69,7 @@ class Viewer:
             self._until_listening(self.receiver)
             if not window:
                 self._until_listening(source)
-                self._page = Page(port, source, self.receiver)
+                self._page = WebPage(port, source, self.receiver)
                 self.address = f"http://{LOOPBACK}:{self._page.port}/"
         except BaseException:
             self.close()

@@ -26,8 +26,8 @@ from softfinger.daemon.simulation.emulator.control_port import ControlPort
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encoder_for
 from softfinger.daemon.simulation.emulator.fault_spec import (
     SERVOS,
-    Event,
     FaultError,
+    FaultEvent,
     parse_faults,
 )
 from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
@@ -86,7 +86,7 @@ class EmulatorClock:
 
 
 @dataclass(frozen=True, slots=True)
-class ServoLine:
+class EmulatedServos:
     """How the servos are emulated, beside the settings."""
 
     baud: int = 0  # 0: they answer at once and at any rate
@@ -107,7 +107,7 @@ class Emulator:
         settings: Settings,
         folder: Path,
         *,
-        line: ServoLine | None = None,
+        line: EmulatedServos | None = None,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
         undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
@@ -130,7 +130,7 @@ class Emulator:
         self._sources: list[SimulatedTactile] = []
         self._advance_due = 0.0
         try:
-            line = line or ServoLine()
+            line = line or EmulatedServos()
             self._ids = settings.servos.ids if line.ids is None else line.ids
             self._events = parse_faults(faults, self._ids)
             with undisturbed():
@@ -155,7 +155,7 @@ class Emulator:
             self.close()
             raise
 
-    def _add_servos(self, settings: Settings, line: ServoLine) -> None:
+    def _add_servos(self, settings: Settings, line: EmulatedServos) -> None:
         try:
             bus = ServoBus.from_settings(
                 settings, self.hand, ids=self._ids, baud=line.baud, factory=line.factory
@@ -302,7 +302,7 @@ class Emulator:
         servos = self._servos.bus.report(t) if self._servos is not None else []
         return {"t": t, "monotonic": time.monotonic(), "servos": servos}
 
-    def _apply(self, event: Event, t: float) -> None:
+    def _apply(self, event: FaultEvent, t: float) -> None:
         _, part, kind, value = event
         device = self._servos if part == SERVOS else self._boards.get(part)
         if device is None:

@@ -30,7 +30,7 @@ class FaultError(SoftfingerError, ValueError):
     """A fault that can't be understood. The message says what is known."""
 
 
-class Event(NamedTuple):
+class FaultEvent(NamedTuple):
     """What happens to one part of the hand."""
 
     after: float  # s
@@ -39,7 +39,7 @@ class Event(NamedTuple):
     value: float = 1.0  # a probability, or a servo's ID
 
 
-def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[Event]:
+def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
     """Faults from words of text, in time's order, and as they were given where they start at once.
 
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` for both
@@ -54,11 +54,11 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[Event]:
     return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
 
 
-def _after(event: Event) -> float:
+def _after(event: FaultEvent) -> float:
     return event.after
 
 
-def _parse(word: str, ids: tuple[int, ...]) -> list[Event]:
+def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     def refused(why: str) -> FaultError:
         return FaultError(f"fault {word!r}: {why}")
 
@@ -74,23 +74,23 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[Event]:
         raise refused(f"{text!r} is not a number")
     probability = value is not None and 0.0 <= value <= 1.0
     if value is None and kind in _PORT:
-        return [Event(after, side or SERVOS, kind)]
+        return [FaultEvent(after, side or SERVOS, kind)]
     if value is None and kind == _WELL:
-        return [Event(after, part, kind) for part in ((side,) if side else (SERVOS, *FINGERS))]
+        return [FaultEvent(after, part, kind) for part in ((side,) if side else (SERVOS, *FINGERS))]
     # `silent=2` and `frozen=2` are a servo's, `silent` and `left:silent` a board's.
     if kind in BOARD_FAULTS and (side or value is None or kind not in SERVO_FAULTS):
         if value is not None and not probability:
             raise refused("a probability lies in 0 … 1")
         chance = BOARD_FAULTS[kind] if value is None else value
-        return [Event(after, part, kind, chance) for part in ((side,) if side else FINGERS)]
+        return [FaultEvent(after, part, kind, chance) for part in ((side,) if side else FINGERS)]
     if value is not None and side is None and kind in LINE_FAULTS:
         if not probability:
             raise refused("a probability lies in 0 … 1")
-        return [Event(after, SERVOS, kind, value)]
+        return [FaultEvent(after, SERVOS, kind, value)]
     if value is not None and side is None and kind in SERVO_FAULTS:
         if value not in ids:
             raise refused("no servo has that ID")
-        return [Event(after, SERVOS, kind, value)]
+        return [FaultEvent(after, SERVOS, kind, value)]
     raise refused(
         f"expected for tactile boards {', '.join(BOARD_FAULTS)} [=PROBABILITY]; for the servos "
         f"{', '.join(LINE_FAULTS)} =PROBABILITY or {', '.join(SERVO_FAULTS)} =ID; or "

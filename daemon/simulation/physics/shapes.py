@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.backends import SHAPES
-from softfinger.daemon.profile.settings import Simulation
+from softfinger.daemon.profile.settings import SimulationSettings
 from softfinger.daemon.simulation.physics.plant_state import (
     DISC,
     NO_OBJECT,
@@ -52,36 +52,36 @@ class Shape:
         return np.column_stack((self.corners, normal, length))
 
 
-def shape_of(simulation: Simulation) -> Shape:
+def shape_of(simulation: SimulationSettings) -> Shape:
     """The object of the settings, made by the function that `daemon.backends` names for it."""
     shape: Shape = SHAPES[simulation.object_shape].load()(simulation)
     return shape
 
 
-def rectangle(simulation: Simulation) -> Shape:
+def rectangle(simulation: SimulationSettings) -> Shape:
     """A box of the settings' width and height."""
     return _polygon(RECTANGLE, simulation, 0.0)
 
 
-def wedge(simulation: Simulation) -> Shape:
+def wedge(simulation: SimulationSettings) -> Shape:
     """Faces that lean by half the taper each, with the settings' width at half the height."""
     leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
     return _polygon(POLYGON, simulation, leaning)
 
 
-def disc(simulation: Simulation) -> Shape:
+def disc(simulation: SimulationSettings) -> Shape:
     """A disc of the settings' radius."""
     radius = simulation.object_radius
     square = _trapezoid(radius, radius, radius)
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
 
 
-def nothing(simulation: Simulation) -> Shape:
+def nothing(simulation: SimulationSettings) -> Shape:
     """No object; its outline is the rectangle's."""
     return _polygon(NO_OBJECT, simulation, 0.0)
 
 
-def _polygon(kind: int, simulation: Simulation, leaning: float) -> Shape:
+def _polygon(kind: int, simulation: SimulationSettings, leaning: float) -> Shape:
     half, height = 0.5 * simulation.object_width, simulation.object_height
     corners = _trapezoid(half + leaning, half - leaning, 0.5 * height)
     lever, squared = _mean_distances(corners)

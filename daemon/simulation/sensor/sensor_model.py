@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.profile.settings import Simulation
+from softfinger.daemon.profile.settings import SimulationSettings
 from softfinger.daemon.simulation.sensor import sensor_effects
 from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, render_curved
 from softfinger.daemon.simulation.sensor.sensor_effects import PLAYS
@@ -66,7 +66,7 @@ class Imperfections:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
     @classmethod
-    def of(cls, simulation: Simulation) -> Imperfections:
+    def of(cls, simulation: SimulationSettings) -> Imperfections:
         """Those of the settings."""
         values = simulation.model_dump()
         return cls(**{each.name: values[f"tactile_{each.name}"] for each in fields(cls)})

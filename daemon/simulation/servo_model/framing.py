@@ -76,7 +76,7 @@ class Packet(NamedTuple):
     size: int  # bytes it took on the wire
 
 
-class Parser:
+class PacketParser:
     """Packets out of a byte stream, as a servo finds them.
 
     A header inside a packet (FF FF FD not followed by FD, where stuffing is due) throws away the

@@ -27,7 +27,7 @@ from softfinger.daemon.simulation.servo_model.bus_faults import (
 )
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.collision import collide
-from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, Parser
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
 
 _GROUP_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
@@ -49,7 +49,7 @@ _SPAN = struct.Struct("<HH")  # address, length
 _ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
-class Reply(NamedTuple):
+class TimedReply(NamedTuple):
     """Bytes to send ``delay`` seconds after the wire fell silent; ``late`` adds to that alone."""
 
     delay: float
@@ -70,7 +70,7 @@ class ServoBus:
         self.servos = list(servos)
         self.plant = plant
         self.faults = FaultSource(seed)
-        self.parser = Parser()
+        self.parser = PacketParser()
         self.packets = 0  # that came through
         self._jitter = random.Random(seed)
         self._now = -math.inf
@@ -141,10 +141,10 @@ class ServoBus:
         """What the bus answers to ``data`` arriving at time t, all at once."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
-    def exchange(self, data: bytes, t: float, baud: int = 0) -> list[Reply]:
+    def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
         """As :meth:`feed`, reply by reply with their delays. ``baud`` 0 is heard by every servo."""
         self.advance(t)
-        replies: list[Reply] = []
+        replies: list[TimedReply] = []
         for packet in self.parser.feed(data, t):
             self.packets += 1
             if self.faults.loses(packet.instruction in _READS):
@@ -162,7 +162,7 @@ class ServoBus:
         if not self.faults.active:
             return replies
         return [
-            Reply(reply.delay, spoilt, late)
+            TimedReply(reply.delay, spoilt, late)
             for reply in replies
             for late, spoilt in self.faults.spoil(reply.data)
         ]
@@ -189,7 +189,7 @@ class ServoBus:
 
     # --- instructions ----------------------------------------------------------------------------
 
-    def _answers(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[Reply]:
+    def _answers(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[TimedReply]:
         instruction = packet.instruction
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
@@ -205,12 +205,12 @@ class ServoBus:
                 if level >= needed:
                     # The alert bit is taken after the instruction was done.
                     status = framing.status(name, error | servo.alert, data)
-                    replies.append(Reply(delay, status))
+                    replies.append(TimedReply(delay, status))
             elif servo.shadow_id == packet.id and instruction != framing.PING:
                 _execute(servo, instruction, packet.parameters, t)
         return self._at_once(replies, servos)
 
-    def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[Reply]:
+    def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[TimedReply]:
         instruction, data = packet.instruction, packet.parameters
         if instruction == framing.PING:
             replies = []
@@ -243,13 +243,13 @@ class ServoBus:
         servos: list[EmulatedServo],
         t: float,
         fast: bool,
-    ) -> list[Reply]:
+    ) -> list[TimedReply]:
         by_id = {servo.id: servo for servo in servos}
         if len(by_id) < len(servos):
             return self._shared_read(wanted, servos, t)
         if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
             return []  # an ID may stand in the list once only
-        replies: list[Reply] = []
+        replies: list[TimedReply] = []
         if fast:
             length = 1 + sum([length + 4 for _, _, length in wanted])
             piece = framing.fast_head(length)
@@ -274,13 +274,13 @@ class ServoBus:
         if not block:
             return replies
         # The blocks follow each other as one packet; the delays before them add up.
-        return [Reply(delay, block + piece)]
+        return [TimedReply(delay, block + piece)]
 
     def _shared_read(
         self, wanted: list[tuple[int, int, int]], servos: list[EmulatedServo], t: float
-    ) -> list[Reply]:
+    ) -> list[TimedReply]:
         """A group read where several servos have one ID: they talk at once, fast read or not."""
-        replies: list[Reply] = []
+        replies: list[TimedReply] = []
         for servo_id, address, length in wanted:
             same = [servo for servo in servos if servo.id == servo_id]
             if not same:
@@ -291,12 +291,12 @@ class ServoBus:
             replies += self._at_once(answers, same)
         return replies
 
-    def _at_once(self, replies: list[Reply], servos: list[EmulatedServo]) -> list[Reply]:
+    def _at_once(self, replies: list[TimedReply], servos: list[EmulatedServo]) -> list[TimedReply]:
         """Replies of servos that share an ID come as one, garbled."""
         if len(replies) < 2:
             return replies
         data = collide([reply.data for reply in replies], servos[0].baud, self._jitter)
-        return [Reply(min(reply.delay for reply in replies), data)]
+        return [TimedReply(min(reply.delay for reply in replies), data)]
 
     def _sync_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
         if len(data) < _SPAN.size:
@@ -322,8 +322,8 @@ class ServoBus:
                     servo.write(address, data[i - length : i], t)
 
 
-def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> Reply:
-    return Reply(servo.return_delay, framing.status(servo.id, error | servo.alert, data))
+def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> TimedReply:
+    return TimedReply(servo.return_delay, framing.status(servo.id, error | servo.alert, data))
 
 
 def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> tuple[int, bytes]:

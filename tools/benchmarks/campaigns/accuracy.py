@@ -15,7 +15,7 @@ from softfinger.tools.benchmarks.campaigns.accuracy_envelope import (
     of_eight_bits,
 )
 from softfinger.tools.benchmarks.campaigns.accuracy_models import flaws, mismatches
-from softfinger.tools.benchmarks.framework.report import Table
+from softfinger.tools.benchmarks.framework.report import Report
 
 _FRAMES = 2000  # of each contact
 
@@ -25,7 +25,7 @@ def _sweep(frames: int) -> Sweep:
 
 
 # Each part by the frames of a contact.
-PARTS: dict[str, Callable[[int], list[Table]]] = {
+PARTS: dict[str, Callable[[int], list[Report]]] = {
     "bound": lambda n: against_the_bound(_sweep(n)),
     "eight bits": lambda n: of_eight_bits(_sweep(n)),
     "faint contacts": lambda n: detection(16, 5 * n // 2, 50 * n),
@@ -35,7 +35,7 @@ PARTS: dict[str, Callable[[int], list[Table]]] = {
 }
 
 
-def measure(trials: int | None = None, only: str = "") -> list[Table]:
+def measure(trials: int | None = None, only: str = "") -> list[Report]:
     """The parts whose name ``only`` is found in, with ``trials`` frames of each contact."""
     chosen = [part for name, part in PARTS.items() if only in name]
     return [table for part in chosen for table in part(trials or _FRAMES)]

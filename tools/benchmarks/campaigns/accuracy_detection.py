@@ -34,7 +34,7 @@ from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     TIP,
 )
 from softfinger.tools.benchmarks.framework.campaign import upper_bound
-from softfinger.tools.benchmarks.framework.report import Row, Table
+from softfinger.tools.benchmarks.framework.report import Report, Row
 
 FloatArray = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ _ROOT = math.sqrt(float(np.sum(_WEIGHTS**2)))
 _BATCH = 500
 
 
-def detection(around: int, frames: int, again_frames: int, seed: int = 11) -> list[Table]:
+def detection(around: int, frames: int, again_frames: int, seed: int = 11) -> list[Report]:
     """d = 0.2 mm at 0.2 % noise, over tilts, azimuths and offsets, as floats and as counts."""
     rows = []
     places = list(trials.places((FAINT,), (0.0, 7.5, 15.0, 22.5, 30.0), around))
@@ -73,7 +73,7 @@ def detection(around: int, frames: int, again_frames: int, seed: int = 11) -> li
                 "aim ≥": 0.999,
             }
         )
-    return [Table("share of d = 0.2 mm at 0.2 % noise that is seen", rows)]
+    return [Report("share of d = 0.2 mm at 0.2 % noise that is seen", rows)]
 
 
 def _missed(
@@ -89,7 +89,7 @@ def _missed(
     return missed
 
 
-def false_alarms(frames: int) -> list[Table]:
+def false_alarms(frames: int) -> list[Report]:
     """The default level on every board, and lower ones to check the computed figure."""
     rows = []
     levels = (2.5, 3.0, 3.5, 4.0, PATCH_LEVEL)
@@ -103,7 +103,7 @@ def false_alarms(frames: int) -> list[Table]:
         for noise in trials.NOISES:
             if not (board is SIXTEEN_BITS and noise == NOISE):
                 rows.append(_alarm_row(name, board, noise, PATCH_LEVEL))
-    return [Table("alarms a frame of noise alone", rows)]
+    return [Report("alarms a frame of noise alone", rows)]
 
 
 def _alarm_row(name: str, board: Board | None, noise: float, level: float) -> Row:

@@ -22,7 +22,7 @@ from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     SIZE,
     TIP,
 )
-from softfinger.tools.benchmarks.framework.report import Row, Table
+from softfinger.tools.benchmarks.framework.report import Report, Row
 
 FloatArray = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Case:
+class EnvelopeCase:
     """One contact at one noise with one way of estimating."""
 
     place: trials.Place
@@ -64,7 +64,7 @@ class Case:
 class Score:
     """What came of a case: RMS over the bound, NEES a degree of freedom, bias, frames lost."""
 
-    case: Case
+    case: EnvelopeCase
     frames: int
     lost: int  # no valid estimate
     d: float = math.nan
@@ -85,7 +85,7 @@ class Score:
         return abs(self.d_bias) / self.case.place.d
 
 
-def against_the_bound(sweep: Sweep, seed: int = 1) -> list[Table]:
+def against_the_bound(sweep: Sweep, seed: int = 1) -> list[Report]:
     """For all cells and for 1 % dead ones, gain free and known, bound small and elsewhere."""
     errors, honesty, notes = [], [], []
     for dead, small_aim in ((0.0, 1.10), (_DEAD, 1.20)):
@@ -111,12 +111,12 @@ def against_the_bound(sweep: Sweep, seed: int = 1) -> list[Table]:
             honesty.append(_honesty(name, chosen))
             notes.append(f"  worst, {name}: d: {d_top.case}; tilt: {tilt_top.case}")
     return [
-        Table("RMS error over the Cramér-Rao bound", errors, notes=tuple(notes)),
-        Table("errorᵀ Σ⁻¹ error a degree of freedom", honesty),
+        Report("RMS error over the Cramér-Rao bound", errors, notes=tuple(notes)),
+        Report("errorᵀ Σ⁻¹ error a degree of freedom", honesty),
     ]
 
 
-def of_eight_bits(sweep: Sweep, seed: int = 5) -> list[Table]:
+def of_eight_bits(sweep: Sweep, seed: int = 5) -> list[Report]:
     """The bias of d with 8-bit counts and a threshold of 3, d from 1 mm up."""
     deep = tuple(d for d in sweep.depths if d >= 0.001)
     part = replace(sweep, depths=deep, around=max(sweep.around // 2, 1))
@@ -144,7 +144,7 @@ def of_eight_bits(sweep: Sweep, seed: int = 5) -> list[Table]:
             }
         )
         notes.append(f"  worst, {name}: {top.case}")
-    return [Table("bias of d [%], 8 bits of 800 Pa, 3 counts sent", rows, notes=tuple(notes))]
+    return [Report("bias of d [%], 8 bits of 800 Pa, 3 counts sent", rows, notes=tuple(notes))]
 
 
 def _groups(scores: list[Score]) -> Iterator[tuple[str, bool, list[Score]]]:
@@ -176,7 +176,7 @@ def _honesty(name: str, scores: list[Score]) -> Row:
     return row | rest
 
 
-def _cases(sweep: Sweep, dead: float, board: Board | None, seed: int) -> Iterator[Case]:
+def _cases(sweep: Sweep, dead: float, board: Board | None, seed: int) -> Iterator[EnvelopeCase]:
     random = np.random.default_rng(seed)
     rounding = 0.0 if board is None else board.pascal_per_count**2 / 12.0  # its variance [Pa²]
     for place in trials.places(sweep.depths, sweep.degrees, sweep.around):
@@ -188,10 +188,12 @@ def _cases(sweep: Sweep, dead: float, board: Board | None, seed: int) -> Iterato
                 # What rounding adds to the noise is in the bound that decides what is small.
                 covariance = unit * (noise**2 + rounding)
                 small = trials.is_small(place, covariance)
-                yield Case(place, noise, free, small, np.sqrt(np.diag(covariance)), live, board)
+                yield EnvelopeCase(
+                    place, noise, free, small, np.sqrt(np.diag(covariance)), live, board
+                )
 
 
-def _measure(cases: Iterable[Case], frames: int, seed: int) -> list[Score]:
+def _measure(cases: Iterable[EnvelopeCase], frames: int, seed: int) -> list[Score]:
     bank = np.random.default_rng(seed).standard_normal((min(frames, _BANK), SIZE, SIZE))
     return [_score(case, [bank]) for case in cases]
 
@@ -208,7 +210,7 @@ def _worst(scores: list[Score], value: Callable[[Score], float], sweep: Sweep, s
     return max(fresh, key=value)
 
 
-def _score(case: Case, banks: Iterable[FloatArray]) -> Score:
+def _score(case: EnvelopeCase, banks: Iterable[FloatArray]) -> Score:
     clean = case.place.grid.pressure(TIP, LINEAR, *case.place.truth[:3])
     more = {} if case.live is None else {"live": case.live}
     made = trials.estimator(case.place, case.noise, case.free, case.board, **more)

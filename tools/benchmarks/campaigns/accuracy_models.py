@@ -25,7 +25,7 @@ from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
     TIP,
     Place,
 )
-from softfinger.tools.benchmarks.framework.report import Row, Table
+from softfinger.tools.benchmarks.framework.report import Report, Row
 
 FloatArray = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ _FINE = 8  # points a cell's side in frames of other models
 
 def mismatches(
     frames: int, noises: tuple[float, ...] = trials.NOISES, seed: int = 23
-) -> list[Table]:
+) -> list[Report]:
     """Each other model at each contact and noise, estimated as linear with the gain free."""
     bank = np.random.default_rng(seed).standard_normal((frames, SIZE, SIZE))
     rows = []
@@ -64,10 +64,10 @@ def mismatches(
                 found = trials.run(trials.estimator(place, noise, True), clean, noise, bank)
                 more = {"noise %": 100 * noise / MODULUS}
                 rows.append(_row(model, place, found, more))
-    return [Table("other models estimated as linear", rows)]
+    return [Report("other models estimated as linear", rows)]
 
 
-def flaws(frames: int, seed: int = 29) -> list[Table]:
+def flaws(frames: int, seed: int = 29) -> list[Report]:
     """Each imperfection at each contact, on estimators that know of none but the noise.
 
     The tip is pressed in straight, for hysteresis a third deeper first, and held for 20 s of which
@@ -92,7 +92,7 @@ def flaws(frames: int, seed: int = 29) -> list[Table]:
                     trials.keep(estimator.update(data, SIXTEEN_BITS.pascal_per_count), each[k])
             for gain, each in zip(("free", "known"), found, strict=True):
                 rows.append(_row(name, place, each, {"gain is": gain}))
-    return [Table("a sensor with", rows)]
+    return [Report("a sensor with", rows)]
 
 
 def _row(name: str, place: Place, found: FloatArray, more: Row) -> Row:

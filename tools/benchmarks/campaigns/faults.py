@@ -21,13 +21,13 @@ from softfinger.tools.benchmarks.campaigns.faults_cases import CASES
 from softfinger.tools.benchmarks.campaigns.faults_clock import STEPS, clock_rig
 from softfinger.tools.benchmarks.campaigns.faults_rig import Rig
 from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, trial
-from softfinger.tools.benchmarks.framework.campaign import Outcome, run_trials
-from softfinger.tools.benchmarks.framework.report import Row, Table
+from softfinger.tools.benchmarks.framework.campaign import Tally, run_trials
+from softfinger.tools.benchmarks.framework.report import Report, Row
 
 _TRIALS = 100
 
 
-def measure(trials: int | None = None, only: str = "") -> list[Table]:
+def measure(trials: int | None = None, only: str = "") -> list[Report]:
     """Every fault, or those whose name the pattern ``only`` is found in."""
     rows, notes, failed = [], [], False
     with ExitStack() as stack:
@@ -38,7 +38,7 @@ def measure(trials: int | None = None, only: str = "") -> list[Table]:
             rows.append(row)
             notes += [f"  {name}, {failure}" for failure in outcome.failures]
             failed = failed or outcome.failed
-    return [Table("fault", rows, notes=tuple(notes), failed=failed)]
+    return [Report("fault", rows, notes=tuple(notes), failed=failed)]
 
 
 def known(only: str) -> bool:
@@ -73,7 +73,7 @@ def broken(seed: int, reason: str) -> Trial:
     return Trial(seed, wrong=reason)
 
 
-def summary(name: str, expected: str, allowed: float | None, outcome: Outcome[Trial]) -> Row:
+def summary(name: str, expected: str, allowed: float | None, outcome: Tally[Trial]) -> Row:
     """Counts, and times [ms] of those trials that have them: median and greatest."""
     row: Row = {
         "name": name,

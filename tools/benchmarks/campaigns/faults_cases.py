@@ -35,7 +35,7 @@ _SIDES = ("left", "right")
 
 
 @dataclass(frozen=True)
-class Case:
+class FaultCase:
     """One kind of fault, injected into a hand that grips."""
 
     name: str
@@ -100,12 +100,12 @@ def _stood_still(seconds: float) -> Inject:
     return lambda rig, chance: pressures.stood_still(rig, seconds)
 
 
-_works = partial(Case, expect="works", lasts=0.3)
-_silent = partial(Case, expect="fault", names=("servos.silent",), within=_SILENT + _AT_ONCE)
-_alert = partial(Case, expect="fault", names=("servos.alert",), within=_SILENT + _AT_ONCE)
-_blind = partial(Case, expect="fault", names=("tactile.silent",), within=_FRAMES + _AT_ONCE)
+_works = partial(FaultCase, expect="works", lasts=0.3)
+_silent = partial(FaultCase, expect="fault", names=("servos.silent",), within=_SILENT + _AT_ONCE)
+_alert = partial(FaultCase, expect="fault", names=("servos.alert",), within=_SILENT + _AT_ONCE)
+_blind = partial(FaultCase, expect="fault", names=("tactile.silent",), within=_FRAMES + _AT_ONCE)
 
-CASES: tuple[Case, ...] = (
+CASES: tuple[FaultCase, ...] = (
     *(_works(f"replies dropped, {share:.0%}", inject=_reply("drop", share))
       for share in (0.01, 0.1)),
     _silent("replies dropped, 100%", inject=_reply("drop", 1.0)),
@@ -119,50 +119,51 @@ CASES: tuple[Case, ...] = (
     _silent("replies truncated, 100%", inject=_reply("truncate", 1.0)),
     *(_works(f"replies doubled, {share:.0%}", inject=_reply("duplicate", share))
       for share in (0.01, 0.1, 1.0)),
-    Case("one servo silent", "fault", _servo("silent={}", "answer={}"),
+    FaultCase("one servo silent", "fault", _servo("silent={}", "answer={}"),
          ("servos.silent",), _WATCHDOG),
     _silent("one servo rebooted", inject=_servo("reboot={}", "")),
-    Case("one servo overheated", "fault",
+    FaultCase("one servo overheated", "fault",
          _servo("overheat={0}", "recover={0} reboot={0}"),
          ("servos.alert", "servos.temperature"), _SILENT + _AT_ONCE),
     _alert("one servo overloaded", inject=_servo("overload={0}", "recover={0} reboot={0}")),
-    Case("one servo without supply", "fault",
+    FaultCase("one servo without supply", "fault",
          _servo("undervoltage={0}", "recover={0} reboot={0}"),
          ("servos.alert", "servos.voltage"), _SILENT + _AT_ONCE),
-    Case("one servo's encoder stuck", "fault", _servo("stuck={0}", "recover={0}"),
+    FaultCase("one servo's encoder stuck", "fault", _servo("stuck={0}", "recover={0}"),
          ("joint.dead",), 0.05 / _SETTINGS.control.approach_speed + _JUDGED),
-    Case("one servo's encoder jumped", "fault", _servo("jump={0}", "recover={0}"),
+    FaultCase("one servo's encoder jumped", "fault", _servo("jump={0}", "recover={0}"),
          ("joint.jump",), _AT_ONCE),
-    Case("one servo's readings frozen", "fault", _servo("frozen={0}", "recover={0}"),
+    FaultCase("one servo's readings frozen", "fault", _servo("frozen={0}", "recover={0}"),
          ("servos.frozen",), 0.12 + _AT_ONCE),
     _silent("one servo's readings refused", inject=_servo("refuse={0}", "recover={0}")),
-    Case("writes lost, 100%", "fault", sent(lambda _: ("lose-writes=1", "well")),
+    FaultCase("writes lost, 100%", "fault", sent(lambda _: ("lose-writes=1", "well")),
          ("goal.lost",), _SAME + 0.05 + _STOP),
-    *(Case(f"stop, {share:.0%} lost each way", "stops", _lost(share), within=_STOP)
+    *(FaultCase(f"stop, {share:.0%} lost each way", "stops", _lost(share), within=_STOP)
       for share in (0.0, 0.2, 0.5, 0.8, 0.9)),
-    Case("stop, writes lost", "stops", sent(lambda _: ("lose-writes=1", "well")), within=_STOP),
-    Case("servos' port gone and back", "fault", sent(lambda _: ("unplug", "plug")),
+    FaultCase("stop, writes lost", "stops", sent(lambda _: ("lose-writes=1", "well")),
+         within=_STOP),
+    FaultCase("servos' port gone and back", "fault", sent(lambda _: ("unplug", "plug")),
          ("servos.bus",), _WATCHDOG),
     _blind("board silent", inject=_board("{}:silent")),
-    Case("board frozen", "fault", _board("{}:frozen"), ("tactile.frozen",), _FROZEN,
+    FaultCase("board frozen", "fault", _board("{}:frozen"), ("tactile.frozen",), _FROZEN,
          holding_only=True),
-    Case("board noisy, 10%", "either", _board("{}:noisy=0.1"),
+    FaultCase("board noisy, 10%", "either", _board("{}:noisy=0.1"),
          ("tactile.silent", "tip.force", "tip.displacement", "tip.tilt", "hand.angle",
           "hand.width"), 0.5, 0.5, True),
     _blind("board noisy, 100%", inject=_board("{}:noisy=1")),
-    Case("board torn, 10%", "either", _board("{}:torn=0.1"), ("tactile.silent",), 0.5, 0.5),
+    FaultCase("board torn, 10%", "either", _board("{}:torn=0.1"), ("tactile.silent",), 0.5, 0.5),
     _blind("board torn, 100%", inject=_board("{}:torn=1")),
     _blind("board of the wrong size", inject=_board("{}:wrong-size")),
-    Case("board saturated", "fault", _board("{}:saturated"),
+    FaultCase("board saturated", "fault", _board("{}:saturated"),
          ("tactile.silent", "tip.force", "tip.displacement"), _FRAMES + _AT_ONCE),
-    Case("board zero", "lets go", _board("{}:zero"), lasts=0.4, holding_only=True),
-    Case("board's port gone and back", "fault", _board("{}:unplug", "{}:plug"),
+    FaultCase("board zero", "lets go", _board("{}:zero"), lasts=0.4, holding_only=True),
+    FaultCase("board's port gone and back", "fault", _board("{}:unplug", "{}:plug"),
          ("tactile.silent",), _FRAMES + _AT_ONCE),
-    Case("daemon killed", "dies", _killed, within=_WATCHDOG),
+    FaultCase("daemon killed", "dies", _killed, within=_WATCHDOG),
     # As long as a servo's reading may be old: the first one after it decides.
-    Case("daemon stood still for 50 ms", "either", _stood_still(0.05), ("servos.silent",),
+    FaultCase("daemon stood still for 50 ms", "either", _stood_still(0.05), ("servos.silent",),
          _SILENT + _AT_ONCE, 0.3),
-    Case("daemon stood still for 2 s", "fault", _stood_still(2.0),
+    FaultCase("daemon stood still for 2 s", "fault", _stood_still(2.0),
          ("servos.bus", "servos.silent", "tactile.silent"), _WATCHDOG, 4.0),
     _works("command flood", inject=pressures.flood),
     _works("garbage on the command socket", inject=pressures.garbage),

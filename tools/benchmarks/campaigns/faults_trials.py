@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from softfinger.daemon.client.command_client import NoAnswer
-from softfinger.tools.benchmarks.campaigns.faults_cases import Case
+from softfinger.tools.benchmarks.campaigns.faults_cases import FaultCase
 from softfinger.tools.benchmarks.campaigns.faults_rig import Rig, stopped
 from softfinger.tools.benchmarks.framework.campaign import RigError
 
@@ -55,7 +55,7 @@ class Trial:
         return f"{self.phase}: {text}" if text else ""
 
 
-def trial(rig: Rig, case: Case, seed: int) -> Trial:
+def trial(rig: Rig, case: FaultCase, seed: int) -> Trial:
     """Inject once. Raises RigError when the set-up itself fails."""
     chance = random.Random(f"{case.name} {seed}")
     found = Trial(seed)
@@ -73,7 +73,7 @@ def trial(rig: Rig, case: Case, seed: int) -> Trial:
     return found
 
 
-def _grip(rig: Rig, case: Case, chance: random.Random, found: Trial) -> None:
+def _grip(rig: Rig, case: FaultCase, chance: random.Random, found: Trial) -> None:
     """A hand that grips, and an empty record. Raises RigError when that can't be had."""
     for attempt in range(_TRIES):
         if not ready(rig, chance):
@@ -155,7 +155,7 @@ def _start_anew(rig: Rig) -> None:
     rig.start()
 
 
-def _phase(rig: Rig, case: Case, chance: random.Random) -> str:
+def _phase(rig: Rig, case: FaultCase, chance: random.Random) -> str:
     """Bring the hand into one of the states in which it grips."""
     phase = "holding" if case.holding_only else chance.choice(("holding", "grasping", "rotating"))
     if phase == "grasping":
@@ -165,7 +165,7 @@ def _phase(rig: Rig, case: Case, chance: random.Random) -> str:
     return phase
 
 
-def _look(rig: Rig, case: Case, found: Trial) -> None:
+def _look(rig: Rig, case: FaultCase, found: Trial) -> None:
     begin = now = time.monotonic()
     modes = set()
     if case.expect == "stops":
@@ -225,7 +225,7 @@ def judge_wire(rig: Rig, found: Trial) -> None:
             found.wrong = f"{servo['goals_refused']} goals that the servo refused"
 
 
-def _judge_daemon(rig: Rig, case: Case, found: Trial) -> None:
+def _judge_daemon(rig: Rig, case: FaultCase, found: Trial) -> None:
     """No crash, no hang."""
     if not rig.alive:
         status = None if rig.daemon is None else rig.daemon.returncode
@@ -234,7 +234,7 @@ def _judge_daemon(rig: Rig, case: Case, found: Trial) -> None:
         found.wrong = "the daemon does not answer"
 
 
-def _judge(case: Case, found: Trial) -> None:
+def _judge(case: FaultCase, found: Trial) -> None:
     """What was expected, and in time."""
     safe = not math.isnan(found.safe_s)
     if case.expect in ("works", "lets go"):

@@ -33,7 +33,7 @@ T = TypeVar("T", bound=Judged)
 
 
 @dataclass
-class Outcome(Generic[T]):
+class Tally(Generic[T]):
     """The trials of one case that count, and the failures among them."""
 
     trials: list[T] = field(default_factory=list)
@@ -53,13 +53,13 @@ class Outcome(Generic[T]):
         return min(upper_bound(count - self.passed, count), 1.0) if count else 1.0
 
 
-def run_trials(trials: int, one: Callable[[int], T], broken: Callable[[int, str], T]) -> Outcome[T]:
+def run_trials(trials: int, one: Callable[[int], T], broken: Callable[[int, str], T]) -> Tally[T]:
     """``trials`` of ``one(seed)`` that count.
 
     A disturbed trial is made again with another seed, up to ``trials`` times altogether. A RigError
     becomes ``broken(seed, reason)``; three in a row end the case.
     """
-    outcome: Outcome[T] = Outcome()
+    outcome: Tally[T] = Tally()
     for seed, found in _tried(2 * trials, one, broken):
         if found.disturbed and outcome.disturbed < trials:
             outcome.disturbed += 1

@@ -22,7 +22,7 @@ _LEAST = 0.05  # share below which no rise is of interest
 
 
 @dataclass(frozen=True)
-class Table:
+class Report:
     """Rows under a title; ``error`` names the column that run time is drawn against."""
 
     title: str
@@ -79,7 +79,7 @@ def yardstick() -> Row:
     return figure("yardstick", "µs", samples)
 
 
-def slower(old: list[Row], new: list[Row]) -> Table:
+def slower(old: list[Row], new: list[Row]) -> Report:
     """The times and ratios of ``new`` that rose beyond the noise of both runs.
 
     Rows are matched by measurement, table and name. Times are taken over their run's own yardstick,
@@ -110,10 +110,10 @@ def slower(old: list[Row], new: list[Row]) -> Table:
         if ratio > 1.0 + max(_SURE * noise, _LEAST):
             name = ": ".join(part for part in key if part)
             rows.append({"name": name, "ratio": ratio, "noise": noise})
-    return Table(f"slower than before, over the yardstick: {len(rows)} of {len(common)}", rows)
+    return Report(f"slower than before, over the yardstick: {len(rows)} of {len(common)}", rows)
 
 
-def draw(tables: list[Table], path: Path) -> None:
+def draw(tables: list[Report], path: Path) -> None:
     """Run time against error: a panel for each table with an error column. Raises MissingExtra."""
     drawn = [table for table in tables if table.error]
     columns = min(len(drawn), 3)
