@@ -12,7 +12,7 @@ import pytest
 
 from softfinger.daemon.client.hand import Hand
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.recover import recover
+from softfinger.tools.recordings.record import recover
 from tests.conftest import until
 from tests.harness.daemon_process import Running
 
