@@ -65,7 +65,7 @@ def make_models(
 
 
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
-    """The sensor's cells, at the calibrated centre if there is one. Raises SettingsError."""
+    """The sensor's cells, at the calibrated centre if there is one."""
     if calibration is None or calibration.centre is None:
         return make_grid(settings, finger)
     return make_grid(settings, finger, calibration.centre.centre, calibration.centre.rotation)

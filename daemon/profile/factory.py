@@ -65,19 +65,13 @@ def make_grid(
     centre: tuple[float, float] | None = None,
     rotation: float | None = None,
 ) -> SensorGrid:
-    """The sensor's cells under one finger; ``centre`` [m] and ``rotation`` [rad] where measured.
-
-    Raises SettingsError for a blur wider than half the sensor.
-    """
+    """The sensor's cells under one finger; ``centre`` [m] and ``rotation`` [rad] where measured."""
     tactile = settings.tactile
-    try:
-        return SensorGrid(
-            rows=tactile.rows,
-            cols=tactile.cols,
-            pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
-            centre=tactile.centre if centre is None else centre,
-            rotation=tactile.rotation[finger] if rotation is None else rotation,
-            blur=tactile.blur,
-        )
-    except ValueError as error:
-        raise SettingsError(f"tactile.blur: {error}") from None
+    return SensorGrid(
+        rows=tactile.rows,
+        cols=tactile.cols,
+        pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
+        centre=tactile.centre if centre is None else centre,
+        rotation=tactile.rotation[finger] if rotation is None else rotation,
+        blur=tactile.blur,
+    )

@@ -141,6 +141,14 @@ def _cells(settings: Settings) -> Iterator[str]:
                 )
 
 
+def _blur(settings: Settings) -> Iterator[str]:
+    tactile = settings.tactile
+    height = tactile.rows * (tactile.pitch_y or tactile.pitch)
+    most = 0.5 * min(height, tactile.cols * tactile.pitch)
+    if tactile.blur > most:
+        yield f"tactile.blur: found {tactile.blur:g} m, expected {most:g} m (half the sensor) or less"
+
+
 def _recordings(settings: Settings) -> Iterator[str]:
     if settings.tactile.backend != "replay":
         return
@@ -232,6 +240,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...]
     (("tip", "material", "estimator", "safety"), _solid_tip),
     (("simulation",), _wedge),
     (("tactile",), _cells),
+    (("tactile",), _blur),
     (("scene", "tactile"), _recordings),
     (("servos", "tactile", "loop"), _clock),
     (("safety",), _limits),

@@ -37,8 +37,8 @@ class Hand:
         self.folder = folder
         self.settings = load(HIL, folder)
         self._stack = contextlib.ExitStack()
-        line = EmulatedServos(**options)
-        running = emulated(folder, settings=self.settings, line=line)
+        servos = EmulatedServos(**options)
+        running = emulated(folder, settings=self.settings, servos=servos)
         self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:

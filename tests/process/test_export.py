@@ -15,8 +15,8 @@ from softfinger.tools.recordings.tables import BLOCK, CsvTable, ParquetTable, ex
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import Inline
 from tests.harness.daemon_process import softfinger
+from tests.harness.golden_wire import flat, sample
 from tests.process.test_record import written
-from tests.unit.test_schema import flat, sample
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import Inline, until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask
 from tests.harness.fake_daemon import FakeDaemon, frame, state
-from tests.unit.test_schema import flat, sample
+from tests.harness.golden_wire import flat, sample
 
 Profile = Callable[[str], Path]
 TOPICS = tuple(schema.TOPICS)

@@ -23,8 +23,8 @@ from softfinger.tools.recordings.recomputed import Comparison, recompute
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import Inline, until
 from tests.harness.daemon_process import PATIENT, SOFTFINGER, softfinger
+from tests.harness.golden_wire import sample
 from tests.harness.recorded_hand import Messages, Script, published
-from tests.unit.test_schema import sample
 
 Profile = Callable[[str], Path]
 

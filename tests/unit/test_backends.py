@@ -18,5 +18,6 @@ def test_settings_take_the_tables_names_and_name_them_when_one_is_wrong() -> Non
     for name in SHAPES:
         settings = load(changes=[f"simulation.object_shape={name}"])
         assert settings.simulation.object_shape == name
-    with pytest.raises(SettingsError, match="'simulated', 'flexitac', 'glove', 'cobs', 'replay'"):
+    with pytest.raises(SettingsError) as caught:
         load(changes=["tactile.backend=flexitack"])
+    assert all(f"'{name}'" in str(caught.value) for name in TACTILE)

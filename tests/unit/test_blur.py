@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_grid, make_material
+from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.compiled.simd_sums import LANES
@@ -279,9 +280,8 @@ def test_the_settings_blur_goes_into_the_fingers_estimator():
     assert e.valid
     assert e.d == pytest.approx(0.004, abs=2e-5)
     assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=2e-3)
-    few = Settings.model_validate({"tactile": {"rows": 4, "cols": 4, "blur": 0.005}})
-    with pytest.raises(SettingsError, match=r"tactile\.blur"):
-        make_grid(few)
+    with pytest.raises(SettingsError, match=r"tactile\.blur: found 0\.005 m, expected 0\.0026"):
+        load(changes=["tactile.rows=4", "tactile.cols=4", "tactile.blur=0.005"])
 
 
 @pytest.mark.parametrize("reading", [math.nan, math.inf, 1e9])

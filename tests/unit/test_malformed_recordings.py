@@ -19,7 +19,7 @@ from softfinger.tools.analysis.sources import open_source
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recorded_settings
 from softfinger.tools.recordings.writer import RecordingWriter
-from tests.unit.test_schema import sample
+from tests.harness.golden_wire import sample
 
 SPOILT: dict[str, Any] = {
     "no finger": ("finger", None),

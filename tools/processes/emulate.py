@@ -154,7 +154,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
         emulator = Emulator(
             settings,
             arguments.dir,
-            line=servos,
+            servos=servos,
             faults=arguments.fault,
             table_cache=table_cache(),
             undisturbed=signals.held,

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.loop.sd_notify import Service
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.tools.arguments import add_profile, profile, seconds
@@ -88,7 +88,7 @@ def _serve(
         daemon = Daemon(settings, on_event=log.line, table_cache=table_cache())
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
-        return 1
+        return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
         signals.hand_over(loop)

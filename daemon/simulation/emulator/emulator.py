@@ -107,7 +107,7 @@ class Emulator:
         settings: Settings,
         folder: Path,
         *,
-        line: EmulatedServos | None = None,
+        servos: EmulatedServos | None = None,
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
         undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
@@ -130,8 +130,8 @@ class Emulator:
         self._sources: list[SimulatedTactile] = []
         self._advance_due = 0.0
         try:
-            line = line or EmulatedServos()
-            self._ids = settings.servos.ids if line.ids is None else line.ids
+            servos = servos or EmulatedServos()
+            self._ids = settings.servos.ids if servos.ids is None else servos.ids
             self._events = parse_faults(faults, self._ids)
             with undisturbed():
                 self._links = LinkFolder(folder)
@@ -144,7 +144,7 @@ class Emulator:
             table = make_table(settings, make_material(settings.material), table_cache)
             self.hand = SimulatedHand(settings, 0.0, table)
             if settings.servos.backend != "none":
-                self._add_servos(settings, line)
+                self._add_servos(settings, servos)
             if settings.tactile.backend != "none":
                 for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
                     self._add_board(settings, finger)

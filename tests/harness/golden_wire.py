@@ -1,0 +1,112 @@
+"""Samples of every topic's message, and their golden bytes in ``tests/golden/``.
+
+``python -m tests.harness.golden_wire`` writes the bytes anew, after a field was added.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softfinger.daemon.loop.timing import Statistics, record
+from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import message_maker, packer
+
+
+def golden_file(topic: bytes) -> Path:
+    """Where a topic's golden bytes are kept."""
+    name = f"{topic.decode().replace('/', '-')}.msgpack"
+    return Path(__file__).parents[1] / "golden" / name
+
+
+class SampleTruth:
+    d = np.array([0.004, -0.001])
+    theta = np.array([0.1, -0.1])
+    force = np.array([10.5, 0.0])
+    object_pose = np.array([0.001, 0.08, 0.05])
+
+
+def sample_state() -> State:
+    """A state in which no two fields have the same value."""
+    state = State(seq=1234, t=12.5, wall=1.7e9 + 0.25, mode="holding", fault="", torque=True)
+    state.reading.seq, state.reading.t, state.reading.valid = 1234, 12.4995, True
+    state.timing.tick_s, state.timing.compute_s = 0.002, 15.5e-6
+    state.timing.wake_late_s, state.timing.overruns = 3.25e-6, 2
+    state.timing.behind_s, state.timing.busy_s = 1.875, 0.15625
+    for finger, contact in enumerate(state.contacts):
+        sign = 1.0 - 2.0 * finger
+        state.reading.q[finger] = 0.25 + 0.0625 * finger
+        state.reading.dq[finger] = 0.125 * sign
+        state.reading.current[finger] = 0.5 + finger
+        state.goal.q[finger] = 0.375 + 0.0625 * finger
+        state.goal.current[finger] = 0.75 + finger
+        contact.seq, contact.t, contact.valid, contact.contact = 77 + finger, 12.48, True, True
+        contact.d, contact.theta, contact.tilt_y = 0.004, 0.1 * sign, 0.01 * sign
+        contact.d_std, contact.theta_std, contact.gain = 2e-5, 1e-3, 1.01
+        contact.force, contact.energy = 10.5 + finger, 0.0125 + finger
+    state.goal.force, state.goal.angle = 11.25, 0.0625
+    state.object.valid, state.object.angle, state.object.width = True, 0.05, 0.04
+    return state
+
+
+def arguments(topic: bytes) -> tuple[Any, ...]:
+    """What a sample of the topic's message is made from."""
+    state, wall, t = sample_state(), 1.7e9 + 0.25, 12.5
+    if topic == schema.STATE:
+        return state, Parts(fingers=(True, True), servos=True, sensors=True), 5
+    if topic == schema.TACTILE:
+        counts = np.arange(20, dtype=np.uint16).reshape(4, 5) * 3000
+        frame = Frame(seq=77, t_sample=12.48, t_arrival=12.49, valid=True, data=counts)
+        facts = SensorFacts(
+            pitch=0.0013,
+            pitch_y=0.0014,
+            centre_x=1e-4,
+            centre_y=-2e-4,
+            rotation=0.01,
+            unit="count",
+            scale=4.0,
+            calibrated=False,
+            calibration="",
+        )
+        return frame, counts, 1, facts, 1.7e9 + 0.23, 4, 19
+    if topic == schema.STATS:
+        statistics = Statistics()
+        for k in range(1, 100):
+            times = (1e-6 * k, 10e-6 * k, 3e-6 * k, 2e-6 * k)
+            record(statistics.counts, statistics.largest, times)
+        return state, 0.002, schema.Rates(500.0, 100.0, 99.5, 50.0, 25.0), statistics, 500
+    if topic == schema.TRUTH:
+        return state, SampleTruth(), 5
+    if topic == schema.INPUT:
+        frame = Frame(77, t_sample=12.48, t_arrival=12.49, valid=True, data=np.zeros((4, 5), "<u2"))
+        return state, (frame, None)
+    if topic == schema.SETTINGS:
+        facts = HandFacts("0.1.0", '{"loop":{"rate":500.0}}', "", "{}", "{}", "{}")
+        return 1, 1.7e9, 10.0, facts
+    if topic == schema.COMMAND:
+        request = {"command": "grasp", "force": 5.0, "client": "notebook"}
+        return 3, wall, t, 1234, request, "arm first"
+    assert topic == schema.EVENT
+    return 5, wall, t, "warning", "late", "a tick came late — ß"
+
+
+def sample(topic: bytes) -> dict[str, Any]:
+    """A topic's message."""
+    return message_maker(topic)(*arguments(topic))
+
+
+def flat(message: dict[str, Any], outer: str = "") -> dict[str, Any]:
+    """A message without maps in it: ``left.q`` for q in ``left``."""
+    found: dict[str, Any] = {}
+    for key, value in message.items():
+        name = f"{outer}{key}"
+        found |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return found
+
+
+if __name__ == "__main__":
+    for topic in schema.TOPICS:
+        golden_file(topic).write_bytes(packer(topic)(*arguments(topic)))
