@@ -146,7 +146,7 @@ def _blur(settings: Settings) -> Iterator[str]:
     height = tactile.rows * (tactile.pitch_y or tactile.pitch)
     most = 0.5 * min(height, tactile.cols * tactile.pitch)
     if tactile.blur > most:
-        yield f"tactile.blur: found {tactile.blur:g} m, expected {most:g} m (half the sensor) or less"
+        yield f"tactile.blur: found {tactile.blur:g} m, expected half the sensor or less, {most:g} m"
 
 
 def _recordings(settings: Settings) -> Iterator[str]:
