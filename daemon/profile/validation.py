@@ -142,11 +142,11 @@ def _cells(settings: Settings) -> Iterator[str]:
 
 
 def _blur(settings: Settings) -> Iterator[str]:
-    tactile = settings.tactile
+    tactile, blur = settings.tactile, settings.tactile.blur
     height = tactile.rows * (tactile.pitch_y or tactile.pitch)
     most = 0.5 * min(height, tactile.cols * tactile.pitch)
-    if tactile.blur > most:
-        yield f"tactile.blur: found {tactile.blur:g} m, expected half the sensor or less, {most:g} m"
+    if blur > most:
+        yield f"tactile.blur: found {blur:g} m, expected at most {most:g} m, half the sensor"
 
 
 def _recordings(settings: Settings) -> Iterator[str]:

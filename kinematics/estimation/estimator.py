@@ -197,14 +197,15 @@ class ContactEstimator:
         Frames as for :meth:`update`. Raises ValueError for a wrong shape or type.
         """
         estimate = self._state.estimate
-        kept = self._estimate.copy()
+        kept, seq, last = self._estimate.copy(), self._seq, self._last
+        self._last = ContactEstimate()
         try:
             estimate.warm = False
-            found = self._run(frame, pascal_per_count, ContactEstimate())
+            found = self.update(frame, pascal_per_count)
             found.covariance[:] = estimate.covariance
             return found
         finally:
-            self._estimate[:] = kept
+            self._estimate[:], self._seq, self._last = kept, seq, last
 
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
@@ -218,29 +219,6 @@ class ContactEstimator:
         """
         if seq is not None and seq == self._seq:
             return self._last
-        self._run(frame, pascal_per_count, self._last)
-        self._seq = seq
-        return self._last
-
-    def reset(self) -> None:
-        """Forget the last estimate: the next frame starts cold."""
-        self._state.estimate.warm = False
-        self._seq = None
-
-    @property
-    def state(self) -> EstimatorState:
-        """The memory of :func:`estimation.frame_pipeline.estimate_frame`, for compiled callers."""
-        return self._state
-
-    @property
-    def arena(self) -> tuple[FloatArray, IntArray | None]:
-        """The arrays that the same function takes last; see `estimation.state`."""
-        return self._arena, self._places
-
-    def _run(
-        self, frame: NDArray[Any], pascal_per_count: float, result: ContactEstimate
-    ) -> ContactEstimate:
-        """Estimate from ``frame`` and fill in ``result``, but for its covariance."""
         full = _FULL.get(frame.dtype) if isinstance(frame, np.ndarray) else None
         if full is None:
             kind = getattr(frame, "dtype", type(frame).__name__)
@@ -261,6 +239,7 @@ class ContactEstimator:
             self._arena,
             self._places,
         )
+        result = self._last
         # The record's fields in their order: read at once, a tenth of the time of one by one.
         (
             result.d,
@@ -278,7 +257,23 @@ class ContactEstimator:
             result.second,
             *_,
         ) = self._estimate.item()
+        self._seq = seq
         return result
+
+    def reset(self) -> None:
+        """Forget the last estimate: the next frame starts cold."""
+        self._state.estimate.warm = False
+        self._seq = None
+
+    @property
+    def state(self) -> EstimatorState:
+        """The memory of :func:`estimation.frame_pipeline.estimate_frame`, for compiled callers."""
+        return self._state
+
+    @property
+    def arena(self) -> tuple[FloatArray, IntArray | None]:
+        """The arrays that the same function takes last; see `estimation.state`."""
+        return self._arena, self._places
 
 
 @lru_cache(maxsize=4)

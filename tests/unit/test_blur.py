@@ -280,7 +280,9 @@ def test_the_settings_blur_goes_into_the_fingers_estimator():
     assert e.valid
     assert e.d == pytest.approx(0.004, abs=2e-5)
     assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=2e-3)
-    with pytest.raises(SettingsError, match=r"tactile\.blur: found 0\.005 m, expected 0\.0026"):
+    with pytest.raises(
+        SettingsError, match=r"tactile\.blur: found 0\.005 m, expected at most 0\.0026"
+    ):
         load(changes=["tactile.rows=4", "tactile.cols=4", "tactile.blur=0.005"])
 
 
