@@ -1,0 +1,71 @@
+"""The solid tip's data file: limits, identities, and frames of another finite element method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import softfinger.kinematics.contact as contact
+from softfinger.tools.solid_tip.evaluate import SolidTip, centroid_and_extent
+from softfinger.tools.solid_tip.fit import NU, THETA_MAX
+
+FILE = Path(contact.__file__).parent / "solid_tip.npz"
+BASES = ("bonded", "lying")
+PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in radii
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, np.ndarray]:
+    with np.load(FILE) as data:
+        return dict(data)
+
+
+def tips(arrays: dict[str, np.ndarray]) -> list[SolidTip]:
+    return [SolidTip(arrays, base, poisson) for base in BASES for poisson in (*NU, 0.49)]
+
+
+def test_shallow_presses_are_those_of_hertz(arrays: dict[str, np.ndarray]) -> None:
+    for tip in tips(arrays):
+        for theta in (0.0, THETA_MAX):
+            for d in (1e-8, 1e-6):
+                push, energy, _ = tip.press(d, theta)
+                hertz = 4 / 3 / (1 - tip.poisson**2) * d**1.5
+                assert push == pytest.approx(hertz, rel=2 * np.sqrt(d))
+                assert energy == pytest.approx(0.4 * hertz * d, rel=2 * np.sqrt(d))
+
+
+def test_the_push_is_the_energy_s_slope_and_the_base_carries_it(
+    arrays: dict[str, np.ndarray],
+) -> None:
+    areas = np.pi * np.diff(arrays["ring_edges"] ** 2)
+    for tip in tips(arrays):
+        for d in (0.01, 0.1, 0.39):
+            for theta in (0.0, 0.3, -0.6):
+                push, _, pressure = tip.press(d, theta)
+                step = 1e-5 * d
+                slope = (tip.press(d + step, theta)[1] - tip.press(d - step, theta)[1]) / (2 * step)
+                assert push == pytest.approx(slope, rel=1e-7)
+                assert pressure[0] @ areas == pytest.approx(push * np.cos(theta), rel=1e-6)
+
+
+def test_the_other_tilt_mirrors_the_pressure(arrays: dict[str, np.ndarray]) -> None:
+    for tip in tips(arrays):
+        push, energy, pressure = tip.press(0.2, 0.4)
+        other = tip.press(0.2, -0.4)
+        sign = (-1.0) ** np.arange(len(pressure))
+        assert (push, energy) == other[:2]
+        np.testing.assert_allclose(other[2], sign[:, None] * pressure, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("d", "force"), [(1, 2.85), (4, 27.4), (6, 54.7)])
+def test_forces_of_an_axisymmetric_computation(
+    arrays: dict[str, np.ndarray], d: float, force: float
+) -> None:
+    """Bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa, upright; and σ_y near 9.7 mm."""
+    tip = SolidTip(arrays, "bonded", 0.49)
+    push, _, pressure = tip.press(d * MM, 0.0)
+    assert push * 0.304 * 20**2 == pytest.approx(force, rel=0.01)
+    _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
+    assert sigma == pytest.approx(9.7 * MM, abs=0.2 * MM)

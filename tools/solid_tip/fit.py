@@ -1,0 +1,154 @@
+"""From presses to the data file: one polynomial for the energy, a few modes for the base pressure.
+
+The energy's ratio to Hertz is fitted to energies and pushes together, so that N = ∂U/∂d holds
+exactly. The base pressure over N is split by singular values, one harmonic after the other; the
+modes' amplitudes are polynomials, too. Variables: s = √(d/a), sin²θ and ν, each by Chebyshev
+polynomials; the file's own notes say how they are put together.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from softfinger.tools.solid_tip.contact import Press
+from softfinger.tools.solid_tip.meridian import GAUSS, FloatArray, quadratic
+
+D_MAX, THETA_MAX = 0.4, np.radians(36.0)  # sin 36° < 1 − D_MAX: the plane stays above the base
+NU = (0.45, 0.4995)
+S_MAX = np.sqrt(D_MAX)
+RING_EDGES = np.sin(
+    np.linspace(0, np.pi / 2, 97)
+)  # fine at the rim, where a bonded base is singular
+ORDERS = (8, 6)  # coefficients in s and sin²θ
+HARMONICS = 9
+
+
+def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
+    """Chebyshev points of the first kind on [low, high], rising."""
+    return (low + high) / 2 - (high - low) / 2 * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+
+class Samples(NamedTuple):
+    """Presses of one base at one ν, as arrays over the presses."""
+
+    d: FloatArray
+    theta: FloatArray
+    push: FloatArray
+    energy: FloatArray
+    base: FloatArray  # (n, H, R) harmonics of the base pressure, means over rings
+
+    @classmethod
+    def of(cls, presses: list[Press], base_radius: FloatArray) -> Samples:
+        """Collects ``presses``; ``base_radius`` are the nodes of their base pressure."""
+        rings = ring_means(base_radius)
+        d, theta, push, energy = (
+            np.array([getattr(each, name) for each in presses])
+            for name in ("d", "theta", "push", "energy")
+        )
+        base = np.array([each.base[:HARMONICS] @ rings.T for each in presses])
+        return cls(d, theta, push, energy, base)
+
+
+def ring_means(base_radius: FloatArray) -> FloatArray:
+    """(R, B): area means over the rings of quadratic elements with nodes at ``base_radius``."""
+    points, gauss = GAUSS
+    ends = base_radius[::2]
+    cuts = np.unique(np.concatenate([RING_EDGES, ends]))
+    out = np.zeros((RING_EDGES.size - 1, base_radius.size))
+    for low, high in pairwise(cuts):
+        r = (low + high) / 2 + (high - low) / 2 * points
+        middle = (low + high) / 2
+        j = int(np.searchsorted(ends, middle)) - 1
+        ring = int(np.searchsorted(RING_EDGES, middle)) - 1
+        local = 2 * (r - ends[j]) / (ends[j + 1] - ends[j]) - 1
+        out[ring, 2 * j : 2 * j + 3] += (gauss * r * (high - low)) @ quadratic(local)[0]
+    return out / np.diff(RING_EDGES**2)[:, None]
+
+
+def terms(
+    s: FloatArray, theta: FloatArray, orders: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Products T_i T_j at each point, (n, I·J), and their derivatives by s."""
+    x, w = 2 * s / S_MAX - 1, 2 * (np.sin(theta) / np.sin(THETA_MAX)) ** 2 - 1
+    first, second = chebyshev.chebvander(x, orders[0] - 1), chebyshev.chebvander(w, orders[1] - 1)
+    slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(orders[0]))).T * (2 / S_MAX)
+    value, rise = (np.einsum("ni,nj->nij", each, second) for each in (first, slope))
+    return np.asarray(value.reshape(s.size, -1)), np.asarray(rise.reshape(s.size, -1))
+
+
+def energy_terms(s: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What the energy's coefficients add to U/U_Hertz and to N/N_Hertz at each point."""
+    value, slope = terms(s, theta, ORDERS)
+    return s[:, None] * value, s[:, None] * (1.2 * value + 0.2 * s[:, None] * slope)
+
+
+def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
+    """(I, J) coefficients of V in U = U_Hertz (1 + s V); ``step`` is the cells' width."""
+    s = np.sqrt(samples.d)
+    hertz = 4 / (3 * (1 - poisson**2)) * s**3
+    of_energy, of_push = energy_terms(s, samples.theta)
+    # A contact of radius s of cells of that width: the scatter of both, seen between meshes.
+    scatter = 1e-4 + np.concatenate([0.05 * (step / s) ** 2, 0.2 * (step / s) ** 2 + 5e-4])
+    right = np.concatenate([samples.energy / (0.4 * hertz * s**2) - 1, samples.push / hertz - 1])
+    left = np.concatenate([of_energy, of_push])
+    found = np.linalg.lstsq(left / scatter[:, None], right / scatter, rcond=None)[0]
+    return np.asarray(found.reshape(ORDERS), dtype=np.float64)
+
+
+def push_of(energy: FloatArray) -> FloatArray:
+    """Coefficients of Q in N = N_Hertz (1 + s Q), for those of V: Q = 6/5 V + s/5 ∂V/∂s."""
+    slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
+    s = np.array([S_MAX / 2, S_MAX / 2])  # s itself, as a Chebyshev series
+    product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)
+    return np.asarray(1.2 * energy + 0.2 * product[: len(energy)])
+
+
+def over_nu(values: FloatArray) -> FloatArray:
+    """Chebyshev coefficients along a last axis from values at the nodes of ν, the first axis."""
+    count = len(values)
+    x = chebyshev_nodes(-1, 1, count)
+    inverse = np.linalg.inv(chebyshev.chebvander(x, count - 1))
+    return np.asarray(np.einsum("ln,n...->...l", inverse, values))
+
+
+def fit(
+    all_samples: list[Samples], nodes: FloatArray, step: float, tolerance: float
+) -> dict[str, FloatArray]:
+    """The arrays of one base; ``nodes`` are the samples' values of ν, Chebyshev points."""
+    energy = np.array(
+        [fit_energy(one, nu, step) for one, nu in zip(all_samples, nodes, strict=True)]
+    )
+    push = np.array([push_of(each) for each in energy])
+    areas = np.pi * np.diff(RING_EDGES**2)
+    patterns = np.array([one.base / one.push[:, None, None] for one in all_samples])
+    cosine = np.cos(all_samples[0].theta)
+    first = np.mean(patterns[:, :, 0] / cosine[:, None], axis=(0, 1))
+    first /= areas @ first
+    patterns[:, :, 0] -= cosine[:, None] * first
+    scale = np.sqrt(areas @ first**2)
+    ms, basis, coef = [0], [first], [np.zeros((*ORDERS, len(nodes)))]
+    s = np.sqrt(all_samples[0].d)
+    for m in range(HARMONICS):
+        weight = np.sqrt(areas * (1.0 if m == 0 else 0.5))
+        flat = patterns[:, :, m].reshape(-1, areas.size) * weight
+        _, size, rows = np.linalg.svd(flat, full_matrices=False)
+        left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(flat)) / scale  # rms of what is cut
+        design = terms(s, all_samples[0].theta, ORDERS)[0]
+        design = design * np.sin(all_samples[0].theta)[:, None] ** m
+        for row in rows[: int(np.sum(left > tolerance))]:
+            ms.append(m)
+            basis.append(row / weight)
+            amplitude = (patterns[:, :, m] * weight) @ row
+            each = np.linalg.lstsq(design, amplitude.T, rcond=None)[0].T.reshape(-1, *ORDERS)
+            coef.append(over_nu(each))
+    return {
+        "push": over_nu(push),
+        "energy": over_nu(energy),
+        "m": np.array(ms, dtype=np.int32),
+        "basis": np.array(basis, dtype=np.float32),
+        "coef": np.array(coef, dtype=np.float32),
+    }

@@ -1,0 +1,126 @@
+"""Surface Green's functions of the hemisphere: what loads on its rings do to rings and base.
+
+A ring is one element of the arc. A traction that is constant along the ring's arc and of harmonic m
+around the axis moves every ring (mean over its arc), and presses on the base.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from softfinger.tools.solid_tip.meridian import GAUSS, FloatArray, IntArray, Meridian, quadratic
+
+STIFF = 1e4  # of the springs (in E) that hold what harmonic 1 would leave free
+CONTACT_END = np.radians(85.0)  # rings nearer to the rim carry no contact
+
+
+class Green(NamedTuple):
+    """Response of rings and base; components are (r, φ, z), rings go from the pole outwards."""
+
+    bonded: bool
+    poisson: float
+    place: FloatArray  # (R, 2) mean r and z of each ring [a]
+    weight: FloatArray  # (R,) ∫ r ds of each ring [a²]
+    cells: IntArray  # (R,) cells around each ring, an even number
+    rings: FloatArray  # (M + 1, 3, R, 3, R) weight × mean displacement for unit traction
+    base_radius: FloatArray  # (B,) nodes of the base [a]
+    base: FloatArray  # (H, B, 3, R) base pressure at them for unit traction
+
+
+def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of each ring: place (R, 2), ∫ r ds (R,), nodal weights ∫ N r ds (R, 3), and the angle."""
+    points, gauss = GAUSS
+    value, slope = quadratic(points)
+    arc = mesh.number[-1]
+    nodes = mesh.nodes[np.stack([arc[2 * j : 2 * j + 3] for j in range(mesh.arcs)])]
+    where = np.einsum("qa,rax->rqx", value, nodes)
+    length = np.linalg.norm(np.einsum("qa,rax->rqx", slope, nodes), axis=2) * gauss
+    share = length * where[:, :, 0]
+    weight = share.sum(axis=1)
+    place = np.einsum("rq,rqx->rx", share, where) / weight[:, None]
+    return place, weight, share @ value, np.arctan2(place[:, 0], place[:, 1])
+
+
+def base_mass(radius: FloatArray) -> sparse.csc_matrix:
+    """∫ N N r dr of the base's quadratic elements, whose nodes are at ``radius``."""
+    points, gauss = GAUSS
+    value, slope = quadratic(points)
+    rows, columns, entries = [], [], []
+    for j in range(0, radius.size - 2, 2):
+        r, stretch = value @ radius[j : j + 3], slope @ radius[j : j + 3]
+        matrix = np.einsum("q,qa,qb->ab", gauss * r * stretch, value, value)
+        index = np.arange(j, j + 3)
+        rows.append(np.repeat(index, 3))
+        columns.append(np.tile(index, 3))
+        entries.append(matrix.ravel())
+    each = (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csc_matrix(each, (radius.size, radius.size))
+
+
+def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
+    """Degrees of freedom that are zero: base, axis, and the twist that no symmetric load turns."""
+    base = 3 * mesh.base[:, None] + (np.arange(3) if bonded else np.array([2]))
+    axis = 3 * mesh.axis[:, None] + {0: [0, 1], 1: [2]}.get(m, [0, 1, 2])
+    twist = 3 * np.arange(len(mesh.nodes) if m == 0 else 0) + 1
+    return np.unique(np.concatenate([base.ravel(), axis.ravel(), twist]))
+
+
+def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
+    """Springs of harmonic 1: U + V = 0 on the axis; a lying base keeps its mean place."""
+    if m != 1:
+        return 0.0
+    size = 3 * len(mesh.nodes)
+    rows = [
+        sparse.csc_matrix(([1.0, 1.0], ([0, 0], [3 * k, 3 * k + 1])), (1, size)) for k in mesh.axis
+    ]
+    if not bonded:
+        share = np.asarray(base_mass(mesh.nodes[mesh.base, 0]).sum(axis=0)).ravel()
+        places = np.concatenate([3 * mesh.base, 3 * mesh.base + 1])
+        rows.append(
+            sparse.csc_matrix(
+                (np.concatenate([share, -share]), (np.zeros(places.size, int), places)), (1, size)
+            )
+        )
+    hold = sparse.vstack(rows)
+    return (STIFF * hold.T @ hold).tocsc()
+
+
+def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) -> Green:
+    """Green's functions for ``rings`` elements along the arc; a cell is as long as it is wide."""
+    mesh = Meridian(rings)
+    place, weight, nodal, angle = arc_loads(mesh)
+    count = int(np.sum(angle < CONTACT_END))
+    place, weight, nodal = place[:count], weight[:count], nodal[:count]
+    cells = 2 * np.maximum(np.round(place[:, 0] * 2 * rings).astype(np.int64), 3)
+    harmonics = int(cells.max()) // 2
+    arc = mesh.number[-1]
+    size = 3 * len(mesh.nodes)
+    base_z = 3 * mesh.base + 2
+    base_radius = mesh.nodes[mesh.base, 0]
+    to_pressure = splu(base_mass(base_radius))
+    out = np.zeros((harmonics + 1, 3, count, 3, count))
+    base = np.zeros((base_harmonics + 1, mesh.base.size, 3, count))
+    for m in range(harmonics + 1):
+        active = np.flatnonzero(cells // 2 >= m)
+        matrix = mesh.stiffness(m, poisson)
+        free = np.setdiff1d(np.arange(size), fixed(mesh, m, bonded))
+        held = (matrix + supports(mesh, m, bonded)).tocsc()[free][:, free]
+        factors = splu(
+            held, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        loads = np.zeros((size, 3 * active.size))  # columns: component, then ring
+        for k, ring in enumerate(active):
+            for c in range(3):
+                loads[3 * arc[2 * ring : 2 * ring + 3] + c, c * active.size + k] = nodal[ring]
+        moved = np.zeros_like(loads)
+        moved[free] = factors.solve(loads[free])
+        response = (loads.T @ moved).reshape(3, active.size, 3, active.size)
+        out[m][:, active[:, None], :, active] = response.transpose(1, 3, 0, 2)
+        if m <= base_harmonics:
+            pressure = to_pressure.solve(matrix[base_z] @ moved)
+            base[m][:, :, active] = pressure.reshape(-1, 3, active.size)
+    return Green(bonded, poisson, place, weight, cells, out, base_radius, base)
