@@ -28,14 +28,14 @@ _FILE = Path(__file__).with_name("solid_tip.npz")
 
 @dataclass(frozen=True, eq=False)
 class SolidData:
-    """A solid tip of E = a = 1 and one ν; polynomials are Chebyshev's, rows by t, then by sin² θ.
+    """A solid tip of E = a = 1 and one ν.
 
-    They are of x = 2 t/``root`` − 1 and of y = 2 sin² θ/``square`` − 1.
+    Polynomials are by powers of x = 2 t/``root`` − 1, then of y = 2 sin² θ/``square`` − 1.
     """
 
     root: float  # largest t
     square: float  # largest sin² θ
-    energy: FloatArray  # g [i, j]
+    energy: FloatArray  # g, and its partials by t, t twice, sin² θ, and both [5, i, j]
     harmonics: NDArray[np.int64]  # m of each mode [k]; 0 of the first
     shares: FloatArray  # q [k, i, j]; none of the first
     edges: FloatArray  # of the rings in r/a [rings + 1]
@@ -66,25 +66,34 @@ def solid_data(tip: Fingertip) -> SolidData:
     ratio[1:] += 0.5 * more[:-1]
     ratio[1] += 0.5 * more[0]
     ratio[0, 0] += 1.0
+    square = float(np.sin(kept["theta_max"]) ** 2)
+    energy = powers(ratio * 8.0 / (15.0 * (1.0 - tip.poisson**2)))
+    by_t = 2.0 / root * _slope(energy)
+    by_both = 2.0 / square * _slope(by_t.T).T
     return SolidData(
         root,
-        float(np.sin(kept["theta_max"]) ** 2),
-        ratio * 8.0 / (15.0 * (1.0 - tip.poisson**2)),
+        square,
+        np.stack(
+            [energy, by_t, 2.0 / root * _slope(by_t), 2.0 / square * _slope(energy.T).T, by_both]
+        ),
         kept["m"].astype(np.int64),
-        by_poisson(kept["coef"]),
+        np.stack([powers(by_poisson(each)) for each in kept["coef"]]),
         kept["ring_edges"],
         kept["basis"],
         float(kept.get("error", 0.0)),
     )
 
 
-def powers(terms: NDArray[Any]) -> NDArray[Any]:
+def powers(terms: FloatArray) -> FloatArray:
     """Chebyshev coefficients [i, j] as those of powers."""
-    for axis in (0, 1):
-        terms = np.apply_along_axis(_rising, axis, terms)
-    return terms
+    left, right = (
+        np.array([np.pad(chebyshev.cheb2poly(row), (0, n))[:n] for row in np.eye(n)])
+        for n in terms.shape
+    )
+    return np.asarray(left.T @ terms @ right)
 
 
-def _rising(terms: NDArray[Any]) -> NDArray[Any]:
-    found = chebyshev.cheb2poly(terms)
-    return np.pad(found, (0, len(terms) - len(found)))
+def _slope(rising: FloatArray) -> FloatArray:
+    """The derivative of polynomials of columns, as many powers."""
+    factors = np.arange(1.0, len(rising))[:, None]
+    return np.concatenate([rising[1:] * factors, np.zeros((1, rising.shape[1]))])

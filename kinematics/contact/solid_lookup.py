@@ -14,7 +14,6 @@ import numba
 import numpy as np
 from numba.core import types
 from numba.core.extending import intrinsic
-from numpy.polynomial import chebyshev
 
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records
@@ -30,7 +29,7 @@ from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
 from softfinger.kinematics.contact.lookup import Six, lookup_at, stiffness_ahead
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
-from softfinger.kinematics.contact.solid_data import FloatArray, SolidData, powers, solid_data
+from softfinger.kinematics.contact.solid_data import FloatArray, SolidData, solid_data
 
 _SHAPE = 9
 
@@ -73,16 +72,10 @@ def solid_table(tip: Fingertip, material: Material) -> SolidTable:
 
 def _numbers(data: SolidData) -> FloatArray:
     """g and its partials as the numbers that `compiled.simd` evaluates."""
-    by_t = chebyshev.chebder(data.energy, axis=0) * (2.0 / data.root)
-    by_tt = chebyshev.chebder(by_t, axis=0) * (2.0 / data.root)
-    by_s, by_ts = (
-        chebyshev.chebder(each, axis=1) * (2.0 / data.square) for each in (data.energy, by_t)
-    )
     terms, rows = SHAPES[_SHAPE][0], len(SHAPES[_SHAPE])
     out = np.zeros((rows, terms, STRIDE))
-    for lane, each in enumerate((data.energy, by_t, by_tt, by_s, by_ts)):
-        i, j = each.shape
-        out[:j, terms - i :, lane] = powers(each)[::-1].T
+    lanes, i, j = data.energy.shape
+    out[:j, terms - i :, :lanes] = data.energy[:, ::-1].T
     return out.reshape(-1)
 
 

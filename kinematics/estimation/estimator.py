@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -22,8 +23,9 @@ from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
+from softfinger.kinematics.estimation.solid_fit import SolidFit, solid_fit
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
-from softfinger.kinematics.sensing.cell_integrals import LIVE, cell_integrals
+from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
@@ -122,8 +124,9 @@ class ContactEstimator:
 
     Takes the tip, its material, the grid, and ``noise``, a cell's standard deviation [Pa].
     ``method`` is "ml" (maximum likelihood) or "moments". ``free_gain`` also estimates measured over
-    modelled pressure, which is 1 otherwise. ``live`` [rows, cols] bool masks dead cells.
-    ``readings`` says where the board's readings end.
+    modelled pressure, by default for a tip of springs alone: a solid tip's frame hardly changes its
+    shape with d, which then shows in the force only. Otherwise it is 1. ``live`` [rows, cols] bool
+    masks dead cells. ``readings`` says where the board's readings end.
 
     Raises ValueError for arguments out of their range.
     """
@@ -136,7 +139,7 @@ class ContactEstimator:
         noise: float,
         *,
         method: Literal["ml", "moments"] = "ml",
-        free_gain: bool = True,
+        free_gain: bool | None = None,
         live: NDArray[np.bool_] | None = None,
         readings: Readings | None = None,
     ) -> None:
@@ -144,6 +147,8 @@ class ContactEstimator:
             raise ValueError(f"noise must be a positive number of Pa, got {noise}")
         if method not in ("ml", "moments"):
             raise ValueError(f"method must be 'ml' or 'moments', got {method!r}")
+        if tip.physics == "solid" and method == "moments":
+            raise ValueError("method must be 'ml' for a solid tip: its moments hardly show d and θ")
         if live is not None and np.shape(live) != grid.shape:
             raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
         readings = readings or Readings()
@@ -157,7 +162,7 @@ class ContactEstimator:
         options.saturation = math.inf
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
         options.floor = max(readings.threshold - 0.5, 0.0)
-        options.free_gain = free_gain
+        options.free_gain = tip.physics == "springs" if free_gain is None else free_gain
         options.fixed_gain = 1.0
         options.tolerance = _TOLERANCE
         options.iterations = _ITERATIONS
@@ -168,9 +173,16 @@ class ContactEstimator:
         options.modulus = material.reference_modulus
         options.blur = grid.blur
         options.rotation = grid.rotation
-        set_law(state.law, material.law)
-        state.moments.ratios = moment_ratios(tip, material)
-        self._arena, self._places = _lay_out(state, grid, tip, alive)
+        self._solid: Any = None
+        self._places: IntArray | None
+        if tip.physics == "solid":
+            self._arena, self._places, self._solid = _lay_out_solid(
+                state, grid, tip, alive, material
+            )
+        else:
+            set_law(state.law, material.law)
+            state.moments.ratios = moment_ratios(tip, material)
+            self._arena, self._places = _lay_out(state, grid, tip, alive)
         self._estimate: Any = state.estimate.array
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
@@ -238,6 +250,7 @@ class ContactEstimator:
             float(step),
             self._arena,
             self._places,
+            self._solid,
         )
         result = self._last
         # The record's fields in their order: read at once, a tenth of the time of one by one.
@@ -271,9 +284,9 @@ class ContactEstimator:
         return self._state
 
     @property
-    def arena(self) -> tuple[FloatArray, IntArray | None]:
-        """The arrays that the same function takes last; see `estimation.state`."""
-        return self._arena, self._places
+    def arena(self) -> tuple[FloatArray, IntArray | None, Any]:
+        """What the same function takes last; see `estimation.state`."""
+        return self._arena, self._places, self._solid
 
 
 @lru_cache(maxsize=4)
@@ -323,3 +336,28 @@ def _lay_out(
         setattr(state.at, name, start)
         start += array.size
     return np.concatenate([array.ravel() for array in arrays.values()]), places
+
+
+def _lay_out_solid(
+    state: EstimatorState,
+    grid: SensorGrid,
+    tip: Fingertip,
+    live: NDArray[np.bool_],
+    material: Material,
+) -> tuple[FloatArray, IntArray, Records[SolidFit]]:
+    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory."""
+    geometry = grid.on(tip)
+    state.grid.assign(geometry)
+    state.model.assign(geometry)
+    centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
+    cells = np.zeros((grid.rows, CELL_PLANES, grid.cols))
+    places = np.flatnonzero(centres[HEIGHT] >= 0.0).astype(np.int64)
+    packed = np.ascontiguousarray(grid.pictures(tip)[:, places])
+    solid = solid_fit(tip, material, packed)
+    state.at.cells = centres.size
+    solid.packed = centres.size + cells.size
+    solid.readings = solid.packed + packed.size
+    solid.model = solid.readings + len(places)
+    scratch = np.zeros(2 * len(places))
+    arena = np.concatenate([centres.ravel(), cells.ravel(), packed.ravel(), scratch])
+    return arena, places, solid.array

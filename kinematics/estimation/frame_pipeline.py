@@ -15,6 +15,7 @@ from softfinger.kinematics.estimation.detection import presses_outside
 from softfinger.kinematics.estimation.gauss_newton import fit
 from softfinger.kinematics.estimation.moments import refine, start_from_frame
 from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
+from softfinger.kinematics.estimation.solid_fit import SolidFit, fit_solid, presses, start_solid
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 
@@ -66,9 +67,14 @@ def _track_moments(state: EstimatorState, frame: Pointer, centres: Pointer) -> b
 
 @inner_kernel
 def _likelihood(
-    state: EstimatorState, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray | None,
+    solid: SolidFit | None,
 ) -> bool:
-    """Maximum likelihood from the last estimate, or from the frame's moments if that fails."""
+    """Maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
@@ -79,12 +85,18 @@ def _likelihood(
         if attempt == 0 and not estimate.warm:
             continue
         estimate.second = False
-        if attempt == 1:
+        if attempt == 1 and solid is None:
             _start(state, frame, centres)
+        if attempt == 1 and solid is not None:
+            start_solid(state, solid, frame, arena, centres, address(places))
         if not options.free_gain:
             estimate.gain = options.fixed_gain
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
-        if fit(state, frame, arena, places, energy, tolerance):
+        if solid is None:
+            found = fit(state, frame, arena, places, energy, tolerance)
+        else:
+            found = fit_solid(state, solid, frame, arena, centres, address(places), tolerance)
+        if found:
             # Share of the frame's squared pressure, noise apart, that the model accounts for.
             scatter = variance * math.sqrt(2.0 * number)
             misfit = max(energy + estimate.residual - number * variance, 0.0)
@@ -93,7 +105,7 @@ def _likelihood(
             if estimate.explained < options.explained_min:
                 continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
-            if misfit > 8.0 * scatter + 0.003 * energy:
+            if solid is None and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 estimate.second = presses_outside(state, frame, centres, level)
             if not estimate.second:
@@ -132,19 +144,24 @@ def _to_tilts(state: EstimatorState) -> None:
 
 @inner_kernel
 def _estimate(
-    state: EstimatorState, frame: Pointer, arena: Pointer, centres: Pointer, places: IntArray | None
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray | None,
+    solid: SolidFit | None,
 ) -> bool:
     """The estimate of a frame with a contact; whether it can be used."""
     estimate = state.estimate
     done = False
-    if state.options.moments_only:
+    if solid is None and state.options.moments_only:
         if estimate.warm:
             done = _track_moments(state, frame, centres)
         if not done:
             _start(state, frame, centres)
             done = True
     else:
-        done = _likelihood(state, frame, arena, centres, places)
+        done = _likelihood(state, frame, arena, centres, places, solid)
     in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
     _to_tilts(state)
     return done and in_range
@@ -185,14 +202,17 @@ def estimate_frame(
     step: float,
     arena: FloatArray,
     places: IntArray | None,
+    solids: Records[SolidFit] | None = None,
 ) -> None:
     """One frame → the estimate in the state. The only compiled entry of the estimator.
 
     ``frame`` float64 [rows, cols] in counts, contiguous, ``scale`` Pa a count, ``step`` the width
     of a count's quantum [Pa], 0 for none. ``arena`` as `state.Places` says; ``places`` is scratch
-    for a blur, None without one, and then nothing for a blur is compiled.
+    for a blur, None without one, and then nothing for a blur is compiled. A solid tip has
+    ``solids``, and the live cells' numbers in ``places``; any other tip None, likewise.
     """
     state = states[0]
+    solid = None if solids is None else solids[0]
     estimate = state.estimate
     readings = address(frame)
     start = address(arena)
@@ -201,12 +221,14 @@ def estimate_frame(
     _begin(state, scale, step)
     rejected = without_outliers(state, readings, cells, centres)
     signal = state.signal
+    if solid is not None and signal.finite:
+        signal.contact = presses(state, solid, readings, start, address(places))
     estimate.peak = signal.peak * scale
     estimate.rejected = rejected
     estimate.contact = signal.contact
     done = False
     if signal.contact:
-        done = _estimate(state, readings, start, centres, places)
+        done = _estimate(state, readings, start, centres, places, solid)
     else:
         estimate.d = 0.0
         estimate.n_x = 0.0

@@ -18,11 +18,11 @@ from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.solid_data import powers, solid_data
+from softfinger.kinematics.contact.solid_data import solid_data
 from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes, solid_table
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
-MODES = 24
+MODES = 48
 PICTURES = 2 * MODES
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
 
@@ -55,7 +55,7 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
     count, i, j = data.shares.shape
     weights.modes, weights.pictures = count, pictures_of(data.harmonics)
     weights.harmonics[:count] = data.harmonics
-    weights.shares[:j, :i, :count] = np.stack([powers(each).T for each in data.shares], axis=-1)
+    weights.shares[:j, :i, :count] = data.shares.T
     return weights
 
 
@@ -136,6 +136,10 @@ def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     by_x[0] = n_x * both
     by_y[0] = n_y * both
     _evaluate_shares(weights, x, y)
+    # (n_x + i n_y)^m and its derivative over m; modes stand in the order of m.
+    m = 0
+    power = 1.0 + 0.0j
+    below = 0.0j
     at = 1
     for k in range(1, weights.modes):
         q = weights.q[k]
@@ -144,13 +148,10 @@ def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
         share = push * q
         share_d = (push_t * q + push * q_t) * t_d
         share_s = 2.0 * (push_s * q + push * q_s)
-        m = weights.harmonics[k]
-        # (n_x + i n_y)^m and its derivative over m.
-        power = 1.0 + 0.0j
-        below = 0.0j
-        for _ in range(m):
+        while m < weights.harmonics[k]:
             below = power
             power *= complex(n_x, n_y)
+            m += 1
         value[at] = share * power.real
         by_d[at] = share_d * power.real
         by_x[at] = share_s * n_x * power.real + share * m * below.real

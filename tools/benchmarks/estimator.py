@@ -27,6 +27,7 @@ from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
+from softfinger.kinematics.estimation.solid_fit import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.campaigns import accuracy_envelope
@@ -124,6 +125,7 @@ def _loop(
     states: Records[EstimatorState],
     arena: FloatArray,
     places: NDArray[np.int64] | None,
+    solids: Records[SolidFit] | None,
     out: FloatArray,
 ) -> None:
     estimate = states[0].estimate
@@ -131,7 +133,7 @@ def _loop(
         for k in range(frames.shape[0]):
             if cold:
                 estimate.warm = False
-            estimate_frame(states, frames[k], 1.0, 0.0, arena, places)
+            estimate_frame(states, frames[k], 1.0, 0.0, arena, places, solids)
             out[k, 0] = estimate.d
             out[k, 1] = estimate.tilt_x
             out[k, 2] = estimate.tilt_y
