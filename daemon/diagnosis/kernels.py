@@ -16,7 +16,7 @@ def check_kernels(settings: Settings) -> list[Result]:
         problem = f"can't be used, so every start compiles: {error}"
         fix = "export NUMBA_CACHE_DIR=FOLDER, one that is yours alone"
         return [Result("warn", "kernel cache", problem, fix)]
-    cold = [part.name for part in parts(settings) if not is_built(part)]
+    cold = [part.name for part in parts(settings) if not is_built(part, settings)]
     if not cold:
         return [Result("pass", "kernels", f"compiled, in {folder}")]
     problem = f"{', '.join(cold)} not compiled yet: the next start takes longer"

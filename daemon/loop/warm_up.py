@@ -88,28 +88,28 @@ def named(name: str) -> Part:
     return {each.name: each for each in ALL}[name]
 
 
-def is_built(part: Part) -> bool:
-    """Whether ``part`` was compiled from the present sources and is kept."""
+def is_built(part: Part, settings: Settings) -> bool:
+    """Whether ``part`` was compiled from the present sources, for such tips, and is kept."""
     folder = kernel_folder()
-    return folder is not None and _mark(folder, part).exists()
+    return folder is not None and _mark(folder, part, settings).exists()
 
 
-def mark_built(part: Part) -> None:
+def mark_built(part: Part, settings: Settings) -> None:
     """``part`` was compiled and is kept, where anything can be."""
     folder = kernel_folder()
     if folder is not None:
-        _mark(folder, part).touch()
+        _mark(folder, part, settings).touch()
 
 
-def _mark(folder: Path, part: Part) -> Path:
-    return folder / f"{part.name.replace(' ', '-')}.built"
+def _mark(folder: Path, part: Part, settings: Settings) -> Path:
+    return folder / f"{part.name.replace(' ', '-')}-{settings.tip.physics}.built"
 
 
 def warm_up(scene: WantedScene) -> None:
     """Run every part of ``scene``. Raises as `profile.factory` for settings that can't be met."""
     for part in parts(scene.settings):
         part.run(scene)
-        mark_built(part)
+        mark_built(part, scene.settings)
 
 
 def _table(scene: WantedScene) -> None:

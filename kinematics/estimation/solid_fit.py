@@ -176,8 +176,10 @@ def _read(
         at = places[k]
         reading = frame[at] * signal.scale
         pressure = model[k]
+        outlier = height[at] < 0.0
         full = reading >= signal.saturation and pressure >= signal.saturation
-        if full or height[at] < 0.0:
+        raw += 0.0 if outlier else reading * reading
+        if full or outlier:
             # Saturated, or an outlier: it doesn't count.
             if solid.counted == solid.cells:
                 solid.used[:] = solid.products
@@ -189,7 +191,6 @@ def _read(
             readings[k] = 0.0
             changed = changed or full
             continue
-        raw += reading * reading
         if pressure < near:
             reading = max(reading, signal.floor) - _excess(pressure, floor, clip)
             changed = True

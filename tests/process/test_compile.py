@@ -73,7 +73,7 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
     assert (again.returncode, again.stdout, again.stderr) == (0, "all kernels are compiled\n", "")
     # What can't be built is told, and by the exit status, too.
     (folder,) = (tmp_path / "softfinger").glob("kernels-*")
-    (folder / "contact-table.built").unlink()
+    (folder / "contact-table-springs.built").unlink()
     bad = compiled(tmp_path, "--config", str(steep(tmp_path)))
     assert bad.returncode == 1
     assert "contact table was not compiled ahead: SettingsError: table.tolerance" in bad.stderr

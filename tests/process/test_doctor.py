@@ -329,7 +329,7 @@ def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     assert found.status == "warn"
     assert "contact table not compiled yet" in found.text
     for part in warm_up.parts(scene):
-        warm_up.mark_built(part)
+        warm_up.mark_built(part, scene)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "pass"
     (folder,) = tmp_path.glob("kernels-*")

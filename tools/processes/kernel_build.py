@@ -57,7 +57,7 @@ def build_kernels(
     terminal and ``bar`` allows it, else a call of ``tell`` for each part, as (level, kind, text);
     failures go to ``tell``, too. When interrupted it ends every process.
     """
-    missing = [part for part in wanted or parts(settings) if not is_built(part)]
+    missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
         return Built(0, False)
     if kernel_folder() is None:
@@ -273,7 +273,7 @@ def main() -> None:
         except Exception as error:
             tell(f"failed {type(error).__name__}: {error}".replace("\n", " "))
         else:
-            mark_built(part)
+            mark_built(part, settings)
             tell("done")
 
 

@@ -1,0 +1,187 @@
+"""A tip of solid rubber: its table, its frames, the estimator on them, a hand with such tips."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.contact.material import MaterialError
+from softfinger.kinematics.estimation.estimator import Readings
+from tests.harness.loop import Make, command, grasped
+
+TIPS = [Fingertip(0.020, "solid", 0.49, "bonded"), Fingertip(0.020, "solid", 0.45, "lying")]
+RUBBER = Material.constant(0.304e6)
+GRID = SensorGrid(44, 44, 0.058 / 44)
+AREA = GRID.pitches[0] ** 2
+NOISE = 608.0  # Pa
+
+both = pytest.mark.parametrize("tip", TIPS, ids=lambda tip: tip.base)
+
+
+@both
+def test_the_partials_are_those_of_one_energy(tip: Fingertip) -> None:
+    table = ContactTable.build(tip, RUBBER)
+    d, theta = np.meshgrid([0.4e-3, 3e-3, 7.5e-3], [-0.6, -0.1, 0.0, 0.3])
+    c, h = table(d, theta), 1e-6
+    assert c.inside.all()
+    assert c.force == pytest.approx(np.cos(theta) * c.energy_d, rel=1e-12)
+    for field, up, down in (
+        ("d", table(d + h, theta), table(d - h, theta)),
+        ("theta", table(d, theta + h), table(d, theta - h)),
+    ):
+        for name in ("energy", "force"):
+            slope = (getattr(up, name) - getattr(down, name)) / (2.0 * h)
+            size = np.abs(slope).max()
+            assert getattr(c, f"{name}_{field}") == pytest.approx(slope, rel=1e-5, abs=1e-6 * size)
+    one = table(float(d[1, 1]), float(theta[1, 1]))
+    assert [float(each) for each in one[:6]] == [float(each[1, 1]) for each in c[:6]]
+
+
+@both
+def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip: Fingertip) -> None:
+    table = ContactTable.build(tip, RUBBER)
+    stiffness = 4.0 / 3.0 * 0.304e6 / (1.0 - tip.poisson**2) * math.sqrt(tip.radius)
+    # What confines the rubber raises the force with the contact's radius over a, √(d/a).
+    ratios = [float(table(d, 0.0).force) / (stiffness * d**1.5) for d in (1e-8, 1e-7)]
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.01)
+    end, beyond = table(0.008, 0.0), table(0.0081, 0.0)
+    assert end.inside
+    assert not beyond.inside
+    assert beyond.force == end.force
+    assert not table(0.004, 0.7).inside
+    assert table(-1e-3, 0.1).force == 0.0
+    assert math.isnan(table(math.nan, 0.1).force)
+
+
+def test_what_no_solid_tip_has_is_refused() -> None:
+    with pytest.raises(MaterialError, match="constant modulus"):
+        ContactTable.build(TIPS[0], Material.table_i())
+    with pytest.raises(ValueError, match="'ml' for a solid tip"):
+        ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, method="moments")
+    with pytest.raises(ValueError, match=r"poisson must be 0\.45 to 0\.4995"):
+        Fingertip(0.02, "solid", 0.5)
+    with pytest.raises(ValueError, match="base must be 'bonded' or 'lying'"):
+        Fingertip(0.02, "solid", base="glued")  # type: ignore[arg-type]
+
+
+def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:
+    tip, d, theta = TIPS[0], 0.005, 0.35
+    force = float(ContactTable.build(tip, RUBBER)(d, theta).force)
+    shifted = SensorGrid(50, 40, (0.0014, 0.0011), centre=(7e-4, -3e-4))
+    for grid in (GRID, shifted, SensorGrid(44, 44, 0.058 / 44, blur=1.2e-3)):
+        for azimuth in (0.0, 1.0, 4.0):
+            tilt_x = math.asin(math.sin(theta) * math.cos(azimuth))
+            tilt_y = math.asin(math.sin(theta) * math.sin(azimuth))
+            pressure = grid.pressure(tip, RUBBER, d, tilt_x, tilt_y)
+            assert pressure.sum() * math.prod(grid.pitches) == pytest.approx(force, rel=3e-3)
+    along_x = GRID.pressure(tip, RUBBER, d, theta, 0.0)
+    along_y = GRID.pressure(tip, RUBBER, d, 0.0, theta)
+    assert along_y == pytest.approx(along_x.T, abs=1e-6 * along_x.max())
+    turned = SensorGrid(44, 44, 0.058 / 44, rotation=0.5 * math.pi)
+    assert turned.pressure(tip, RUBBER, d, theta, 0.0)[::-1] == pytest.approx(
+        along_y, abs=1e-6 * along_x.max()
+    )
+
+
+@both
+@pytest.mark.parametrize("counts", [False, True])
+def test_the_estimate_is_at_its_bound(tip: Fingertip, counts: bool) -> None:
+    rng = np.random.default_rng(3)
+    estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
+    squares = []
+    for d in (0.7e-3, 2e-3, 4e-3, 7e-3):
+        for theta in (0.0, 0.25, 0.5):
+            for azimuth in rng.uniform(0.0, 2.0 * math.pi, 8):
+                tilt_x = math.asin(math.sin(theta) * math.cos(azimuth))
+                tilt_y = math.asin(math.sin(theta) * math.sin(azimuth))
+                frame = GRID.pressure(tip, RUBBER, d, tilt_x, tilt_y)
+                frame = frame + NOISE * rng.standard_normal(GRID.shape)
+                if counts:
+                    found = estimator(np.maximum(frame / 4.0 + 0.5, 0.0).astype(np.uint16), 4.0)
+                else:
+                    found = estimator(frame)
+                assert found.valid
+                assert found.contact
+                error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
+                squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
+    # 96 frames of three numbers: 1 ± 0.08.
+    assert 0.7 < np.mean(squares) < 1.3
+
+
+def test_noise_and_shifted_zeros_are_no_contact() -> None:
+    rng = np.random.default_rng(4)
+    estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
+    for _ in range(300):
+        noise = NOISE * rng.standard_normal(GRID.shape)
+        assert not estimator(noise).contact
+        assert not estimator(noise + 2.0 * NOISE).contact
+        assert not estimator(np.maximum(noise / 4.0, 0.0).astype(np.uint16), 4.0).contact
+    assert estimator(GRID.pressure(TIPS[0], RUBBER, 0.4e-3) + noise).contact
+
+
+def test_dead_full_and_lone_cells_are_left_out() -> None:
+    rng = np.random.default_rng(5)
+    live = rng.random(GRID.shape) > 0.1
+    live[8, 20] = True
+    truth = (0.005, 0.2, -0.1)
+    frame = GRID.pressure(TIPS[0], RUBBER, *truth) + NOISE * rng.standard_normal(GRID.shape)
+    frame[~live] = 0.0
+    frame[live & (frame > 45e3)] = 45e3  # 60 cells
+    frame[8, 20] = 200e3
+    readings = Readings(saturation=45e3)
+    found = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, live=live, readings=readings)(frame)
+    assert found.valid
+    assert found.rejected == 1
+    error = np.array([found.d, found.tilt_x, found.tilt_y]) - truth
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
+
+
+def test_another_tips_frame_is_a_misfit() -> None:
+    estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
+    springs = GRID.pressure(Fingertip(0.020), RUBBER, 0.004, 0.2)
+    found = estimator(springs)
+    assert found.contact
+    assert found.misfit or not found.valid
+
+
+def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
+    profile = load(Path("solid")).model_dump(exclude={"loop"})
+    daemon = make(**profile)
+    grasped(daemon, 10.0)
+    daemon.loop.advance(1.0)
+    hand, state = daemon.hand, daemon.loop.state
+    assert hand is not None
+    for angle in (0.1, -0.1):
+        command(daemon, "rotate", angle=angle)
+        daemon.loop.advance(3.0)
+        assert hand.object_pose[2] == pytest.approx(angle, abs=math.radians(0.5))
+        for finger, contact in enumerate(state.contacts):
+            assert contact.valid
+            assert not contact.misfit
+            assert contact.d == pytest.approx(hand.d[finger], abs=5.0 * contact.d_std)
+            assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
+            assert contact.force == pytest.approx(hand.force[finger], rel=0.03)
+    assert state.fault == ""
+    command(daemon, "release")
+    daemon.loop.advance(1.5)
+    assert state.mode == "armed"
+    assert not any(contact.contact for contact in state.contacts)
+
+
+def test_a_profile_that_no_solid_tip_has_is_refused() -> None:
+    from softfinger.daemon.profile.validation import problems
+
+    settings = Settings.model_validate(
+        {"tip": {"physics": "solid"}, "estimator": {"method": "moments"}}
+    )
+    assert [each.partition(":")[0] for each in problems(settings)] == [
+        "material.law",
+        "estimator.method",
+        "safety.d_max",
+    ]
