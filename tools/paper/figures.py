@@ -14,12 +14,17 @@ NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
     *("fig7", "fig7_run", "fig10", "fig10_run", "fig11"),
 )
+BY_NAME = ("basin",)  # the long ones, drawn only when they are named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``figures``."""
     parser.add_argument(
-        "names", metavar="NAME", nargs="*", help=f"which: {', '.join(NAMES)}; all if none is named"
+        "names",
+        metavar="NAME",
+        nargs="*",
+        help=f"which: {', '.join(NAMES)} (all these if none is named); "
+        f"{', '.join(BY_NAME)}: a minute or two",
     )
     parser.add_argument(
         "--out",
@@ -32,18 +37,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, FigurePage]:
     """All figures by name."""
-    from softfinger.tools.paper import appendix, experiment_pages, model_pages, run_pages
+    from softfinger.tools.paper import appendix, basin, experiment_pages, model_pages, run_pages
 
-    pages = (model_pages.PAGES, experiment_pages.PAGES, run_pages.PAGES, appendix.PAGES)
-    found = {name: page for each in pages for name, page in each.items()}
-    return {name: found[name] for name in NAMES}
+    modules = (model_pages, experiment_pages, run_pages, appendix, basin)
+    found = {name: page for each in modules for name, page in each.PAGES.items()}
+    return {name: found[name] for name in (*NAMES, *BY_NAME)}
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the numbers, then the pictures where matplotlib is installed."""
-    unknown = [name for name in arguments.names if name not in NAMES]
+    known = (*NAMES, *BY_NAME)
+    unknown = [name for name in arguments.names if name not in known]
     if unknown:
-        print(f"figures: found {unknown[0]!r}, expected one of {', '.join(NAMES)}", file=sys.stderr)
+        print(f"figures: found {unknown[0]!r}, expected one of {', '.join(known)}", file=sys.stderr)
         return 2
     try:
         arguments.out.mkdir(parents=True, exist_ok=True)
