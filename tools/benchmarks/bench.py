@@ -54,6 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--only", default="", metavar="PATTERN", help="cases of a campaign with this in their name"
     )
+    parser.add_argument(
+        "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     parser.add_argument(
         "--plot", type=Path, metavar="FILE", help="draw run time against error (extra 'plot')"
@@ -87,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             if campaign:
                 tables = module.measure(arguments.trials, arguments.only)
             else:
-                tables = module.measure(brief=not arguments.names)
+                tables = module.measure(brief=arguments.brief or not arguments.names)
         except RuntimeError as error:  # on a busy machine a hand may let go
             print(f"bench: {name}: {error}", file=sys.stderr)
             failed = True
