@@ -14,7 +14,7 @@ import numpy as np
 
 from softfinger.kinematics.hand.upright import resting_share
 from softfinger.tools.benchmarks.control_rig import Watched
-from softfinger.tools.paper.sheets import Curve, FloatArray, Page, Panel, Sheet, sheet
+from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
 from softfinger.tools.paper.style import GREY, KINDS, MARKERS
 
 if TYPE_CHECKING:
@@ -76,14 +76,14 @@ def basin() -> tuple[Sheet, ...]:
     return tuple(sheets)
 
 
-def _laws(laws: Sheet, *_: Sheet) -> Iterator[Curve]:
+def _laws(laws: Sheet, *_: Sheet) -> Iterator[DrawnCurve]:
     starts = laws["put at"]
     for spring, text in ((0.0, "equal torques, no friction"), (1e9, "fingers locked")):
         share = resting_share(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
         line = {"color": GREY, "ls": "--" if spring else ":", "lw": 1.0}
-        yield Curve(starts, share * starts, line, f"closed form: {text}")
+        yield DrawnCurve(starts, share * starts, line, f"closed form: {text}")
     for (law, text), color, marker in zip(LAWS.items(), KINDS, MARKERS, strict=False):
-        yield Curve(starts, laws[f"left by {law}"], {"color": color, "marker": marker}, text)
+        yield DrawnCurve(starts, laws[f"left by {law}"], {"color": color, "marker": marker}, text)
 
 
 def _map(place: int, axes: Axes, *sheets: Sheet) -> None:
@@ -111,7 +111,7 @@ def _panel(place: int, name: str, unit: str) -> Panel:
 
 
 PAGES = {
-    "basin": Page(
+    "basin": FigurePage(
         "The basin of the minimum: objects put askew between the fingers",
         (10.0, 6.4),
         basin,
