@@ -1,11 +1,17 @@
-"""The hand itself: each servo of the scene, asked without a change, and each board's frames."""
+"""The hand itself: each servo of the scene, asked without a change, and each board's frames.
+
+The functions named `repair` are what `softfinger doctor --fix` changes in adapters and servos. The
+hand lets go where a servo's EEPROM has to be written; nothing is ever stiffened or moved.
+"""
 
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
+from softfinger.daemon.diagnosis.ports import check_latency_timer, latency_file
 from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.profile.settings import Settings
@@ -15,7 +21,7 @@ from softfinger.daemon.servos.checks import Examined, check_angle, examine
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.servos.protocol import open_line
-from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, search
+from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, provision, search
 from softfinger.daemon.types import FINGERS
 
 _PATIENCE = 0.05  # s for a reply: a factory-new servo behind a slow adapter answers within it
@@ -126,3 +132,32 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
         text = f"{found}, not {tactile.rate:g}"
         return Result("warn", name, text, f"set tactile.rate = {rate:.0f}")
     return Result("pass", name, found)
+
+
+def repair_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
+    """Set the adapter's latency timer to 1 ms; None when there is nothing to do."""
+    places = () if sysfs is None else (sysfs,)
+    place = latency_file(path, *places)
+    found = check_latency_timer(path, 1.0, *places)
+    if place is None or found is None or found.status == "pass":
+        return None
+    subject = f"{path} latency timer"
+    try:
+        place.write_text("1")
+    except OSError as error:
+        problem = f"could not be set: {(error.strerror or 'refused').lower()}"
+        return Result("warn", subject, problem, f"echo 1 | sudo tee {place}")
+    return Result("fixed", subject, "set to 1 ms")
+
+
+def repair_servos(settings: Settings) -> list[Result]:
+    """Set the scene's servos up as the daemon needs them; one line for each thing done."""
+    try:
+        result = provision(settings)
+    except ServoError as error:
+        return [Result("warn", "servos", f"not repaired: {error}")]
+    problems = [
+        Result("warn", each.subject, f"not repaired: {each.problem}", each.fix.replace("`", ""))
+        for each in result.problems
+    ]
+    return problems + [Result("fixed", name, change) for name, change in result.done]

@@ -1,10 +1,15 @@
 """All bounds of the gateway: what clients may send, hold and cost; see `docs/security.md`.
 
 Those that a profile sets (`commands.max_bytes`, `commands.per_second`, `stream.queue`) are in
-`gateway.config`.
+`Config`, what a gateway is given when it is started.
 """
 
 from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from softfinger.daemon.wire.loop_link import Topics
 
 # The process
 MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
@@ -55,3 +60,28 @@ UNSENT = 1000  # of them that wait to be sent; the oldest are dropped
 LARGEST = 64 << 20  # bytes of a message that comes in pieces
 LATE_EVENTS = 50  # that a late subscriber gets again
 LAST_WORDS = 0.2  # s for subscribers to take what waits when the loop has ended
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Addresses (an empty one is not bound), bounds, and the stream's topics."""
+
+    stream: str
+    commands: str
+    topics: Topics
+    queue: int  # messages that wait for a subscriber
+    max_bytes: int = 4096  # of a request
+    per_second: float = 200.0  # requests of a client
+    ipc_mode: int = 0o600  # rights of an ipc address's file
+    keys: str = ""  # folder of `softfinger keys`
+    stream_key: str = "stream.address"  # what errors call the stream's address
+
+    def to_json(self) -> str:
+        """As a text."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Config:
+        """From that text."""
+        fields = json.loads(text)
+        return cls(**fields | {"topics": Topics(**fields["topics"])})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import select
 import socket
+import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +17,6 @@ from typing import Generic, TypeVar
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.connections import CommandConnection, Connection, StreamConnection
-from softfinger.daemon.gateway.poller import Poller
 from softfinger.daemon.gateway.request_queue import RequestQueue
 from softfinger.daemon.gateway.zmtp import frame
 from softfinger.daemon.wire.loop_link import Topics
@@ -24,6 +24,48 @@ from softfinger.daemon.wire.sockets import Listener
 
 _Connection = TypeVar("_Connection", bound=Connection)
 Late = Callable[[int], list[tuple[int, bytes]]]
+
+_READY = 64  # descriptors asked for at once
+
+
+class Poller:
+    """Waits for descriptors and calls what each was given."""
+
+    def __init__(self) -> None:
+        self._epoll = select.epoll()
+        self._calls: dict[int, Callable[[int], None]] = {}
+        self._due: deque[tuple[int, int, Callable[[int], None]]] = deque()
+
+    def watch(self, fd: int, events: int, call: Callable[[int], None]) -> None:
+        """Call ``call`` with what happened, whenever something does."""
+        self._calls[fd] = call
+        self._epoll.register(fd, events)
+
+    def change(self, fd: int, events: int) -> None:
+        """Wait for something else."""
+        self._epoll.modify(fd, events)
+
+    def forget(self, fd: int) -> None:
+        """Wait for it no more."""
+        del self._calls[fd]
+        self._epoll.unregister(fd)
+
+    def step(self, seconds: float, most: float) -> None:
+        """Wait for ``seconds`` at most, and call for ``most`` s; the rest is called next time."""
+        if not self._due:
+            for fd, events in self._epoll.poll(seconds, _READY):
+                self._due.append((fd, events, self._calls[fd]))
+        until = time.monotonic() + most
+        while self._due:
+            fd, events, call = self._due.popleft()
+            if self._calls.get(fd) is call:  # else it was forgotten meanwhile
+                call(events)
+            if time.monotonic() > until:
+                return
+
+    def close(self) -> None:
+        """Forget all."""
+        self._epoll.close()
 
 
 class StartAnew(SoftfingerError):

@@ -20,7 +20,7 @@ from zmq.auth.thread import ThreadAuthenticator
 
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.endpoints import Endpoint, StartAnew
 from softfinger.daemon.gateway.request_queue import Pace
 from softfinger.daemon.gateway.server import Server

@@ -12,9 +12,8 @@ from typing import Protocol
 import msgpack
 
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.config import Config
-from softfinger.daemon.gateway.endpoints import Endpoint
-from softfinger.daemon.gateway.poller import Poller
+from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.endpoints import Endpoint, Poller
 from softfinger.daemon.gateway.request_queue import RequestQueue
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Topics

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire import loop_link
 
 _ROOT = Path(__file__).parents[3]  # where the package is found

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from softfinger import __version__
 from softfinger.daemon.backends import SERVOS, TACTILE, make_sensor, make_servos
 from softfinger.daemon.clock import LoopClock, make_clock
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.loop import EventSink, Loop
 from softfinger.daemon.loop.warm_up import WantedScene, warm_up

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from softfinger.daemon.gateway.__main__ import open_server
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.command_server import CommandServer, Handler
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher

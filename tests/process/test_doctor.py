@@ -15,7 +15,9 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.diagnosis import addresses as sockets
-from softfinger.daemon.diagnosis import hand, kernels, machine, ports, repair
+from softfinger.daemon.diagnosis import hand, machine, ports
+from softfinger.daemon.diagnosis import hand as repair
+from softfinger.daemon.diagnosis import machine as kernels
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.profile.load import load

@@ -22,7 +22,7 @@ from softfinger.daemon.client import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway.__main__ import open_server
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings

@@ -12,8 +12,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS
 from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.arrivals import Arrivals
-from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
+from softfinger.daemon.simulation.sensor.simulated_tactile import Arrivals, SimulatedTactile
 from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import AddressError, Refused
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.profile.settings import Settings

@@ -10,7 +10,7 @@ import pytest
 
 from softfinger.daemon import own_files
 from softfinger.daemon.own_files import require_own, runtime_folder, write_bytes, write_text
-from softfinger.daemon.profile.table_files import save_table
+from softfinger.daemon.profile.factory import save_table
 from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
-from softfinger.daemon.simulation.servo_model.collision import collide, overlay
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
-from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus, collide, overlay
 from tests.fuzz.servo_bus import fuzz
 from tests.harness.free_joints import FreeJoints
 from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus, put_fault

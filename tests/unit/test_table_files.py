@@ -12,10 +12,15 @@ import pytest
 from softfinger import ContactTable, Fingertip, Material
 from softfinger.daemon import own_files
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile import table_files
-from softfinger.daemon.profile.factory import make_table
+from softfinger.daemon.profile import factory as table_files
+from softfinger.daemon.profile.factory import (
+    load_or_build,
+    load_table,
+    make_table,
+    save_table,
+    table_file,
+)
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.table_files import load_or_build, load_table, save_table, table_file
 from softfinger.kinematics.contact.lookup import TableError
 
 TIP = Fingertip(0.020)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.simulation.servo_model.trajectory import Profile
+from softfinger.daemon.simulation.servo_model.servo_joint import Profile
 
 
 @settings(max_examples=40)

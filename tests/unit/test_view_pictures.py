@@ -15,10 +15,18 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.bridge import statistics_table
-from softfinger.tools.viewing.footprint import footprint, grid_of, on_picture, tip_circle
 from softfinger.tools.viewing.known import read_settings
 from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
-from softfinger.tools.viewing.planar import HeldObject, Touch, finger_lines, tip_axes
+from softfinger.tools.viewing.planar import (
+    HeldObject,
+    Touch,
+    finger_lines,
+    footprint,
+    grid_of,
+    on_picture,
+    tip_axes,
+    tip_circle,
+)
 from tests.harness.reference_hand import ReferenceHand
 
 TIP = Fingertip(radius=0.020)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import AddressError, RecordingError
-from softfinger.daemon.gateway.config import Config
+from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings, StreamSettings

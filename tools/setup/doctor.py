@@ -10,11 +10,14 @@ from collections.abc import Iterator
 
 from softfinger.daemon.backends import SERVOS, TACTILE
 from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
-from softfinger.daemon.diagnosis.hand import check_board, check_servos
-from softfinger.daemon.diagnosis.kernels import check_kernels
-from softfinger.daemon.diagnosis.machine import check_machine
+from softfinger.daemon.diagnosis.hand import (
+    check_board,
+    check_servos,
+    repair_latency_timer,
+    repair_servos,
+)
+from softfinger.daemon.diagnosis.machine import check_kernels, check_machine
 from softfinger.daemon.diagnosis.ports import check_latency_timer, check_port, note_ports
-from softfinger.daemon.diagnosis.repair import repair_latency_timer, repair_servos
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS

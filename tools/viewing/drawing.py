@@ -19,10 +19,18 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.terminal.feed import field, number
 from softfinger.tools.viewing import layout
-from softfinger.tools.viewing.footprint import Footprint, footprint, grid_of, tip_circle
 from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.landscape import Landscape
-from softfinger.tools.viewing.planar import FingerLines, HeldObject, Touch, finger_lines
+from softfinger.tools.viewing.planar import (
+    FingerLines,
+    Footprint,
+    HeldObject,
+    Touch,
+    finger_lines,
+    footprint,
+    grid_of,
+    tip_circle,
+)
 
 _TRAIL = 160  # points in a trail on the landscape
 _ARROW = 1.6e-3  # m of a force's arrow a newton

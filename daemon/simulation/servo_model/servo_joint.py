@@ -14,7 +14,6 @@ from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
-from softfinger.daemon.simulation.servo_model.trajectory import Profile
 
 STEP = 0.001  # s: trajectories, velocity and PWM modes
 POSITION_MODES = (
@@ -215,3 +214,70 @@ class ServoJoint:
             max(0, round(voltage / reg.VOLTAGE_UNIT)),
             max(0, min(255, round(temperature))),
         )
+
+
+_NEAR = 1e-6  # counts: below it the square root's rounding would never let the trajectory arrive
+
+
+class Profile:
+    """The trajectory to a goal, velocity- or time-based: where it is and how fast it goes.
+
+    A limit of 0 means none.
+    """
+
+    def __init__(self) -> None:
+        self.position = 0.0  # counts
+        self.velocity = 0.0  # counts/s
+        self.target = 0.0
+        self.speed = 0.0  # greatest velocity, 0 = at once
+        self.acceleration = 0.0  # counts/s², 0 = at once
+
+    @property
+    def busy(self) -> bool:
+        """Whether the trajectory still moves towards its target."""
+        return self.position != self.target or self.velocity != 0.0
+
+    def hold(self, position: float) -> None:
+        """Stand still at a position."""
+        self.position = self.target = position
+        self.velocity = 0.0
+
+    def aim(self, target: float, speed: float, acceleration: float) -> None:
+        """Go to a target with these limits (velocity-based profile)."""
+        self.target, self.speed, self.acceleration = target, speed, acceleration
+        if speed == 0.0 and acceleration == 0.0:
+            self.hold(target)
+
+    def aim_in(self, target: float, duration: float, ramp: float) -> None:
+        """Go to a target in ``duration`` seconds with ramps of ``ramp`` (time-based profile)."""
+        if duration <= 0.0:
+            self.hold(target)
+            return
+        ramp = min(ramp, duration / 2.0)
+        speed = abs(target - self.position) / (duration - ramp)
+        self.aim(target, speed, speed / ramp if ramp > 0.0 else 0.0)
+
+    def step(self, dt: float) -> None:
+        """Go on by dt [s]: a trapezoid, which never passes its target."""
+        distance = self.target - self.position
+        if distance == 0.0 and self.velocity == 0.0:
+            return
+        if abs(distance) < _NEAR and abs(self.velocity) <= max(self.acceleration * dt, _NEAR):
+            self.hold(self.target)
+            return
+        limit = self.speed if self.speed > 0.0 else math.inf
+        if self.acceleration > 0.0:
+            # The speed from which it can still stop at the target, over the coming step too.
+            a = self.acceleration
+            stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
+            wanted = math.copysign(min(limit, stop), distance)
+            change = max(-a * dt, min(a * dt, wanted - self.velocity))
+            velocity = self.velocity + change
+        else:
+            velocity = math.copysign(min(limit, abs(distance) / dt), distance)
+        move = velocity * dt
+        if distance * move >= 0.0 and abs(move) >= abs(distance):
+            self.hold(self.target)
+            return
+        self.position += move
+        self.velocity = velocity
