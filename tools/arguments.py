@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import require_own, runtime_folder
-from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def add_profile(parser: argparse.ArgumentParser) -> None:
         "--dir",
         type=Path,
         metavar="DIR",
-        help="replaces {dir} in the ports' paths (default: the folder of `softfinger emulate`)",
+        help="what {dir} in the ports' paths stands for (default: the folder of `softfinger emulate`)",
     )
 
 
@@ -37,14 +37,14 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         "--config",
         type=Path,
         metavar="PROFILE",
-        help="settings: a TOML file, or a name as sim, demo, paper, small, hil",
+        help=f"settings: a TOML file, or one of {', '.join(names())}",
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="overrides a setting of the file, as loop.rate=1000; may be repeated",
+        help="override a setting, as loop.rate=1000; may be repeated",
     )
 
 

@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="softfinger",
         description="Two rotational fingers with soft tips: daemon and tools.",
-        epilog="softfinger help SUBCOMMAND tells more of one. To begin: softfinger run --monitor",
+        epilog="softfinger help SUBCOMMAND: its arguments. To begin: softfinger run --monitor",
     )
     parser.add_argument("--version", action="version", version=f"softfinger {__version__}")
     # Only the subcommand that is called is imported, for its arguments and for its work.

@@ -33,10 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="DIR", help="output folder (default: FILE.plots)"
     )
     parser.add_argument(
-        "--pages", nargs="+", choices=tuple(PAGES), metavar="PAGE", help="which (default: all)"
+        "--pages",
+        nargs="+",
+        choices=tuple(PAGES),
+        metavar="PAGE",
+        help="pages to draw (default: all)",
     )
     parser.add_argument(
-        "--format", nargs="+", choices=("png", "svg", "pdf"), default=["png"], help="default: png"
+        "--format",
+        nargs="+",
+        choices=("png", "svg", "pdf"),
+        default=["png"],
+        help="of the files (default: png)",
     )
     add_range(parser)
 

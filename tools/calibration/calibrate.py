@@ -34,13 +34,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--finger", choices=("left", "right"), default="left")
     add_profile(parser)
     parser.add_argument(
-        "--recording", type=Path, nargs="+", default=[], metavar="R", help="instead of the sensor"
+        "--recording",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="R",
+        help="recordings, instead of the live sensor",
     )
     parser.add_argument(
-        "--frames", type=_frames, default=64, help="live frames a load (default 64)"
+        "--frames", type=_frames, default=64, help="live frames of each load (default 64)"
     )
     parser.add_argument(
-        "--loads", type=int, default=0, help="equilibrate: number of pressures, live"
+        "--loads", type=int, default=0, help="equilibrate, live: number of pressures"
     )
     for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
         parser.add_argument(
@@ -49,17 +54,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             nargs="+",
             default=[],
             metavar="X",
-            help=f"of the loads [{unit}]",
+            help=f"known {name} of each load [{unit}]",
         )
-    parser.add_argument("--kind", choices=("power", "cubic"), default="power", help="of the curve")
-    parser.add_argument("--law", action="store_true", help="modulus: the whole stress-strain curve")
     parser.add_argument(
-        "--speed", type=_speed, metavar="X", help="modulus, live: of one press [mm/s], instead of d"
+        "--kind",
+        choices=("power", "cubic"),
+        default="power",
+        help="form of the curve (default power)",
     )
     parser.add_argument(
-        "--plot", type=Path, metavar="PICTURE", help="output (default: FILE's name, .STEP.png)"
+        "--law", action="store_true", help="modulus: fit the whole stress-strain curve"
     )
-    parser.add_argument("--no-plot", action="store_true", help="draw nothing")
+    parser.add_argument(
+        "--speed",
+        type=_speed,
+        metavar="X",
+        help="modulus, live: speed of one press [mm/s], instead of --d",
+    )
+    parser.add_argument(
+        "--plot", type=Path, metavar="PICTURE", help="the picture's file (default: FILE.STEP.png)"
+    )
+    parser.add_argument("--no-plot", action="store_true", help="draw no picture")
 
 
 def run(arguments: argparse.Namespace) -> int:

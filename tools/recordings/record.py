@@ -61,9 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TOPIC",
         help="as state or hand/state, or all (default: all but input, each tick's inputs)",
     )
-    parser.add_argument("--split-size", type=megabytes, metavar="MB", help="a new file after MB")
     parser.add_argument(
-        "--split-time", type=seconds, metavar="S", help="a new file after S seconds"
+        "--split-size", type=megabytes, metavar="MB", help="begin a new file after so many MB"
+    )
+    parser.add_argument(
+        "--split-time", type=seconds, metavar="S", help="begin a new file after S seconds"
     )
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # ends when it closes
     parser.add_argument(

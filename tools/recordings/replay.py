@@ -51,18 +51,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "`softfinger keys`",
     )
     parser.add_argument(
-        "--speed", type=_factor, default=1.0, metavar="X", help="times as fast (default 1)"
+        "--speed",
+        type=_factor,
+        default=1.0,
+        metavar="X",
+        help="publish X times as fast (default 1)",
     )
     add_range(parser)
     parser.add_argument(
         "--no-wait", action="store_true", help="begin at once, without waiting for a subscriber"
     )
-    parser.add_argument("--recompute", action="store_true", help="compare instead of publishing")
     parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="with --recompute: these settings instead"
+        "--recompute", action="store_true", help="run it through today's code and compare"
     )
     parser.add_argument(
-        "--json", type=Path, metavar="OUT", help="with --recompute: write the comparison, too"
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="with --recompute: other settings than the recorded",
+    )
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT", help="with --recompute: write the comparison to a file"
     )
 
 

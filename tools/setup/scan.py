@@ -15,21 +15,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``scan``."""
     parser.epilog = "Exit status: 0 when a servo answered, 1 when none did or no port can be used."
     parser.add_argument(
-        "ports", metavar="PORT", nargs="*", help="where to look; every serial port if none is named"
+        "ports", metavar="PORT", nargs="*", help="where to look (default: every serial port)"
     )
     parser.add_argument(
         "--baud",
         type=int,
         action="append",
         metavar="N",
-        help="a rate to try, given as often as needed; all that servos have if none is named",
+        help="a baud rate to try, may be repeated (default: all that servos have)",
     )
     parser.add_argument(
         "--wait",
         type=float,
         default=SEARCH_TIME,
         metavar="S",
-        help="how long to listen at each rate (0.8: 253 servos at 1 Mbaud)",
+        help="seconds to listen at each rate (0.8 are enough for 253 servos at 1 Mbaud)",
     )
 
 

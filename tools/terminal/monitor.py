@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ):
         parser.add_argument(name, type=kind, default="", metavar="ADDRESS", help=what)
     add_keys(parser)
-    parser.add_argument("--client", default="", help="name that owns the commander's lease")
+    parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
     parser.add_argument(
         "--no-wait", action="store_true", help="end when no daemon is running, or when it ends"
     )

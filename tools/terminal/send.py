@@ -28,13 +28,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("values", metavar="key=value", nargs="*")
     parser.add_argument("--address", type=command_address, default="", help="command socket")
     add_keys(parser)
-    parser.add_argument("--client", default="", help="name that owns the commander's lease")
+    parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
     parser.add_argument(
         "--timeout",
         type=seconds,
         default=PATIENCE,
         metavar="S",
-        help=f"to wait for the reply; {PATIENCE:g} unless given",
+        help=f"seconds to wait for the reply (default {PATIENCE:g})",
     )
 
 

@@ -27,15 +27,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--web", action="store_true", help="in the browser, instead of a window")
     parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
     parser.add_argument(
-        "--port", type=_port, metavar="N", help="the page's (default: 9090 or a free one)"
+        "--port", type=_port, metavar="N", help="the page's port (default: 9090 or a free one)"
     )
-    parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="must not exist yet")
+    parser.add_argument(
+        "--save", type=Path, metavar="FILE.rrd", help="write it to this new file, too"
+    )
     parser.add_argument(
         "--memory",
         type=megabytes,
         default=500.0,
         metavar="MB",
-        help="for the newest data (default 500)",
+        help="memory for the newest data (default 500)",
     )
     parser.add_argument(
         "--rate",
