@@ -27,7 +27,7 @@ def add_profile(parser: argparse.ArgumentParser) -> None:
         "--dir",
         type=Path,
         metavar="DIR",
-        help="what {dir} in the ports' paths stands for (default: the folder of `softfinger emulate`)",
+        help="replaces {dir} in the ports' paths (default: the folder of `softfinger emulate`)",
     )
 
 
