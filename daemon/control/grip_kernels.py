@@ -118,10 +118,13 @@ def squeeze(
     """
     g = grips[0]
     grasp = grasps[0]
-    if g.law.watched and slip_monitor.due(g.slip):
+    if g.law.watched:
         g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
     g.push = wanted + _correction(g, wanted, _felt(grasp))
+    if g.slip.reflex:
+        g.push += max(g.force.target - wanted, 0.0)
+        g.slip.reflex = not setpoint.arrived(g.force)
     if g.law.blind and not g.steering:
         torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
         return torque1, torque2, g.force.target, g.slip.turned

@@ -18,7 +18,10 @@ What these sensors show, and what they don't:
   once it slides, nothing shows it until a tip comes to its edge. So the margin is kept before, and
   ``control.tip_friction`` must not be more than the real friction.
 - While the grip is built up or the object turns, currents also move the joints: the last load is
-  kept. A load that grows by more than about 10 N a second is too fast for the grip.
+  kept. A load that grows by more than about 10 N a second is too fast for that.
+- One that comes at once, by more than twice the joints' friction, moves the joints, and their
+  damping shows it at the same tick. How much is to come is not known: the grip is then raised by
+  all of ``control.grip_raise_max``, as fast as ``safety.current_rate`` lets it.
 """
 
 from __future__ import annotations
@@ -30,8 +33,8 @@ from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 
-_EACH = 0.008  # s between two looks
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
+_SUDDEN = 0.5  # of what friction bears with its margin: a load that comes at once, and may go on
 _LEARN = 1.0  # s in which the friction at rest is learnt
 _SCALE_ERROR = 0.1  # share by which the torque constant may be off
 _KEPT = 1.0  # s that a raised grip is kept after the need for it has gone
@@ -47,8 +50,7 @@ _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip h
 class SlipLaw(Record):
     """What is set once."""
 
-    every: int  # ticks between two looks
-    dt: float  # between two looks [s]
+    dt: float  # [s]
     width: float  # of the object [m]
     force_max: float  # [N]
     friction: float  # Coulomb, tip on object
@@ -62,9 +64,9 @@ class SlipState(Record):
     """What is known of one held object."""
 
     law: SlipLaw
-    ticks: int  # until the next look
     load: float  # that each tip may bear along its face, hidden part included [N]
     turned: bool  # the object has turned in the grip, at this tick
+    reflex: bool  # until the setpoint is there, the grip pushes with all that is needed
     friction: float  # what a joint's friction looks like, as a load [N]
     known: bool  # what stood when holding began:
     still: float  # what of it does not grow with the grip [N]
@@ -81,8 +83,7 @@ class SlipState(Record):
 def set_law(law: SlipLaw, settings: Settings) -> None:
     """Fill in what the settings say."""
     control = settings.control
-    law.every = max(round(_EACH * settings.loop.rate), 1)
-    law.dt = law.every / settings.loop.rate
+    law.dt = 1.0 / settings.loop.rate
     law.width = settings.object.width
     law.force_max = GRIP_SHARE * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
@@ -93,8 +94,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 @inner_kernel
 def forget(s: SlipState) -> None:
     """Nothing is held any more, or something else."""
-    s.ticks = 0
-    s.turned = s.known = False
+    s.turned = s.known = s.reflex = False
     s.load = s.still = s.share = s.smooth = s.age = 0.0
     s.stray = s.away = s.needed = s.most = s.idle = 0.0
 
@@ -122,17 +122,6 @@ def begin(s: SlipState, grasp: GraspState) -> None:
 
 
 @inner_kernel
-def due(s: SlipState) -> bool:
-    """Whether this tick takes a look: not every one does, loads are slower."""
-    s.turned = False
-    if s.ticks > 0:
-        s.ticks -= 1
-        return False
-    s.ticks = s.law.every - 1
-    return True
-
-
-@inner_kernel
 def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: float) -> float:
     """The grip force [N] to go to: ``asked``, or more where the margin needs it.
 
@@ -140,10 +129,14 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
     friction is given at present for closing.
     """
     law = s.law
+    s.turned = False
     s.most = max(min(asked + law.raise_max, law.force_max), asked)
     found = grasp.load - closing * s.friction - s.share * _mean(grasp.normal)
-    s.smooth += (found - s.smooth) * law.dt / _SMOOTH
-    if holding and s.known:
+    judged = holding and s.known
+    # So much more at once is no flicker, and no friction that turns round.
+    sudden = judged and abs(found - s.still) > abs(s.smooth - s.still) + 2.0 * s.friction
+    s.smooth += (found - s.smooth) * (1.0 if sudden else law.dt / _SMOOTH)
+    if judged:
         _weigh(s, grasp.load_lever)
         _watch_turning(s, grasp)
     else:
@@ -158,6 +151,10 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
         needed = load / max(spare, _LEAST_SPARE * law.friction)
     if s.turned:
         needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, s.needed))
+    s.reflex = s.reflex or s.turned
+    if sudden and load > _SUDDEN * max(spare, 0.0) * _mean(grasp.normal):
+        needed = s.most  # how much more is to come is not known
+        s.reflex = True
     if needed >= s.needed:
         s.needed = min(needed, s.most)
         s.idle = 0.0

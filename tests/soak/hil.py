@@ -121,7 +121,7 @@ def _next(chance: random.Random, mode: str) -> dict[str, object] | None:
 def _judge(rig: Rig, account: Account, warm: bool) -> None:
     found = Trial(0)
     judge_wire(rig, found)
-    rig.report(forget=True)
+    rig.report("forget")
     if found.wrong:
         account.wrong.append(found.wrong)
     if warm and rig.daemon is not None:

@@ -18,6 +18,10 @@ def test_faults_in_words() -> None:
         (3.0, "servos", "silent", 2.0),
         (10.0, "right", "frozen", 1.0),
     ]
+    assert parse_faults(["twist=-0.3@1", "push=15"], (1, 2)) == [
+        (0.0, "object", "push", 15.0),
+        (1.0, "object", "twist", -0.3),
+    ]
     assert parse_faults(["well", "left:well@1", "right:plug", "noisy"], (1, 2)) == [
         (0.0, "servos", "well", 1.0),
         (0.0, "left", "well", 1.0),
@@ -38,6 +42,8 @@ def test_faults_in_words() -> None:
         ("left:drop=0.1", "wrong-size"),
         ("drop", "drop, late, .* =PROBABILITY"),
         ("middle:torn", "left: or right:"),
+        ("push", "push, twist =NUMBER"),
+        ("push=inf", "push, twist =NUMBER"),
         ("torn=2", "0 … 1"),
         ("left:silent=2", "0 … 1"),
         ("drop=7", "0 … 1"),

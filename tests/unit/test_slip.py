@@ -105,8 +105,24 @@ def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is() -> None:
     assert watched.grip.slip.load == 0.0
     # As much more as friction may hide of it: 0.05 N·m over 30 mm.
     hidden = 0.05 / 0.03
+    for load in np.linspace(1.5, 6.0, 500):
+        watched.run(load, 1)
+    found = watched.run(6.0, 500)
     expected = (6.0 - watched.grip.slip.still + hidden) / (0.6 * 0.8)
-    assert watched.run(6.0, 500) == pytest.approx(expected, rel=0.01)
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> None:
+    watched = Watched(friction_speed=1e6)
+    watched.run(0.0, 500, holding=False)
+    watched.grip.begin_holding()
+    watched.run(0.0, 600)
+    friction = 0.05 / 0.03
+    # Friction that turns round is none, and neither is a load that goes.
+    assert watched.run(1.95 * friction, 1) == FORCE
+    assert watched.run(0.0, 500) == FORCE
+    assert watched.run(3.0 * friction, 1) == FORCE + 10.0
+    assert watched.grip._state.push == pytest.approx(FORCE + 10.0, rel=1e-4), "at the same tick"
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() -> None:

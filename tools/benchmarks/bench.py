@@ -25,6 +25,7 @@ MEASUREMENTS = {
     "control": "grasping, turning and holding on the simulated hand",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
     "hil": "one tick over the emulated hand's ptys",
+    "reflex": "from a slip's onset to the servos' bytes",
     "wakeup": "wake-ups of the loop beside cyclictest and time.sleep",
     "startup": "start to the first published state, memory",
 }

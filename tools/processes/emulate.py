@@ -21,12 +21,13 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
                    stuck (angle stands, velocity and current read 0), jump (by 0.2 rad), frozen
                    (all registers stand, their time too), refuse (an error for each); recover =ID
   ports            unplug, plug for the servos'; left:unplug, right:plug … for a board's
+  the object       push=N along its faces, away from the palm, twist=N·m; 0 ends it
   all well again   well for the servos' line and boards, left:well for one board
   @SECONDS         when it starts; at once without
 
 softfinger emulate --send "drop=0.01 left:frozen@2" changes a running one, by DIR/control.
 
-the object, where it slipped away: --send place puts it back, at rest.
+the object, where it slipped away: --send place puts it back, at rest and without a load.
 
 what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
 begins the record anew, --send "report forget" does both without a gap:
@@ -45,6 +46,9 @@ begins the record anew, --send "report forget" does both without a gap:
                    time since the last instruction with torque on, null while it is off, and the
                    longest such [s]
     watchdog_fired count, t of the last
+    goal_currents  with --send "report goals": t and value of the newest 1000, in their order
+  object           pose (x, y [m], angle [rad]) now; pushed: t of the last push or twist; slipped: t
+                   when both tips last stuck before one slipped; both null when there was none
 """
 
 

@@ -17,6 +17,7 @@ from softfinger.daemon.simulation.emulator.link_folder import FolderError
 
 NAME = "control"
 _LONGEST = 4096  # bytes of a message
+_LONGEST_REPLY = 1 << 17
 _CLIENTS = 8  # at a time
 _PATIENCE = 2.0  # s that a client waits for its reply
 
@@ -102,7 +103,7 @@ def send_words(folder: Path, text: str) -> str:
                 client.settimeout(_PATIENCE)
                 client.connect(_address(descriptor))
                 client.send(text.encode())
-                reply = client.recv(_LONGEST)
+                reply = client.recv(_LONGEST_REPLY)
     except OSError:
         raise NoEmulator(f"{folder}: no emulator answers here") from None
     if not reply:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import socket
@@ -25,6 +26,7 @@ from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.simulation.emulator.control_port import ControlPort
 from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encoder_for
 from softfinger.daemon.simulation.emulator.fault_spec import (
+    OBJECT,
     SERVOS,
     FaultError,
     FaultEvent,
@@ -40,7 +42,8 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, longest that the physics lags behind
-_REQUESTS = ("report", "forget", "place")  # words to the control socket that are no fault
+_REQUESTS = ("report", "goals", "forget", "place")  # words to the control socket that are no fault
+_SLIPS = 0.999  # of what friction bears
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
 # The board where a profile names none: that of config/hil.toml.
 DEFAULT_BOARD = {
@@ -129,6 +132,9 @@ class Emulator:
         self._boards: dict[str, TactileBoard] = {}
         self._sources: list[SimulatedTactile] = []
         self._advance_due = 0.0
+        self._pushed: float | None = None  # when a load on the object last changed
+        self._slipped: float | None = None  # when both tips last stuck before one slipped
+        self._stuck = 0.0  # when they last stuck, as far as was looked
         try:
             servos = servos or EmulatedServos()
             self._ids = settings.servos.ids if servos.ids is None else servos.ids
@@ -258,6 +264,12 @@ class Emulator:
         else:
             self.hand.advance(t)
         self._advance_due = t + _STEP
+        if self._slipped is None:
+            most = _SLIPS * self._simulation.tip_friction
+            tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
+            if any(normal > 0.0 and abs(along) >= most * normal for along, normal in tips):
+                self._slipped = self._stuck
+            self._stuck = t
 
     # --- requests and faults ---------------------------------------------------------------------
 
@@ -265,8 +277,9 @@ class Emulator:
         """Take words of the control socket: ``ok``, or ``error: `` and why none of them counts.
 
         A time behind a word counts from now. With ``report`` among them the answer is
-        :meth:`report` as JSON; ``forget`` begins the record anew; ``place`` puts the object back
-        where it was at the start, at rest.
+        :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
+        ``forget`` begins the record anew; ``place`` puts the object back where it was at the
+        start, at rest and with no load on it.
         """
         words = text.split()
         try:
@@ -275,13 +288,14 @@ class Emulator:
         except FaultError as error:
             return f"error: {error}"
         now = self.clock.now()
-        reply = json.dumps(self.report(now)) if "report" in words else "ok"
-        if "forget" in words and self._servos is not None:
-            self._servos.bus.forget(now)
+        reply = json.dumps(self.report(now, "goals" in words)) if "report" in words else "ok"
+        if "forget" in words:
+            self._forget(now)
         if "place" in words:
             simulation = self._simulation
             self.hand.object_pose[:] = *simulation.object_position, simulation.object_angle
             self.hand.object_velocity[:] = 0.0
+            self.hand.push(0.0, 0.0)
             self.hand.refresh()
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
@@ -294,16 +308,34 @@ class Emulator:
         self._advance(self.clock.now())
         return reply
 
-    def report(self, t: float) -> dict[str, Any]:
-        """What was on the servos' wire, and their state; times are the hand's [s].
+    def report(self, t: float, goals: bool = False) -> dict[str, Any]:
+        """What was on the servos' wire, their state and the object's; times are the hand's [s].
 
         ``monotonic`` is time.monotonic() at ``t``, to compare with times of other processes.
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
-        return {"t": t, "monotonic": time.monotonic(), "servos": servos}
+        if goals and self._servos is not None:
+            for told, servo in zip(servos, self._servos.bus.servos, strict=True):
+                told["goal_currents"] = servo.goal_currents()
+        pose = self.hand.object_pose.tolist()
+        held = {"pose": pose, "pushed": self._pushed, "slipped": self._slipped}
+        return {"t": t, "monotonic": time.monotonic(), "servos": servos, "object": held}
+
+    def _forget(self, t: float) -> None:
+        """Begin the record anew."""
+        self._pushed = self._slipped = None
+        self._stuck = t
+        if self._servos is not None:
+            self._servos.bus.forget(t)
 
     def _apply(self, event: FaultEvent, t: float) -> None:
         _, part, kind, value = event
+        if part == OBJECT:
+            angle = float(self.hand.object_pose[2])
+            load = (0.0, value) if kind == "twist" else (value, 0.0)
+            self.hand.push(-load[0] * math.sin(angle), load[0] * math.cos(angle), load[1])
+            self._pushed = t
+            return
         device = self._servos if part == SERVOS else self._boards.get(part)
         if device is None:
             return

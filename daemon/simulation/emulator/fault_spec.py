@@ -12,6 +12,7 @@ from softfinger.daemon.simulation.servo_model.bus_faults import LINE_FAULTS, SER
 from softfinger.daemon.types import FINGERS
 
 SERVOS = "servos"
+OBJECT = "object"
 BOARD_FAULTS = {  # kind → probability if none is given
     "torn": 0.1,
     "noisy": 0.1,
@@ -22,6 +23,7 @@ BOARD_FAULTS = {  # kind → probability if none is given
     "zero": 1.0,
 }
 _PORT = ("unplug", "plug")
+_LOADS = ("push", "twist")  # N along the object's faces, away from the palm; N·m
 _WELL = "well"
 _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*))?")
 
@@ -36,7 +38,7 @@ class FaultEvent(NamedTuple):
     after: float  # s
     part: str  # ``servos``, ``left`` or ``right``: a board
     kind: str
-    value: float = 1.0  # a probability, or a servo's ID
+    value: float = 1.0  # a probability, a servo's ID, or a load
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
@@ -46,6 +48,7 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
       boards, with ``left:`` or ``right:`` before it for one; see :class:`TactileBoard`.
     - ``drop=0.01``, ``silent=2`` … for the servos; see :meth:`ServoBus.fault`.
     - ``unplug`` and ``plug`` for the servos' port, ``left:unplug`` … for a board's.
+    - ``push=15``, ``twist=0.3`` for the object, from then on; 0 ends it.
     - ``well`` ends what is wrong with the servos' line and boards, ``left:well`` with one board.
 
     ``@SECONDS`` behind it says when it starts. ``ids`` are the servos'. Raises FaultError for a
@@ -73,6 +76,8 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     if value is not None and math.isnan(value):
         raise refused(f"{text!r} is not a number")
     probability = value is not None and 0.0 <= value <= 1.0
+    if kind in _LOADS and side is None and value is not None and math.isfinite(value):
+        return [FaultEvent(after, OBJECT, kind, value)]
     if value is None and kind in _PORT:
         return [FaultEvent(after, side or SERVOS, kind)]
     if value is None and kind == _WELL:
@@ -94,7 +99,7 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     raise refused(
         f"expected for tactile boards {', '.join(BOARD_FAULTS)} [=PROBABILITY]; for the servos "
         f"{', '.join(LINE_FAULTS)} =PROBABILITY or {', '.join(SERVO_FAULTS)} =ID; or "
-        "unplug, plug, well"
+        f"{', '.join(_LOADS)} =NUMBER; unplug, plug, well"
     )
 
 

@@ -289,6 +289,10 @@ class EmulatedServo:
             **self.recorder.report(t, self._joint, self.torque_on),
         }
 
+    def goal_currents(self) -> list[tuple[float, float]]:
+        """The newest goal currents on the wire: time [s] and value [A] of each."""
+        return self.recorder.goal_currents(self._joint)
+
     def fault(self, kind: str, t: float) -> None:
         """One of SERVO_FAULTS. ``recover`` leaves a latched hardware error until a reboot."""
         match kind:

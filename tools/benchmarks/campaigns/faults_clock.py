@@ -44,7 +44,7 @@ def clock_rig() -> Iterator[Callable[[str, int], Trial]]:
         _hold(loop)
         loop.advance(chance.uniform(0.0, _BEFORE))
         rig.waited()
-        rig.report(forget=True)
+        rig.report("forget")
         begin, seq = time.monotonic(), loop.state.seq
         offset += STEPS[name]
         loop.advance(_AFTER)

@@ -144,9 +144,9 @@ class Rig:
             raise RigError(reply)
         return reply
 
-    def report(self, forget: bool = False) -> dict[str, Any]:
-        """What was on the servos' wire; ``forget`` begins the record anew."""
-        report: dict[str, Any] = json.loads(self.send("report forget" if forget else "report"))
+    def report(self, more: str = "") -> dict[str, Any]:
+        """What was on the servos' wire; ``more``: ``forget`` begins the record anew, ``goals``."""
+        report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
     def ask(self, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def _grip(rig: Rig, case: FaultCase, chance: random.Random, found: Trial) -> Non
         rig.states(0.0)
         rig.waited()
         # A busy machine may have let a servo's watchdog act already; then once more.
-        if not any(servo["stopped_by_watchdog"] for servo in rig.report(forget=True)["servos"]):
+        if not any(servo["stopped_by_watchdog"] for servo in rig.report("forget")["servos"]):
             return
         time.sleep(_TRIPPED)
     raise RigError("the servos' watchdogs stop them again and again")
