@@ -19,6 +19,12 @@ from softfinger import SoftfingerError
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.press_fit import (
+    Presses,
+    depth_of_force,
+    fit_place,
+    modulus_by_force,
+)
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
@@ -218,7 +224,9 @@ def fit_centre(
     """Centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
 
     ``frames`` [n, rows, cols] Pa. The pressure's centroid stands at centre + (a − d/3)·n, so both
-    follow linearly from the estimated centroids; the estimate's own centre is brought along.
+    follow linearly from the estimated centroids; the estimate's own centre is brought along. A
+    solid tip's centroid hardly moves: its whole frames are fitted, and the residual is what the
+    last step changed.
     Raises CalibrationError when a frame shows no contact, and for tilts that are all alike but not
     upright.
     """
@@ -232,6 +240,12 @@ def fit_centre(
             f"centre: the tilts differ by less than {math.degrees(_LEAST_TILT):g}°, so that tilt "
             "can't be separated from place; press upright alone, or upright and tilted further"
         )
+    if tip.physics == "solid":
+        used = np.broadcast_to(True if live is None else live, stack.shape)
+        force = stack.sum(axis=(1, 2)) * math.prod(grid.pitches)
+        presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
+        found, moved = fit_place(presses, tip, material, grid, tilted)
+        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved)
     centre, rotation, scale, residual = grid.centre, None, 1.0, 0.0
     for _ in range(4):
         at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)
@@ -268,12 +282,17 @@ class Modulus:
 
 
 def fit_modulus(
-    d: ArrayLike, theta: ArrayLike, force: ArrayLike, free_offset: bool = True
+    d: ArrayLike,
+    theta: ArrayLike,
+    force: ArrayLike,
+    free_offset: bool = True,
+    tip: Fingertip | None = None,
 ) -> Modulus:
     """A constant modulus from a compression run: √(F cos θ/π) is a line in d of slope √E.
 
     ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. ``free_offset``: the run's own
-    zero of d is fitted too. Raises CalibrationError for too few points.
+    zero of d is fitted too. A solid ``tip`` has its own force law. Raises CalibrationError for too
+    few points.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
@@ -282,6 +301,11 @@ def fit_modulus(
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
         raise CalibrationError("modulus: expected at least three frames of different d, pressed")
     depth, tilt, load = depth[used], tilt[used], load[used]
+    if tip is not None and tip.physics == "solid":
+        modulus, offset, fitted = modulus_by_force(depth, tilt, load, tip, free_offset)
+        if not modulus > 0.0:
+            raise CalibrationError("modulus: the force does not rise with d")
+        return Modulus(modulus, offset, fitted / load - 1.0, _rms(fitted / load - 1.0))
     root = np.sqrt(load * np.cos(tilt) / math.pi)
     rows = np.stack([depth, np.ones(len(depth))], axis=1) if free_offset else depth[:, None]
     solution = np.linalg.lstsq(rows, root, rcond=None)[0]

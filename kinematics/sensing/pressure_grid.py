@@ -231,7 +231,7 @@ class SensorGrid:
 
     def pictures(self, tip: Fingertip) -> FloatArray:
         """The cells' means of a solid tip's modes, see `solid_pressure`: [pictures, cells]."""
-        return _pictures(self, tip)
+        return _pictures(replace(self, rotation=0.0), tip)
 
     def finer(self, parts: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:
         """The blur's stencils along x and y in parts of cells, and the unblurred grid of all parts.

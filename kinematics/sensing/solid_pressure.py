@@ -22,7 +22,7 @@ from softfinger.kinematics.contact.solid_data import solid_data
 from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes, solid_table
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
-MODES = 48
+MODES = 32
 PICTURES = 2 * MODES
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
 

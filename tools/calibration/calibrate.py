@@ -9,7 +9,7 @@ from pathlib import Path
 from softfinger.tools.arguments import add_profile, number, profile
 from softfinger.tools.extras import MissingExtra, require
 
-STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
+STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law")
 _EPILOG = """\
 steps, in this order; each is written into FILE, which keeps the others:
   tare         unloaded: the zero of each cell
@@ -17,6 +17,8 @@ steps, in this order; each is written into FILE, which keeps the others:
   curve        known weights upright on the tip (--force), or a run of known displacement (--d)
   centre       presses upright or of known tilt (--theta): the tip's place and rotation
   modulus      a run of known displacement (--d): E, or with --law the curve stress over strain
+  law          presses at known depths and tilts (--d, --theta): springs or solid rubber, its E and
+               ν, how well each explains the frames, and what error it leaves
 
 Frames come live from the sensor of the profile, load by load, or from recordings: one for each
 load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.

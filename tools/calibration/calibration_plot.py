@@ -68,9 +68,8 @@ def _centre(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
 
 
 def _modulus(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
-    d, theta, fit = data["d"], data["theta"], data["fit"]
+    d, fit, model = data["d"], data["fit"], data["model"]
     left.plot(d * 1e3, data["force"], "o", color=style.KINDS[0], label="measured")
-    model = math.pi * fit.modulus * np.maximum(d - fit.offset, 0.0) ** 2 / np.cos(theta)
     left.plot(d * 1e3, model, "x", color=style.KINDS[1], label="constant E")
     left.set(title=f"E = {fit.modulus / 1e6:.4f} MPa", xlabel="d [mm]", ylabel="force [N]")
     left.legend()
@@ -84,10 +83,24 @@ def _modulus(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
         right.set(title="residuals", xlabel="d [mm]", ylabel="relative error [%]")
 
 
+def _law(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
+    fits = data["fits"]
+    names = [each.tip.base if each.tip.physics == "solid" else "springs" for each in fits]
+    for axes, values, title in (
+        (left, [each.chi2 for each in fits], "χ² a cell"),
+        (right, [100.0 * each.force_error for each in fits], "error left in F [%]"),
+    ):
+        axes.barh(names, values, color=style.KINDS[: len(fits)])
+        axes.set(title=title)
+    left.axvline(1.0, color=style.GREY)
+    left.set(xscale="log")
+
+
 _PANELS = {
     "tare": _tare,
     "equilibrate": _equilibrate,
     "curve": _curve,
     "centre": _centre,
     "modulus": _modulus,
+    "law": _law,
 }

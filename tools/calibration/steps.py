@@ -33,6 +33,8 @@ from softfinger.daemon.perception.finger_model import calibrated_grid
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.calibration import (
     CalibrationError,
     cleared,
@@ -43,6 +45,7 @@ from softfinger.kinematics.estimation.calibration import (
     fit_modulus,
     tare,
 )
+from softfinger.kinematics.estimation.press_fit import Presses, TipFit, compare_tips
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
 
@@ -230,7 +233,8 @@ def _modulus(step: Step) -> Done:
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
     whole = ~full.any(axis=(1, 2))  # a saturated cell hides a part of the force
-    found = fit_modulus(d[whole], theta[whole], force[whole])
+    tip = make_tip(step.settings)
+    found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
         f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} frames, zero of d at "
         f"{found.offset * 1e3:.3f} mm, force within {found.residual:.2%} rms"
@@ -239,10 +243,11 @@ def _modulus(step: Step) -> Done:
         line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
     strain: list[float] = []
     stress: list[float] = []
+    if step.arguments.law and tip.physics == "solid":
+        raise CalibrationError("modulus: a solid tip has a constant modulus: leave --law out")
     if step.arguments.law:
         grid = calibrated_grid(step.settings, FINGERS.index(sensor.finger), step.calibration)
         live = step.converter.live & ~full
-        tip = make_tip(step.settings)
         law = fit_law(step.pressures, d - found.offset, theta, tip, grid, live)
         strain, stress = law.strain.tolist(), law.stress.tolist()
         line += f"; law of {len(strain)} points, cells {law.residual:.0f} Pa rms from it"
@@ -255,8 +260,53 @@ def _modulus(step: Step) -> Done:
         residual=found.residual,
     )
     d, theta, force = d[whole], theta[whole], force[whole]
-    picture = {"d": d, "theta": theta, "force": force, "fit": found, "law": (strain, stress)}
+    table = ContactTable.build(tip, Material.constant(found.modulus))
+    model = table(d - found.offset, theta).force
+    picture = {"d": d, "force": force, "model": model, "fit": found, "law": (strain, stress)}
     return step.result(modulus=result), line, picture
+
+
+def _law(step: Step) -> Done:
+    d, theta, settings = step.loads.truths.get("d"), step.theta, step.settings
+    if d is None:
+        raise CalibrationError("law: expected --d, or a run that has d")
+    if len(d) < 3 or np.ptp(d) <= 0.0:
+        raise CalibrationError("law: expected at least three presses of different d")
+    sensor = step.calibration.sensor
+    grid = calibrated_grid(settings, FINGERS.index(sensor.finger), step.calibration)
+    full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
+    noise = settings.tactile.noise / math.sqrt(min(map(len, step.loads.frames)))
+    live = step.converter.live
+    presses = Presses(step.pressures, d, theta, noise, live & ~full)
+    fits = compare_tips(presses, settings.tip.radius, grid, live)
+    best = fits[0]
+    if best.valid == 0.0:
+        raise CalibrationError(f"law: none explains these presses; the best: {_told(best)}")
+    result = ModulusStep(
+        date=now(), modulus=best.modulus, offset=best.offset, residual=best.force_error
+    )
+    line = "\n  ".join(map(_told, fits))
+    wanted = f'tip.physics = "{best.tip.physics}"'
+    if best.tip.physics == "solid":
+        wanted += f', tip.base = "{best.tip.base}", tip.poisson = {best.tip.poisson:.3f}'
+    line += f"\n  for the profile: {wanted}"
+    return step.result(modulus=result), line, {"fits": fits}
+
+
+def _told(fit: TipFit) -> str:
+    name = "springs"
+    if fit.tip.physics == "solid":
+        name = f"solid, {fit.tip.base}, ν {fit.tip.poisson:.3f}"
+    words = (
+        f"{name}: E = {fit.modulus / 1e6:.4f} MPa, zero of d at {fit.offset * 1e3:.3f} mm, "
+        f"χ² {fit.chi2:.2f} a cell; "
+    )
+    if fit.valid == 0.0:
+        return words + "no frame is a valid contact"
+    return words + (
+        f"errors left: d {fit.d_error * 1e3:.3f} mm, θ {math.degrees(fit.theta_error):.2f}°, "
+        f"F {fit.force_error:.1%}, {fit.valid:.0%} of the frames valid"
+    )
 
 
 _STEPS = {
@@ -265,4 +315,5 @@ _STEPS = {
     "curve": _curve,
     "centre": _centre,
     "modulus": _modulus,
+    "law": _law,
 }

@@ -1,0 +1,217 @@
+"""What presses at known depths and tilts tell of a tip: its physics, its modulus, its place.
+
+Least squares over all cells of all frames, for whichever tip, by the forward model alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.contact.closed_form import POISSON, Base, Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.footprint import FloatArray
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+_UNIT = Material.constant(1.0)
+_STEP = 1e-5  # m of a derivative
+_SHIFT = 2e-4  # m of one by the place: cells at the rim change by the points that are in it
+_TURN = 1e-4  # rad
+_TURNS = 8  # rotations that are tried first
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+_NARROW = 4e-3  # of ν
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Frames float64 [n, rows, cols] Pa of presses of d [n] m and θ [n] rad in the finger's plane.
+
+    ``noise`` [Pa] is a cell's in these frames; ``used`` [n, rows, cols] leaves out dead and
+    saturated cells.
+    """
+
+    frames: FloatArray
+    d: FloatArray
+    theta: FloatArray
+    noise: float
+    used: NDArray[np.bool_]
+
+    def of(self, tip: Fingertip, grid: SensorGrid, d: FloatArray) -> FloatArray:
+        """The frames of such presses by the model, for a modulus of 1, [cells that are used]."""
+        made = [
+            grid.pressure(tip, _UNIT, float(depth), float(tilt))
+            for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
+        ]
+        return np.asarray(np.stack(made)[self.used])
+
+
+@dataclass(frozen=True)
+class TipFit:
+    """How well one kind of tip explains the presses.
+
+    ``modulus`` [Pa] and the run's zero of d ``offset`` [m] are fitted, and a solid tip's ν;
+    ``chi2`` is the squared misfit a cell over the noise's. What is left when the estimator takes
+    this tip: rms errors of d [m], θ [rad] and, relative, of the force against the sensor's sum;
+    ``valid`` is the share of frames whose estimate can be used, and they are over those.
+    """
+
+    tip: Fingertip
+    modulus: float
+    offset: float
+    chi2: float
+    d_error: float = math.nan
+    theta_error: float = math.nan
+    force_error: float = math.nan
+    valid: float = 0.0
+
+
+def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
+    """Modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
+    readings = presses.frames[presses.used]
+    offset = 0.0
+    for _ in range(6):
+        shape = presses.of(tip, grid, presses.d - offset)
+        slope = (presses.of(tip, grid, presses.d - offset + _STEP) - shape) / _STEP
+        columns = np.stack([shape, -slope], axis=1)
+        modulus, moved = np.linalg.lstsq(columns, readings, rcond=None)[0]
+        step = float(np.clip(moved / modulus, -5e-4, 5e-4))
+        if abs(step) < 1e-7:
+            break
+        offset += step
+    misfit = readings - columns @ np.array([modulus, moved])
+    freedom = max(len(readings) - 2, 1)
+    chi2 = float(misfit @ misfit) / (presses.noise**2 * freedom)
+    return TipFit(tip, float(modulus), offset, chi2)
+
+
+def compare_tips(
+    presses: Presses, radius: float, grid: SensorGrid, live: NDArray[np.bool_]
+) -> list[TipFit]:
+    """Springs, and solid rubber on either base at its best ν: the best explanation first."""
+    fits = [fit_tip(presses, Fingertip(radius), grid)]
+    for base in ("bonded", "lying"):
+        fits.append(_best_poisson(presses, radius, base, grid))
+    return sorted((_judged(presses, each, grid, live) for each in fits), key=lambda fit: fit.chi2)
+
+
+def _best_poisson(presses: Presses, radius: float, base: Base, grid: SensorGrid) -> TipFit:
+    def at(poisson: float) -> TipFit:
+        return fit_tip(presses, Fingertip(radius, "solid", poisson, base), grid)
+
+    low, high = POISSON
+    inner = [at(high - _GOLDEN * (high - low)), at(low + _GOLDEN * (high - low))]
+    while high - low > _NARROW:
+        left, right = inner
+        if left.chi2 < right.chi2:
+            high = right.tip.poisson
+            inner = [at(high - _GOLDEN * (high - low)), left]
+        else:
+            low = left.tip.poisson
+            inner = [right, at(low + _GOLDEN * (high - low))]
+    return min([*inner, at(low), at(high)], key=lambda fit: fit.chi2)
+
+
+def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bool_]) -> TipFit:
+    """The fit with what the estimator leaves."""
+    material = Material.constant(fit.modulus)
+    table = ContactTable.build(fit.tip, material)
+    estimator = ContactEstimator(fit.tip, material, grid, presses.noise, live=live)
+    area = math.prod(grid.pitches)
+    errors = []
+    for frame, used, d, theta in zip(
+        presses.frames, presses.used, presses.d - fit.offset, presses.theta, strict=True
+    ):
+        found = estimator(frame)
+        if not (found.valid and found.contact):
+            continue
+        tilt = math.asin(min(math.hypot(math.sin(found.tilt_x), math.sin(found.tilt_y)), 1.0))
+        force = found.gain * float(table(found.d, tilt).force)
+        measured = float(frame[used].sum()) * area
+        turned = math.hypot(found.tilt_x - theta, found.tilt_y)
+        errors.append([found.d - d, turned, force / measured - 1.0])
+    if not errors:
+        return fit
+    d_error, theta_error, force_error = np.sqrt(np.mean(np.square(errors), axis=0))
+    return replace(
+        fit,
+        d_error=float(d_error),
+        theta_error=float(theta_error),
+        force_error=float(force_error),
+        valid=len(errors) / len(presses.frames),
+    )
+
+
+def fit_place(
+    presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, turned: bool
+) -> tuple[SensorGrid, float]:
+    """The grid with the tip's centre, and rotation if ``turned``; the rms step left [m].
+
+    Gauss-Newton on place, rotation and each press' own depth, begun at ``presses.d``; the tilts are
+    known. For a tip whose centroid hardly moves with tilt, so that only the frames' shape tells.
+    """
+    readings = presses.frames[presses.used] / material.reference_modulus
+    depths = presses.d.copy()
+
+    def misfit(tried: SensorGrid) -> float:
+        return float(np.linalg.norm(presses.of(tip, tried, depths) - readings))
+
+    if turned:
+        turns = 2.0 * math.pi * np.arange(_TURNS) / _TURNS
+        grid = min((replace(grid, rotation=float(each)) for each in turns), key=misfit)
+    owner = np.broadcast_to(
+        np.arange(len(depths))[:, None, None], presses.used.shape
+    )[presses.used]  # fmt: skip
+    moved = math.inf
+    for _ in range(12):
+        now = presses.of(tip, grid, depths)
+        by_depth = (presses.of(tip, grid, depths + _STEP) - now) / _STEP
+        columns = [np.where(owner == k, by_depth, 0.0) for k in range(len(depths))]
+        x, y = grid.centre
+        tried: Sequence[tuple[SensorGrid, float]] = [
+            (replace(grid, centre=(x + _SHIFT, y)), _SHIFT),
+            (replace(grid, centre=(x, y + _SHIFT)), _SHIFT),
+        ]
+        if turned:
+            tried = [*tried, (replace(grid, rotation=grid.rotation + _TURN), _TURN)]
+        columns += [(presses.of(tip, each, depths) - now) / step for each, step in tried]
+        found = np.linalg.lstsq(np.stack(columns, axis=1), readings - now, rcond=None)[0]
+        step, place = found[: len(depths)], found[len(depths) :]
+        depths = np.clip(depths + step, 0.3 * depths, 0.95 * tip.radius)
+        moved = math.hypot(*np.clip(place[:2], -2e-3, 2e-3))
+        rotation = grid.rotation + (float(np.clip(place[2], -0.5, 0.5)) if turned else 0.0)
+        x_step, y_step = np.clip(place[:2], -2e-3, 2e-3).tolist()
+        grid = replace(grid, centre=(x + x_step, y + y_step), rotation=rotation)
+        if moved < 1e-7:
+            break
+    turn = (grid.rotation + math.pi) % (2.0 * math.pi) - math.pi
+    return replace(grid, rotation=turn), moved
+
+
+def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
+    """d [m] of an upright tip by its ``force`` [N], from the table."""
+    d = np.linspace(0.0, 0.4 * tip.radius, 401)
+    return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
+
+
+def modulus_by_force(
+    d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip, free_offset: bool
+) -> tuple[float, float, FloatArray]:
+    """E [Pa], the zero of d [m] if free, and the fit's forces [n], by least relative squares."""
+    unit, offset = ContactTable.build(tip, _UNIT), 0.0
+    modulus = 0.0
+    for _ in range(30):
+        c = unit(np.maximum(d - offset, 1e-9), theta)
+        columns = np.stack([c.force, -c.force_d][: 2 if free_offset else 1], axis=1)
+        found = np.linalg.lstsq(columns / force[:, None], np.ones(len(force)), rcond=None)[0]
+        modulus = float(found[0])
+        step = float(np.clip(found[1] / modulus, -5e-4, 5e-4)) if free_offset else 0.0
+        offset += step
+        if abs(step) < 1e-9:
+            break
+    return modulus, offset, modulus * unit(np.maximum(d - offset, 1e-9), theta).force

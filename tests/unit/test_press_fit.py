@@ -1,0 +1,86 @@
+"""Presses at known depths and tilts: which tip made them, its modulus, its ν and its place."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softfinger import Fingertip, Material, SensorGrid
+from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.kinematics.estimation.calibration import fit_centre, fit_modulus
+from softfinger.kinematics.estimation.press_fit import Presses, compare_tips
+from softfinger.tools.cli import main
+
+GRID = SensorGrid(32, 32, 0.058 / 32)
+RUBBER = Material.constant(0.25e6)
+TIP = Fingertip(0.020, "solid", 0.48)
+D = np.array([1e-3, 2e-3, 3e-3, 3e-3, 4e-3])
+THETA = np.radians([0.0, 0.0, -10.0, 20.0, 15.0])
+NOISE = 600.0
+LATE = 2e-4  # m that the presses' own zero of d is off
+
+
+def frames(tip: Fingertip, grid: SensorGrid = GRID) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    pressed = [
+        grid.pressure(tip, RUBBER, float(d), float(t)) for d, t in zip(D, THETA, strict=True)
+    ]
+    return np.stack(pressed) + NOISE * rng.standard_normal((len(D), *grid.shape))
+
+
+@pytest.mark.parametrize("tip", [TIP, Fingertip(0.020)], ids=lambda tip: tip.physics)
+def test_the_tip_that_made_them_explains_them_best(tip: Fingertip) -> None:
+    seen = frames(tip)
+    presses = Presses(seen, D + LATE, THETA, NOISE, np.ones(seen.shape, np.bool_))
+    best, *others = compare_tips(presses, 0.020, GRID, np.ones(GRID.shape, np.bool_))
+    assert best.tip.physics == tip.physics
+    assert best.chi2 == pytest.approx(1.0, abs=0.1)
+    assert min(each.chi2 for each in others) > 3.0
+    assert best.modulus == pytest.approx(0.25e6, rel=0.03)
+    assert best.offset == pytest.approx(LATE, abs=3e-5)
+    assert best.valid == 1.0
+    assert best.d_error < 1e-4
+    assert best.theta_error < math.radians(1.5)
+    assert best.force_error < 0.12  # most of it the noise of the sum
+    if tip.physics == "solid":
+        assert best.tip.base == "bonded"
+        assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
+
+
+def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames() -> None:
+    true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)
+    found = fit_centre(frames(TIP, true), THETA, TIP, RUBBER, GRID, NOISE)
+    assert found.centre == pytest.approx(true.centre, abs=3e-5)
+    assert found.rotation == pytest.approx(-2.0, abs=0.03)
+
+
+def test_a_solid_tips_modulus_is_found_by_its_own_force_law() -> None:
+    force = frames(TIP).sum(axis=(1, 2)) * GRID.pitches[0] ** 2
+    found = fit_modulus(D + LATE, THETA, force, tip=TIP)
+    assert found.modulus == pytest.approx(0.25e6, rel=0.05)
+    assert found.offset == pytest.approx(LATE, abs=5e-5)
+    assert found.residual < 0.03
+
+
+def test_calibrate_law_says_which_tip_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    counts = np.clip(np.round(frames(TIP) / 20.0), 0, 4095).astype(np.uint16)
+    np.savez(tmp_path / "run.npz", frames=counts, d=D + LATE, theta=THETA)
+    (tmp_path / "profile.toml").write_text(
+        'tactile = { backend = "simulated", rows = 32, cols = 32, '
+        f"pitch = {0.058 / 32}, pascal_per_count = 20.0, full_count = 4095 }}\n"
+    )
+    words = ["calibrate", "law", str(tmp_path / "left.json"), "--no-plot"]
+    words += ["--config", str(tmp_path / "profile.toml"), "--recording", str(tmp_path / "run.npz")]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("law: solid, bonded, ν 0.4")
+    assert "springs: E = " in told
+    assert 'for the profile: tip.physics = "solid", tip.base = "bonded", tip.poisson = 0.4' in told
+    modulus = load_calibration(tmp_path / "left.json").modulus
+    assert modulus is not None
+    assert modulus.modulus == pytest.approx(0.25e6, rel=0.05)
