@@ -49,7 +49,8 @@ WAITING = 2048  # … and of all, beyond one of each
 ALL_RATE = 2000.0  # a second of all clients together …
 LEAST_RATE = 2.0  # … but each may send so many
 OLDEST = 1.0  # s after which one that waits is too old to act upon
-LOST = 2.0  # s after which an answer of the loop is given up
+LATE = 2.0  # s after which others need not wait for an answer of the loop, …
+LATE_ANSWERS = 64  # … of which the newest are still handed on when they come
 REFUSALS = 1  # that are answered at one read from a client that floods
 
 # Turns

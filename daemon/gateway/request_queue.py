@@ -110,6 +110,7 @@ class RequestQueue:
         self._active: set[Client] = set()  # who has sent something in this second
         self._share_until = 0.0
         self._asked: dict[int, tuple[list[tuple[Client, Any]], float]] = {}
+        self._late: dict[int, list[tuple[Client, Any]]] = {}  # the oldest first
         self._stop = 0  # the number of the stop that the loop has
         self.epoch = 0
         self.refused = 0  # because too many came
@@ -171,9 +172,9 @@ class RequestQueue:
         """Give the loop what it may have now."""
         while self._asked:
             number, (_, then) = next(iter(self._asked.items()))
-            if now - then < bounds.LOST:
+            if now - then < bounds.LATE:
                 break
-            self.reply(number, None)
+            self._give_way(number)
         if self._stops and not self._stop:
             packed = msgpack.packb({"command": "stop", "client": self._stops[0][0].name})
             self._stop = self._ask(self._stops, self.epoch, packed, now, stop=True)
@@ -212,14 +213,20 @@ class RequestQueue:
         self._asked[number] = (targets, now)
         return number
 
-    def reply(self, number: int, reply: bytes | None) -> None:
-        """The loop's answer to request ``number``; None: none came."""
+    def _give_way(self, number: int) -> None:
+        """Let others have the place of a request that the loop is long about, or still starts."""
         if number == self._stop:
             self._stop = 0
-        targets, _ = self._asked.pop(number, ((), 0.0))
-        for client, envelope in targets:
-            if reply is not None:
-                client.answer(envelope, reply)
+        self._late[number], _ = self._asked.pop(number)
+        if len(self._late) > bounds.LATE_ANSWERS:
+            del self._late[next(iter(self._late))]
+
+    def reply(self, number: int, reply: bytes) -> None:
+        """The loop's answer to request ``number``."""
+        if number in self._asked:
+            self._give_way(number)
+        for client, envelope in self._late.pop(number, ()):
+            client.answer(envelope, reply)
 
     def begin_epoch(self, epoch: int) -> None:
         """Refuse all that waits; what is read from now on carries its client's epoch."""

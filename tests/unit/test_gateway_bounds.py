@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.zmtp import GREETING, Broken, FrameParser, frame
 from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire.publisher import bit
@@ -44,6 +45,26 @@ def is_served(served: Served, address: str) -> bool:
     until(lambda: served.serve(echo) or heard.extend(client.replies()) or heard)
     client.close()
     return bool(heard[0]["ok"])
+
+
+def test_an_answer_that_the_loop_is_long_about_comes_and_holds_up_nobody(
+    served: Served, addresses: tuple[str, str], clock: VirtualClock
+) -> None:
+    clients = [RawClient(addresses[1], b"REQ") for _ in range(2 * bounds.UNDER_WAY)]
+    for client in clients:
+        client.ask(command="arm")
+    until(lambda: served.settle() or len(served.link.asked) == bounds.UNDER_WAY)
+    clock.sleep_until(clock.now() + 0.9 * bounds.OLDEST)  # a machine that is busy
+    served.settle()
+    assert len(served.link.asked) == bounds.UNDER_WAY
+    clock.sleep_until(clock.now() + bounds.LATE)
+    served.settle()
+    assert is_served(served, addresses[1])
+    for client in clients:
+        heard: list[dict[str, Any]] = []
+        until(lambda c=client, h=heard: served.serve(echo) or h.extend(c.replies()) or h)
+        assert heard[0].get("heard") == "arm" or "waited too long" in heard[0]["error"]
+        client.close()
 
 
 @pytest.mark.parametrize(
