@@ -317,7 +317,7 @@ def _equal_torques(
     elif g.shaken < law.dither_time:
         lengths = (law.half_separation, law.length, law.offset, law.radius)
         depth = 0.5 * (grasp.d[0] + grasp.d[1])
-        spring = min(upright_spring(mean, depth, wanted, lengths), g.joint_stiffness)
+        spring = min(upright_spring(mean, depth, wanted, grasp.turning, lengths), g.joint_stiffness)
         # What then holds the fingers begins with the torque that the spring has come to.
         g.offset = lean * (1.0 - spring / g.joint_stiffness)
         fading = 1.0 - g.shaken / law.dither_time

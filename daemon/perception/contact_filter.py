@@ -68,6 +68,7 @@ class ContactFilter:
         )
         self._history["t"] = -math.inf
         self.grasp = state.grasp
+        self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
         self._read = False  # the joints are known
         self._live = [False, False]  # tips that touch and are carried on by the joints
         self._sound = [False, False]  # the newest frame's estimate can be used
@@ -144,6 +145,13 @@ class ContactFilter:
             contact.valid = self._sound[finger]
             if not contact.t_sound >= oldest:
                 contact.valid = pose.valid = False
+
+
+def _turning(table: ContactTable, radius: float) -> float:
+    """∂U/∂θ over F θ d of a tip that is about upright: 2/3 of springs, about 0 of solid rubber."""
+    d, theta = 0.15 * radius, 0.05
+    contact = table(d, theta)
+    return float(contact.energy_theta / (contact.force * d)) / theta
 
 
 def _fill_from_frame(contact: Contact, estimate: ContactEstimate, table: FloatArray) -> None:

@@ -66,6 +66,7 @@ class GraspState(Record):
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # α between the object's faces, as both tips feel them [rad]
     stray: float  # turning of the object that no joint explains, summed [rad]
+    turning: float  # ∂U/∂θ over F θ d of the tips, upright: set once
     q: Pair  # tracked joints [rad]
     arm: Pair  # ∂(d1 + d2)/∂q, the force's lever [m]
     turn: Pair  # φ̇ = turn1 q̇1 − turn2 q̇2

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_share, upright_spring
 from softfinger.tools.benchmarks.control_rig import Watched
@@ -38,7 +40,7 @@ def at_rest(spring: float) -> SimulatedHand:
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 4.0])
 def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) -> None:
     q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
-    spring = share * spring_of(q, DEPTH, FORCE, LENGTHS)
+    spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
     expected = resting_share(DEPTH, WIDTH, spring, FORCE, LENGTHS)
     # Left out of the closed form is q², which is 0.03.
@@ -77,6 +79,18 @@ def test_the_upright_law_needs_no_angle(simulation: dict[str, float]) -> None:
                 hand.run(2.0)
                 turned = float(hand.plant.object_pose[2])
                 assert turned == pytest.approx(0.1, abs=math.radians(0.2))
+
+
+def test_solid_tips_come_upright_too() -> None:
+    # Bonded rubber has no local minimum: the law's spring is another one, by the tips' own table.
+    sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
+    simulation = {"object_angle": START}
+    with Watched({**sections, "control": {"law": "upright"}, "simulation": simulation}) as hand:
+        assert hand.contact_filter.grasp.turning < 0.0
+        hand.grasp(FORCE)
+        hand.run(4.5)
+        assert hand.mode == "holding"
+        assert abs(math.degrees(hand.plant.object_pose[2])) < 0.2
 
 
 def test_equal_torques_alone_leave_it_askew() -> None:

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.hand.upright import resting_share
-from softfinger.tools.benchmarks.control_rig import Watched
 from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
 from softfinger.tools.paper.style import GREY, KINDS, MARKERS
 
@@ -44,15 +46,24 @@ _CLEAR, _LOST = 0.05, 5.0  # degrees between which the maps' colours run
 def left(law: str, tilt: float, force: float = _FORCE, **simulation: Any) -> float:
     """The object's angle after a grasp [degrees]; NaN where it isn't held."""
     sections: dict[str, dict[str, Any]] = {
+        "loop": {"clock": "virtual"},
         "material": {"law": "constant"},
         "control": {"law": law},
         "simulation": {"object_angle": float(np.radians(tilt)), **simulation},
     }
-    with Watched(sections) as hand:
-        hand.grasp(force)
-        hand.run(_SECONDS)
-        angle = float(np.degrees(hand.plant.object_pose[2]))
-        return angle if hand.mode == "holding" else float("nan")
+    daemon = Daemon(Settings.model_validate(sections), wire=False)
+    loop, hand = daemon.loop, daemon.hand
+    assert hand is not None
+    try:
+        loop.advance(0.3)
+        loop.command({"command": "arm"})
+        loop.advance(0.2)
+        loop.command({"command": "grasp", "force": force})
+        loop.advance(_SECONDS)
+        held = loop.state.mode == Mode.HOLDING
+        return float(np.degrees(hand.object_pose[2])) if held else float("nan")
+    finally:
+        daemon.close()
 
 
 def _varied(name: str, value: float) -> dict[str, Any]:
