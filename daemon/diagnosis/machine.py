@@ -15,7 +15,7 @@ from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop.realtime import GRANT_LATENCY, GRANT_MEMORY_LOCK, GRANT_PRIORITY
 from softfinger.daemon.loop.warm_up import is_built, parts
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.compiled.kernel_cache import find_folder
+from softfinger.kinematics.compiled.kernel_folder import find_folder
 
 _MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
 _WAKE_UPS = 100

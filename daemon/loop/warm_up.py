@@ -21,7 +21,7 @@ from softfinger.daemon.perception.finger_model import FingerModel, make_estimato
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
-from softfinger.kinematics.compiled.kernel_cache import kernel_folder
+from softfinger.kinematics.compiled.kernel_folder import kernel_folder
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
@@ -67,20 +67,21 @@ class Part(NamedTuple):
 def parts(settings: Settings) -> list[Part]:
     """What ``settings`` has kernels for, in the order in which two processes best share them.
 
-    One has the estimator, the longest; the other the contact table and then what looks up in it,
-    whose kernels it has compiled in part by then.
+    One has the estimator and then the simulated sensor, whose kernels it has compiled in part by
+    then; the other the contact table and the simulated hand, which looks up in it; the shorter ones
+    even out what is left.
     """
     simulated = SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand
-    found = [_TABLE]
-    if settings.tactile.backend != "none":
-        found.append(_ESTIMATOR)
-    if simulated:
-        found.append(_HAND)
-    if settings.servos.backend != "none":
-        found.append(_CONTROL)
-    if settings.tactile.backend == "simulated":
-        found.append(_SENSOR)
-    return found
+    servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"
+    wanted = {
+        _TABLE: True,
+        _ESTIMATOR: sensors,
+        _HAND: simulated,
+        _SENSOR: settings.tactile.backend == "simulated",
+        _FILTER: servos and sensors,
+        _GRIP: servos,
+    }
+    return [part for part, needed in wanted.items() if needed]
 
 
 def named(name: str) -> Part:
@@ -152,18 +153,13 @@ def _sensor(scene: WantedScene) -> None:
         model.frame(depth, 0.1, 0.0, counts, bend=1.0 / settings.simulation.object_radius)
 
 
-def _control(scene: WantedScene) -> None:
-    from softfinger.daemon.control.grip import Grip
-    from softfinger.daemon.loop.timing import Statistics
+def _filter(scene: WantedScene) -> None:
     from softfinger.daemon.perception.contact_filter import ContactFilter
 
     settings, fingers = scene.settings, scene.sensing
-    Statistics()
-    if not fingers:
-        return
     left, right = scene.models
     contact_filter = ContactFilter(settings, (left.table, right.table))
-    contacts, pose, reading = [Contact(), Contact()], ObjectPose(), Reading()
+    contacts, pose = [Contact(), Contact()], ObjectPose()
     frame = Frame(1, 0.0, 0.0, True, np.zeros((1, 1), np.uint16))
     touch = ContactEstimate(contact=True, valid=True, d=1e-3)
     for k in (1, 2):
@@ -171,7 +167,18 @@ def _control(scene: WantedScene) -> None:
         for finger in fingers:
             contact_filter.correct(finger, frame, touch, contacts[finger])
         contact_filter.write_contacts(0.01 * k, contacts, pose)
-    grip = Grip(settings, fingers, contact_filter.grasp)
+
+
+def _grip(scene: WantedScene) -> None:
+    from softfinger.daemon.control.grip import Grip
+    from softfinger.daemon.loop.timing import Statistics
+    from softfinger.daemon.perception.contact_filter_kernels import GraspState
+
+    fingers, pose, reading = scene.sensing, ObjectPose(), Reading()
+    Statistics()
+    if not fingers:
+        return
+    grip = Grip(scene.settings, fingers, GraspState())
     grip.start(1.0, 2.0)
     grip.steer(0.0, 0.1)
     grip.begin_holding()
@@ -189,9 +196,10 @@ _TABLE = Part("contact table", 26, _table)
 _ESTIMATOR = Part("estimator", 67, _estimator)
 _HAND = Part("simulated hand", 61, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
-_CONTROL = Part("filter and grip", 52, _control, after=_TABLE.name)
+_FILTER = Part("contact filter", 30, _filter, after=_TABLE.name)
+_GRIP = Part("grip and timing", 30, _grip)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
-ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _CONTROL, _MANY)
+ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
 LANDSCAPE = (_TABLE, _MANY)  # what a picture of the energy needs
 FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # what frames are analysed with

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.kinematics.compiled import kernel_cache
+from softfinger.kinematics.compiled import kernel_folder
 
 FILES = {
     "softfinger/__init__.py": "",
@@ -51,9 +51,9 @@ class Package:
         self.cache = folder / "cache"
         for name, text in FILES.items():
             self.write(name, text)
-        real = Path(kernel_cache.__file__).parent
-        for name in ("kernel.py", "kernel_cache.py", "inner_kernels.py"):
-            shutil.copy(real / name, folder / "softfinger" / "kinematics" / "compiled")
+        real = Path(kernel_folder.__file__).parent
+        for file in real.glob("*.py"):
+            shutil.copy(file, folder / "softfinger" / "kinematics" / "compiled")
 
     def write(self, name: str, text: str) -> None:
         """Write one of its files."""
@@ -110,16 +110,16 @@ def test_the_folder_is_the_users_own_and_others_may_not_write_to_it(package: Pac
 def test_own_folder_refuses_links_files_and_other_users(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernel_cache.own_folder(tmp_path / "new")
-    kernel_cache.own_folder(tmp_path / "new")
+    kernel_folder.own_folder(tmp_path / "new")
+    kernel_folder.own_folder(tmp_path / "new")
     (tmp_path / "link").symlink_to(tmp_path / "new")
     (tmp_path / "file").touch()
     for name in ("link", "file"):
         with pytest.raises(NotADirectoryError, match="found a link or a file"):
-            kernel_cache.own_folder(tmp_path / name)
-    monkeypatch.setattr(kernel_cache.os, "geteuid", lambda: 12345)
+            kernel_folder.own_folder(tmp_path / name)
+    monkeypatch.setattr(kernel_folder.os, "geteuid", lambda: 12345)
     with pytest.raises(PermissionError, match="expected 12345"):
-        kernel_cache.own_folder(tmp_path / "new")
+        kernel_folder.own_folder(tmp_path / "new")
 
 
 def test_folders_that_were_not_used_for_longest_go(package: Package) -> None:

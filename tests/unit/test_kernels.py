@@ -14,7 +14,7 @@ import pytest
 
 from softfinger import daemon, kinematics
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.compiled.kernel_cache import kernel_sources
+from softfinger.kinematics.compiled.kernel_folder import kernel_sources
 from softfinger.kinematics.contact.closed_form import theta_limit
 
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.compiled.kernel_cache import kernel_folder, user_cache
+from softfinger.kinematics.compiled.kernel_folder import kernel_folder, user_cache
 from softfinger.tools.terminal.progress import Progress
 
 Tell = Callable[[str, str, str], None]
