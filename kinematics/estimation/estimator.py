@@ -20,6 +20,7 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import parts_to_fit, weights
 from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
+from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
@@ -34,11 +35,18 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 class ContactEstimate:
     """What one frame says about the contact; SI units, angles in rad.
 
-    ``contact``: something presses. ``valid``: the numbers can be used; without contact d and the
-    tilts are 0 and that is valid. ``covariance`` is of (d, tilt_x, tilt_y, gain); a fixed gain has
-    a zero row, and without contact all is zero. ``chi2`` is the misfit's square a cell over the
-    noise's, ``explained`` the share of the frame's squared pressure that the model accounts for;
-    both are 0 where nothing was fitted, as by the moments.
+    ``contact``: something presses. ``valid`` promises one contact that the model describes: the
+    fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
+    frame's squared pressure, nothing else presses, and what it leaves smoothly over the footprint
+    could hide no more than 5 % of d (one standard deviation). Such a misfit and the known
+    uncertainties are in the covariance. Without contact d and the tilts are 0 and that is valid.
+    It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip that stands
+    elsewhere on the sensor.
+
+    ``covariance`` is of (d, tilt_x, tilt_y, gain), ``systematic`` the part of it that all frames
+    share and averaging does not lessen; a fixed gain has a zero row, and without contact all is
+    zero. ``chi2`` is the misfit's square a cell over the noise's, ``explained`` the share of the
+    frame's squared pressure that the model accounts for; both are 0 where nothing was fitted.
     """
 
     contact: bool = False
@@ -54,16 +62,18 @@ class ContactEstimate:
     iterations: int = 0
     rejected: int = 0  # outliers left out
     second: bool = False  # something else presses too, off the footprint
+    sharing: float = 1.0  # cells for each whose noise is independent
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+    systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
     @property
     def misfit(self) -> bool:
         """χ² is beyond what the noise makes once in 3.5 million frames (Wilson-Hilferty, 5 σ).
 
-        The contact is then none that this model describes, or the noise is larger than given; the
-        covariance is widened, but holds no bias.
+        The contact is then none that this model describes well, or the noise is larger than given;
+        the covariance is widened by that.
         """
-        spread = 2.0 / (9.0 * max(self.cells - 4, 1))
+        spread = 2.0 / (9.0 * max(self.cells / self.sharing - 4, 1))
         return self.chi2 > (1.0 - spread + 5.0 * math.sqrt(spread)) ** 3
 
     @property
@@ -126,7 +136,10 @@ class ContactEstimator:
     ``method`` is "ml" (maximum likelihood) or "moments". ``free_gain`` also estimates measured over
     modelled pressure, by default for a tip of springs alone: a solid tip's frame hardly changes its
     shape with d, which then shows in the force only. Otherwise it is 1. ``live`` [rows, cols] bool
-    masks dead cells. ``readings`` says where the board's readings end.
+    masks dead cells. ``readings`` says where the board's readings end. ``known`` are the sensor's
+    other uncertainties, none by default, and for springs alone: they widen the covariance, and make
+    the activity test as much less sensitive. A material's own ``fit_error`` counts among them. The
+    fit goes up to a tilt of 71.57° (tan 3), and no further.
 
     Raises ValueError for arguments out of their range.
     """
@@ -142,6 +155,7 @@ class ContactEstimator:
         free_gain: bool | None = None,
         live: NDArray[np.bool_] | None = None,
         readings: Readings | None = None,
+        known: Uncertainty | None = None,
     ) -> None:
         if not (math.isfinite(noise) and noise > 0.0):
             raise ValueError(f"noise must be a positive number of Pa, got {noise}")
@@ -182,11 +196,16 @@ class ContactEstimator:
         else:
             set_law(state.law, material.law)
             state.moments.ratios = moment_ratios(tip, material)
+            set_budget(state, known or Uncertainty(), grid, tip, material.fit_error)
             self._arena, self._places = _lay_out(state, grid, tip, alive)
         self._estimate: Any = state.estimate.array
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
-        self._last = ContactEstimate(covariance=state.estimate.covariance)
+        self._last = ContactEstimate(
+            sharing=state.budget.sharing,
+            covariance=state.estimate.covariance,
+            systematic=state.estimate.systematic,
+        )
 
     @property
     def saturation(self) -> float | None:
@@ -210,11 +229,12 @@ class ContactEstimator:
         """
         estimate = self._state.estimate
         kept, seq, last = self._estimate.copy(), self._seq, self._last
-        self._last = ContactEstimate()
+        self._last = ContactEstimate(sharing=self._state.budget.sharing)
         try:
             estimate.warm = False
             found = self.update(frame, pascal_per_count)
             found.covariance[:] = estimate.covariance
+            found.systematic[:] = estimate.systematic
             return found
         finally:
             self._estimate[:], self._seq, self._last = kept, seq, last

@@ -12,17 +12,18 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.detection import presses_outside
-from softfinger.kinematics.estimation.gauss_newton import fit
+from softfinger.kinematics.estimation.gauss_newton import fit, judge, linearise, solve
 from softfinger.kinematics.estimation.moments import refine, start_from_frame
 from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
 from softfinger.kinematics.estimation.solid_fit import SolidFit, fit_solid, presses, start_solid
-from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState
-from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
+from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_face
 
 # Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
 CLIPPED_MORE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
+HIDDEN_MAX = 0.05  # of d that a misfit smooth over the footprint may hide
 
 
 @inner_kernel
@@ -78,9 +79,7 @@ def _likelihood(
     estimate = state.estimate
     options = state.options
     signal = state.signal
-    variance = signal.variance
     energy = signal.energy * signal.scale * signal.scale
-    number = float(state.reach.number)
     for attempt in range(2):
         if attempt == 0 and not estimate.warm:
             continue
@@ -97,28 +96,74 @@ def _likelihood(
         else:
             found = fit_solid(state, solid, frame, arena, centres, address(places), tolerance)
         if found:
-            # Share of the frame's squared pressure, noise apart, that the model accounts for.
-            scatter = variance * math.sqrt(2.0 * number)
-            misfit = max(energy + estimate.residual - number * variance, 0.0)
-            power = max(energy - number * variance, scatter)
-            estimate.explained = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / power, 1.0)
+            misfit, scatter = _explain(state, energy)
             if estimate.explained < options.explained_min:
                 continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
             if solid is None and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
+                level += 2.0 * state.budget.baseline / signal.scale
                 estimate.second = presses_outside(state, frame, centres, level)
             if not estimate.second:
-                return True
+                return estimate.hidden <= HIDDEN_MAX
     return False
 
 
 @inner_kernel
-def _to_tilts(state: EstimatorState) -> None:
-    """Turn the estimate from normals in the sensor's axes to tilts in the finger's."""
+def _explain(state: EstimatorState, energy: float) -> tuple[float, float]:
+    """Set the share of the frame's squared pressure, noise apart, that the model accounts for.
+
+    ``energy`` as for `fit`. Returns what it doesn't account for [Pa²], and noise's own scatter.
+    """
+    budget = state.budget
     estimate = state.estimate
-    covariance = state.fit.covariance
-    turned = estimate.covariance
+    number = float(state.reach.number)
+    shift = budget.baseline * budget.baseline
+    noise = number * (state.signal.variance + shift)
+    scatter = state.signal.variance * math.sqrt(2.0 * number * budget.sharing) + shift * number
+    misfit = max(energy + estimate.residual - noise, 0.0)
+    power = max(energy - noise, scatter)
+    estimate.explained = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / power, 1.0)
+    return misfit, scatter
+
+
+@inner_kernel
+def _judge_moments(
+    state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None
+) -> bool:
+    """Whether the model accounts for the frame at the moments' contact, as for the likelihood.
+
+    By one step of the likelihood's, which takes off what the moments' own small errors leave.
+    """
+    fit = state.fit
+    estimate = state.estimate
+    signal = state.signal
+    energy = signal.energy * signal.scale * signal.scale
+    set_face(fit.face, state.grid.radius, estimate.d, estimate.n_x, estimate.n_y)
+    fit.gain = estimate.gain
+    linearise(state, frame, arena, places, energy)
+    if not solve(fit, state.options.free_gain):
+        return False
+    variance = judge(state, further(arena, state.at.packed))
+    if not variance > 0.0:
+        return False
+    _explain(state, energy)
+    wider = variance / signal.variance
+    if state.budget.correlated:
+        wider *= math.sqrt(state.budget.inflation[-1, 1, 1] * state.budget.inflation[-1, 2, 2])
+    for i in range(4):
+        for j in range(4):
+            fit.covariance[i, j] *= wider
+    return estimate.explained >= state.options.explained_min and estimate.hidden <= HIDDEN_MAX
+
+
+@inner_kernel
+def _to_tilts(state: EstimatorState, covariance: Matrix, turned: Matrix) -> None:
+    """Turn the estimate from normals in the sensor's axes to tilts in the finger's.
+
+    And a ``covariance``, which is changed, into ``turned``.
+    """
+    estimate = state.estimate
     c = math.cos(state.options.rotation)
     s = math.sin(state.options.rotation)
     n_x = c * estimate.n_x - s * estimate.n_y
@@ -159,11 +204,16 @@ def _estimate(
             done = _track_moments(state, frame, centres)
         if not done:
             _start(state, frame, centres)
-            done = True
+        done = _judge_moments(state, frame, arena, places)
     else:
         done = _likelihood(state, frame, arena, centres, places, solid)
     in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
-    _to_tilts(state)
+    _to_tilts(state, state.fit.covariance, estimate.covariance)
+    if state.budget.systematic or estimate.hidden > 0.0:
+        _to_tilts(state, state.budget.covariance, estimate.systematic)
+        for i in range(4):
+            for j in range(4):
+                estimate.covariance[i, j] += estimate.systematic[i, j]
     return done and in_range
 
 
@@ -191,7 +241,10 @@ def _begin(state: EstimatorState, scale: float, step: float) -> None:
     estimate.cells = 0
     estimate.iterations = 0
     estimate.second = False
+    estimate.hidden = 0.0
     estimate.covariance[:] = 0.0
+    estimate.systematic[:] = 0.0
+    state.budget.covariance[:] = 0.0
 
 
 @kernel

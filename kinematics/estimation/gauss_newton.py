@@ -12,15 +12,19 @@ import math
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.blurred_cells import spread
+from softfinger.kinematics.estimation.error_budget import colour, hidden_misfit, systematic
 from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, press
 from softfinger.kinematics.estimation.packing import pack
-from softfinger.kinematics.estimation.state import EstimatorState, Fit
+from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
 from softfinger.kinematics.sensing.footprint import IntArray, set_face
 
 # Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
 # square over what a straight model gives rises so.
 GAIN_CURVATURE = 6.0
 _MOST_HALVINGS = 5
+# tan of the largest tilt of the face that the iteration goes to, 71.57°: beyond it the footprint of
+# any d that matters has left the tip, and a step there would not come back.
+TAN_TILT_MAX = 3.0
 
 
 @inner_kernel
@@ -89,10 +93,11 @@ def solve(fit: Fit, free: bool) -> bool:
 
 
 @inner_kernel
-def set_covariance(fit: Fit, a: float, variance: float) -> None:
-    """Covariance of (d, n_x, n_y, gain) at the fit's face, from a cell's ``variance``."""
-    inverse = fit.inverse
-    out = fit.covariance
+def set_covariance(fit: Fit, inverse: Matrix, variance: float, out: Matrix) -> None:
+    """Covariance of (d, n_x, n_y, gain) into ``out``, from that of (gain, u, v, w) over variance.
+
+    At the fit's face.
+    """
     u = fit.face.u
     v = fit.face.v
     w = fit.face.w
@@ -168,9 +173,9 @@ def _take_step(fit: Fit, a: float) -> bool:
     v = face.v + fit.step[2]
     w = face.w + fit.step[3]
     tilt = math.hypot(v, w)
-    if tilt > 3.0:
-        v *= 3.0 / tilt
-        w *= 3.0 / tilt
+    if tilt > TAN_TILT_MAX:
+        v *= TAN_TILT_MAX / tilt
+        w *= TAN_TILT_MAX / tilt
     n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
     d = a - u * n_z
     limited = min(max(d, 0.3 * shallow, 1e-4 * a), 0.95 * a)
@@ -181,38 +186,91 @@ def _take_step(fit: Fit, a: float) -> bool:
 
 
 @inner_kernel
-def _finish(state: EstimatorState, iterations: int) -> bool:
+def judge(state: EstimatorState, packed: Pointer) -> float:
+    """χ² of the solved fit, and the covariance by what all frames share and by a smooth misfit.
+
+    The noise's variance [Pa²] is returned, widened by a misfit beyond its own scatter; after that
+    ``fit.inverse`` is times it the covariance under the noise. Negative with too few cells.
+    """
+    fit = state.fit
+    estimate = state.estimate
+    budget = state.budget
+    variance = state.signal.variance
+    d = estimate.d
+    freedom = fit.sums.weight - (4.0 if state.options.free_gain else 3.0)
+    misfit = max(fit.sums.misfit - fit.decrement, 0.0)
+    estimate.cells = int(fit.sums.weight)
+    estimate.residual = misfit - fit.sums.readings
+    expected = hidden = 0.0
+    if budget.systematic:
+        expected = systematic(state, packed, d, budget.shared)
+    beyond = misfit - expected - variance * freedom
+    if beyond > variance * math.sqrt(2.0 * max(freedom, 0.0)):
+        hidden = hidden_misfit(state, packed, beyond)
+    if hidden > 0.0:
+        if not budget.systematic:
+            budget.shared[:] = 0.0
+        for i in range(4):
+            for j in range(4):
+                budget.shared[i, j] += hidden * fit.inverse[i, j]
+        set_covariance(fit, fit.inverse, hidden, budget.covariance)
+        estimate.hidden = math.sqrt(budget.covariance[0, 0]) / d
+    if budget.systematic or hidden > 0.0:
+        set_covariance(fit, budget.shared, 1.0, budget.covariance)
+    if budget.correlated:
+        freedom = fit.sums.weight - colour(state, d)
+    freedom = max(freedom, 1.0)
+    estimate.chi2 = misfit / (variance * freedom + expected)
+    excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.sharing / freedom), 1.0)
+    return variance * excess if fit.sums.weight > 4.0 else -1.0
+
+
+@inner_kernel
+def _finish(state: EstimatorState, packed: Pointer, iterations: int) -> bool:
     """The estimate and its covariance at the fit's end; whether there are cells enough."""
     fit = state.fit
     estimate = state.estimate
-    a = state.grid.radius
-    free = state.options.free_gain
-    variance = state.signal.variance
     v = fit.face.v
     w = fit.face.w
     n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    freedom = fit.sums.weight - (4.0 if free else 3.0)
-    misfit = max(fit.sums.misfit - fit.decrement, 0.0)
-    d = a - fit.face.u * n_z
+    d = state.grid.radius - fit.face.u * n_z
     estimate.d = d
     estimate.n_x = v * n_z
     estimate.n_y = w * n_z
     estimate.gain = fit.gain
-    estimate.chi2 = misfit / (variance * max(freedom, 1.0))
-    estimate.cells = int(fit.sums.weight)
     estimate.iterations = iterations
-    estimate.residual = misfit - fit.sums.readings
-    # A misfit beyond its own scatter widens the covariance.
-    excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 / max(freedom, 1.0)), 1.0)
-    set_covariance(fit, a, variance * excess)
-    if free:
+    variance = judge(state, packed)
+    set_covariance(fit, fit.inverse, variance, fit.covariance)
+    if state.options.free_gain:
         # The more d is uncertain, the less straight it is in the gain.
         covariance = fit.covariance
-        wider = 1.0 + GAIN_CURVATURE * min(covariance[0, 0] / (d * d), 1.0)
+        shared = state.budget.covariance
+        uncertain = (covariance[0, 0] + shared[0, 0]) / (d * d)
+        wider = 1.0 + GAIN_CURVATURE * min(uncertain, 1.0)
         for i in range(4):
             for j in range(4):
                 covariance[i, j] *= wider
-    return bool(freedom > 0.0)
+                shared[i, j] *= wider
+    return bool(variance > 0.0)
+
+
+@inner_kernel
+def linearise(
+    state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None, energy: float
+) -> None:
+    """Pack the cells of the fit's face, press them, and sum up the normal equations."""
+    packed = further(arena, state.at.packed)
+    if places is None:
+        pack(state, further(arena, state.at.cells), frame, arena, None)
+    else:
+        # Parts have no readings of their own; those taken from ``fine`` are not used.
+        parts = further(arena, state.at.parts)
+        pack(state, parts, further(arena, state.at.fine), arena, address(places))
+    press(state, packed)
+    if places is not None:
+        spread(state, frame, arena, address(places))
+    state.fit.clip = _clip_noise(state, packed, energy) if state.signal.clipped else 0.0
+    accumulate(state, packed)
 
 
 @inner_kernel
@@ -242,17 +300,7 @@ def fit(
     halvings = 0
     solved = False
     for iteration in range(state.options.iterations):
-        if places is None:
-            pack(state, further(arena, state.at.cells), frame, arena, None)
-        else:
-            # Parts have no readings of their own; those taken from ``fine`` are not used.
-            parts = further(arena, state.at.parts)
-            pack(state, parts, further(arena, state.at.fine), arena, address(places))
-        press(state, packed)
-        if places is not None:
-            spread(state, frame, arena, address(places))
-        fit.clip = _clip_noise(state, packed, energy) if state.signal.clipped else 0.0
-        accumulate(state, packed)
+        linearise(state, frame, arena, places, energy)
         now = fit.sums.misfit - fit.sums.readings
         if solved and not now <= cost + variance and halvings < _MOST_HALVINGS:
             # Too far: half way back.
@@ -272,5 +320,5 @@ def fit(
         gain = fit.gain
         halvings = 0
         if _take_step(fit, a) and fit.decrement <= tolerance * variance:
-            return _finish(state, iteration + 1)
+            return _finish(state, packed, iteration + 1)
     return False

@@ -22,6 +22,7 @@ OUTLIERS_MAX = 6  # left out of one frame
 RATIO_POINTS = 33
 LAW_PIECES = 128
 LAW_TERMS = 8  # of a law that is one polynomial
+DEPTHS = 12  # at which the covariance under correlated noise is tabulated
 
 Four: TypeAlias = Annotated[FloatArray, 4]
 Matrix: TypeAlias = Annotated[FloatArray, 4, 4]
@@ -104,7 +105,9 @@ class Estimate(Record):
     n_x: float
     n_y: float
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
+    hidden: float  # what a smooth misfit may hide of d, over d
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
+    systematic: Matrix  # the part of it that all frames share
 
 
 class Moments(Record):
@@ -150,6 +153,27 @@ class Fit(Record):
     lower: Matrix
     inverse: Matrix
     covariance: Matrix  # of (d, n_x, n_y, gain)
+
+
+class Budget(Record):
+    """What the noise of single cells leaves out, see `error_budget`; and scratch for it."""
+
+    baseline: float  # standard deviations: of a shift of all cells [Pa]
+    shift: float  # the same, and of the pressed ones by the law's misfit
+    centre: float  # of the tip's place [m]
+    pitch: float  # relative
+    modulus: float  # relative; 0 with a free gain
+    along: float  # correlation of neighbours in a row
+    sharing: float  # Σρ²: cells for each that is independent
+    systematic: bool  # any of those but the correlation
+    correlated: bool
+    inflation: Annotated[FloatArray, DEPTHS, 4, 4]
+    kept: Matrix
+    answers: Matrix  # Jᵀq, columns by source
+    squares: Four  # qᵀq
+    moved: Four
+    shared: Matrix  # covariance by what all frames share, of (gain, u, v, w)
+    covariance: Matrix  # the same of (d, n_x, n_y, gain)
 
 
 class Strips(Record):
@@ -209,6 +233,7 @@ class EstimatorState(Record):
     estimate: Estimate
     moments: Moments
     fit: Fit
+    budget: Budget
     strips: Annotated[Records[Strips], LEVELS]
     around: Face  # a little beyond the footprint
     outliers: Annotated[IntArray, OUTLIERS_MAX]  # cells

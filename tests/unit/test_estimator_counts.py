@@ -153,13 +153,20 @@ def test_a_misfit_is_flagged_and_good_frames_are_not():
     good = grid.pressure(TIP, LINEAR, 0.003)
     hertz *= good.sum() / hertz.sum()
     estimator = ContactEstimator(TIP, LINEAR, grid, noise)
+    moments = ContactEstimator(TIP, LINEAR, grid, noise, method="moments")
     for clean, expected in ((good, False), (hertz, True)):
         for _ in range(100):
-            e = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
-            assert e.valid
-            assert e.misfit is expected
+            frame = clean + rng.normal(0.0, noise, grid.shape)
+            for e in (estimator.update(frame), moments.update(frame)):
+                assert e.contact
+                assert e.misfit is expected
+                # Such a pressure hides 38 % of d; smoothly, as cells that read unequally don't.
+                assert e.valid is not expected
+    unequal = good * rng.normal(1.0, 0.1, grid.shape)
+    e = estimator(unequal)
+    assert e.misfit
+    assert e.valid
+    assert abs(e.d / 0.003 - 1.0) < 0.05
     counts = np.clip(np.round((good + rng.normal(0.0, noise, grid.shape)) / 800.0), 0, 255)
     assert not estimator(counts.astype(np.uint8), 800.0).misfit
-    moments = ContactEstimator(TIP, LINEAR, grid, noise, method="moments")
-    assert not moments(hertz).misfit
     assert not estimator(np.zeros(grid.shape)).misfit

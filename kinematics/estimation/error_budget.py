@@ -1,0 +1,340 @@
+"""Errors that one frame doesn't show as noise from cell to cell, carried into its covariance.
+
+Noise that neighbouring cells share is measured by `calibrate` as its correlation by lag. What that
+makes of the covariance depends on the footprint's size beside the correlation's: it is tabulated
+over d, in the coordinates in which white noise makes the identity. A shift of all cells, the tip's
+place on the sensor, the pitch and the modulus are the same in every frame: each has a pattern of
+pressure, and moves the estimate as the fit answers that pattern. So does a misfit that is smooth
+over the footprint; how much of it there is shows in how alike the residuals of neighbours are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.simd import Pointer, address
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.likelihood import BY_U, BY_V, BY_W, STRESS
+from softfinger.kinematics.estimation.state import (
+    DEPTHS,
+    READING,
+    WEIGHT,
+    Budget,
+    EstimatorState,
+    Matrix,
+)
+from softfinger.kinematics.sensing.footprint import FloatArray
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+_DEEPEST = 0.75  # of the radius: the end of the table over d
+_NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
+_PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
+_FEW = 48.0  # cells within which nothing is smooth or rough
+# What the fit makes of a motion besides its straight answer, as shares of d and of the gain by the
+# square of the motion in depth over d and of the turn: measured over the envelope, with shifts of
+# 1 kPa, of 0.5 mm, of 1 % of the pitch and 5 % of the modulus.
+_D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
+_D_BY_TURN, _GAIN_BY_TURN, _REST = 0.8, 2.0, 0.3
+_SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations of what a sensor's frames have in common, and how its noise correlates.
+
+    ``baseline``: of a shift of all cells [Pa]; ``centre``: of the tip's place on the sensor, in x
+    and in y [m]; ``pitch`` and ``modulus``: relative. ``correlation`` [rows, cols] is that of two
+    cells' noise by their distance in rows and columns, 1 at [0, 0] and 0 beyond; None for white
+    noise.
+    """
+
+    baseline: float = 0.0
+    centre: float = 0.0
+    pitch: float = 0.0
+    modulus: float = 0.0
+    correlation: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("baseline", "centre", "pitch", "modulus"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.correlation is not None:
+            rho = np.asarray(self.correlation, np.float64)
+            if rho.ndim != 2 or not np.isfinite(rho).all() or not abs(rho[0, 0] - 1.0) < 1e-6:
+                raise ValueError("correlation must be [rows, cols], with 1 at [0, 0]")
+            object.__setattr__(self, "correlation", rho)
+
+
+def set_budget(
+    state: EstimatorState, known: Uncertainty, grid: SensorGrid, tip: Fingertip, law: float
+) -> None:
+    """Fill in the budget, and raise the activity test's level to what the errors alone may make.
+
+    ``law`` [Pa] is how far the material's law is off the points that it was made from: to the
+    cells that it presses that is like a shift.
+    """
+    budget, options = state.budget, state.options
+    budget.shift = math.hypot(known.baseline, law)
+    budget.baseline, budget.centre, budget.pitch = known.baseline, known.centre, known.pitch
+    budget.modulus = 0.0 if options.free_gain else known.modulus
+    budget.systematic = max(budget.shift, known.centre, known.pitch, budget.modulus) > 0.0
+    budget.sharing = 1.0
+    level = options.patch_level
+    weights = _NEIGHBOURS.copy()
+    weights[2, 2] = 0.0
+    norm = float(np.sqrt((weights**2).sum()))
+    if known.correlation is not None and known.correlation.size > 1:
+        rho = _both_ways(known.correlation)
+        budget.correlated = True
+        budget.sharing = float((rho**2).sum())
+        budget.along = float(known.correlation[0, 1]) if known.correlation.shape[1] > 1 else 0.0
+        _set_inflation(budget, rho, grid, tip, options.free_gain)
+        with_centre = float((weights * _fitted(rho, 5)).sum())
+        spread = float(_quadratic(weights, rho)) - with_centre**2
+        level = (level * math.sqrt(max(spread, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
+    # A shift of twice the baseline's standard deviation is no contact.
+    options.patch_level = level + 2.0 * known.baseline / options.noise * weights.sum() / norm
+
+
+def _both_ways(correlation: FloatArray) -> FloatArray:
+    """The correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
+    rows, cols = correlation.shape
+    return np.asarray(
+        correlation[np.abs(np.arange(1 - rows, rows))][:, np.abs(np.arange(1 - cols, cols))]
+    )
+
+
+def _fitted(rho: FloatArray, size: int) -> FloatArray:
+    """The middle [size, size] of ``rho``, with zeros where it has none."""
+    out = np.zeros((size, size))
+    for i in range(size):
+        for j in range(size):
+            at = i - size // 2 + rho.shape[0] // 2, j - size // 2 + rho.shape[1] // 2
+            if 0 <= at[0] < rho.shape[0] and 0 <= at[1] < rho.shape[1]:
+                out[i, j] = rho[at]
+    return out
+
+
+def _quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
+    """Σ over pairs of cells of field · ρ · field, for one field [rows, cols] or several […, n]."""
+    several = fields.reshape(*fields.shape[:2], -1)
+    shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
+    kernel = np.zeros(shape)
+    kernel[: rho.shape[0], : rho.shape[1]] = rho
+    kernel = np.roll(kernel, (-(rho.shape[0] // 2), -(rho.shape[1] // 2)), (0, 1))
+    # A measured correlation may want a negative power at some frequency, which no noise has.
+    power = np.maximum(np.fft.fft2(kernel).real, 0.0)
+    waves = np.fft.fft2(several, shape, axes=(0, 1))
+    out = np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size
+    return np.asarray(out if fields.ndim == 3 else out[0, 0])
+
+
+def _set_inflation(
+    budget: Budget, rho: FloatArray, grid: SensorGrid, tip: Fingertip, free: bool
+) -> None:
+    """K = L⁻¹ JᵀCJ L⁻ᵀ over d, J by (gain, u, v, w) at no tilt, JᵀJ = LLᵀ, C the correlation.
+
+    For a constant modulus: how smooth J is hardly depends on the law, nor on the tilt.
+    """
+    material, a = Material.constant(1.0), tip.radius
+    for k in range(DEPTHS):
+        d = _DEEPEST * a * ((k + 1) / DEPTHS) ** 2
+
+        def at(d: float, x: float = 0.0, y: float = 0.0) -> FloatArray:
+            return grid.pressure(tip, material, d, x, y)
+
+        step = 1e-4
+        columns = [
+            at(d),
+            (at(d * (1.0 - step)) - at(d * (1.0 + step))) / (2.0 * step * d),  # by u = a − d
+            (at(d, step) - at(d, -step)) / (2.0 * step),
+            (at(d, 0.0, step) - at(d, 0.0, -step)) / (2.0 * step),
+        ][0 if free else 1 :]
+        jacobian = np.stack(columns, axis=2)
+        jacobian /= np.sqrt((jacobian**2).sum(axis=(0, 1)))
+        white = np.einsum("xyi,xyj->ij", jacobian, jacobian)
+        inverse = np.linalg.inv(np.linalg.cholesky(white))
+        first = 4 - len(columns)
+        budget.inflation[k, first:, first:] = inverse @ _quadratic(jacobian, rho) @ inverse.T
+
+
+@inner_kernel
+def colour(state: EstimatorState, d: float) -> float:
+    """Make ``fit.inverse`` the covariance under correlated noise of variance 1; the trace of K."""
+    fit = state.fit
+    budget = state.budget
+    first = 0 if state.options.free_gain else 1
+    t = DEPTHS * math.sqrt(d / (_DEEPEST * state.grid.radius)) - 1.0
+    t = min(max(t, 0.0), DEPTHS - 1.001)
+    k = int(t)
+    t -= k
+    kept = budget.kept
+    trace = 0.0
+    for i in range(first, 4):
+        for j in range(first, 4):
+            kept[i, j] = (1.0 - t) * budget.inflation[k, i, j] + t * budget.inflation[k + 1, i, j]
+        trace += kept[i, i]
+    # (JᵀJ)⁻¹ = AᵀA with A = lower · scale.
+    half = fit.matrix
+    for i in range(first, 4):
+        for j in range(first, 4):
+            value = 0.0
+            for m in range(j, 4):
+                value += kept[i, m] * fit.lower[m, j]
+            half[i, j] = value * fit.scale[j]
+    for i in range(first, 4):
+        for j in range(first, 4):
+            value = 0.0
+            for m in range(i, 4):
+                value += fit.lower[m, i] * half[m, j]
+            fit.inverse[i, j] = value * fit.scale[i]
+    return trace
+
+
+@fast_inner_kernel
+def smooth_misfit(state: EstimatorState, packed: Pointer) -> tuple[float, float]:
+    """Σ over neighbours in the packed cells of the product of their residuals [Pa²]; their number.
+
+    Noise of single cells adds nothing to it on average, what is smooth over the footprint all.
+    """
+    gain = state.fit.gain
+    saturation = state.signal.saturation
+    # Nearer to the floor, readings that end there are more than the pressure.
+    floor = state.signal.floor + 2.0 * state.fit.clip
+    size = state.model.rows * state.model.cols
+    total = 0.0
+    number = 0.0
+    for k in range(1, state.fit.count):
+        here = gain * packed[STRESS * size + k]
+        before = gain * packed[STRESS * size + k - 1]
+        y = packed[READING * size + k]
+        z = packed[READING * size + k - 1]
+        weight = packed[WEIGHT * size + k] * packed[WEIGHT * size + k - 1]
+        counts = (max(here, before) < saturation) & (min(here, before) > floor)
+        weight = weight if counts else 0.0
+        total += weight * (y - here) * (z - before)
+        number += weight
+    return total, number
+
+
+@inner_kernel
+def hidden_misfit(state: EstimatorState, packed: Pointer, beyond: float) -> float:
+    """Square sum [Pa²] of what the model leaves smoothly over the footprint; 0 within the noise.
+
+    ``beyond`` [Pa²] is all that it leaves beyond what is expected: in a footprint of few cells no
+    part of that can be told from smooth.
+    """
+    total, number = smooth_misfit(state, packed)
+    variance = state.signal.variance
+    # What the last step takes off is not in the packed cells yet.
+    total -= number * variance * state.budget.along + state.fit.decrement
+    total = beyond if number < _FEW else min(total, beyond)
+    if total <= _SURE * variance * math.sqrt(number * state.budget.sharing):
+        return 0.0
+    return total
+
+
+@fast_inner_kernel
+def _patterns(state: EstimatorState, packed: Pointer) -> None:
+    """Jᵀq and qᵀq of the patterns q: a shift of all cells, of the tip in x and in y, the pitch."""
+    face = state.fit.face
+    u = face.u
+    v = face.v
+    w = face.w
+    a2 = state.model.radius * state.model.radius
+    size = state.model.rows * state.model.cols
+    answers = address(state.budget.answers)
+    squares = address(state.budget.squares)
+    for column in range(4):
+        plane = column * size  # STRESS, BY_U, BY_V, BY_W stand first
+        shift = along_x = along_y = stretch = 0.0
+        n = xx = yy = ss = 0.0
+        for k in range(state.fit.count):
+            g = packed[BY_U * size + k]
+            per_g = 1.0 / g if g > 0.0 else 0.0
+            x = packed[BY_V * size + k] * per_g
+            y = packed[BY_W * size + k] * per_g
+            # The strain is 1 − (u − v x − w y) g with g = 1/√(a² − x² − y²), so ∂g/∂x = x g³.
+            steep = (u - v * x - w * y) / max(a2 - x * x - y * y, 0.01 * a2)
+            by_x = g * (v - steep * x)
+            by_y = g * (w - steep * y)
+            own = packed[WEIGHT * size + k] * packed[plane + k]
+            whole = 1.0 if g > 0.0 else 0.0
+            by_pitch = x * by_x + y * by_y
+            shift += own * whole
+            along_x += own * by_x
+            along_y += own * by_y
+            stretch += own * by_pitch
+            n += whole
+            xx += by_x * by_x
+            yy += by_y * by_y
+            ss += by_pitch * by_pitch
+        answers[4 * column] = shift
+        answers[4 * column + 1] = along_x
+        answers[4 * column + 2] = along_y
+        answers[4 * column + 3] = stretch
+        squares[0] = n
+        squares[1] = xx
+        squares[2] = yy
+        squares[3] = ss
+
+
+@inner_kernel
+def systematic(state: EstimatorState, packed: Pointer, d: float, out: Matrix) -> float:
+    """Covariance of (gain, u, v, w) by what all frames share, into ``out``.
+
+    ``fit.inverse`` is that of white noise of variance 1 [Pa²]. Returns the square sum [Pa²] that
+    the fit leaves of it where each is twice its standard deviation.
+    """
+    fit = state.fit
+    budget = state.budget
+    gain = fit.gain
+    u = fit.face.u
+    v = fit.face.v
+    w = fit.face.w
+    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
+    _patterns(state, packed)
+    factor = (1.0, -gain, gain, gain)
+    sizes = (budget.shift, gain * budget.centre, gain * budget.centre, gain * budget.pitch)
+    moved = budget.moved
+    out[:] = 0.0
+    left = 0.0
+    for source in range(5):
+        # The pattern of the modulus is the pressure itself.
+        size = sizes[source] if source < 4 else gain * budget.modulus
+        square = budget.squares[source] if source < 4 else fit.sums.normal[0]
+        left += size * size * square
+        for i in range(4):
+            moved[i] = 0.0
+        for j in range(4):
+            answer = budget.answers[j, source] if source < 4 else fit.sums.normal[j]
+            answer *= factor[j] * size
+            for i in range(4):
+                moved[i] += fit.inverse[i, j] * answer
+        for j in range(4):
+            answer = budget.answers[j, source] if source < 4 else fit.sums.normal[j]
+            left -= moved[j] * answer * factor[j] * size
+        for i in range(4):
+            for j in range(4):
+                out[i, j] += moved[i] * moved[j]
+        # A motion of this size is not quite straight.
+        deeper = n_z * (u * n_z * n_z * (v * moved[2] + w * moved[3]) - moved[1]) / d
+        square = min(deeper * deeper, 1.0)
+        turned = min(moved[2] * moved[2] + moved[3] * moved[3], 1.0)
+        by_turn = _D_BY_TURN * d * turned
+        rest = _REST * turned
+        out[1, 1] += (_D_BY_DEPTH * d * square) ** 2 + by_turn * by_turn + (rest * d) ** 2
+        out[2, 2] += rest * rest
+        out[3, 3] += rest * rest
+        if state.options.free_gain:
+            gain_by_turn = _GAIN_BY_TURN * gain * turned
+            out[0, 0] += (_GAIN_BY_DEPTH * gain * square) ** 2 + gain_by_turn * gain_by_turn
+            out[0, 0] += (rest * gain) ** 2
+            out[0, 1] += by_turn * gain_by_turn
+            out[1, 0] += by_turn * gain_by_turn
+    return 4.0 * max(left, 0.0)

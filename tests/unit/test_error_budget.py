@@ -1,0 +1,166 @@
+"""The covariance carries what frames don't show: errors are as large as it says, in each case."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.error_budget import Uncertainty
+from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+E = 0.304e6
+TIP = Fingertip(0.020)
+LINEAR = Material.constant(E)
+PITCH = 0.058 / 44
+PLACE = (2e-4, -5e-4)
+GRID = SensorGrid(44, 44, PITCH, PLACE)
+NOISE = 608.0
+LENGTH = 1.5  # cells over which the noise is correlated
+LAGS = np.arange(8.0)
+CORRELATION = np.exp(-(LAGS[:, None] ** 2 + LAGS**2) / (2.0 * LENGTH**2))
+SMOOTH = np.exp(-((np.arange(58) - np.arange(7, 51)[:, None]) ** 2) / LENGTH**2)
+SMOOTH /= np.sqrt((SMOOTH[20] ** 2).sum())
+FRAMES = 200
+
+Frame = Callable[[tuple[float, float, float], np.random.Generator], np.ndarray]
+
+
+def correlated_noise(rng: np.random.Generator) -> np.ndarray:
+    return SMOOTH @ rng.normal(0.0, NOISE, (44 + 14, 44 + 14)) @ SMOOTH.T
+
+
+def white(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(0.0, NOISE, GRID.shape)
+
+
+def moved(truth: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    x, y = np.array(PLACE) + rng.normal(0.0, 5e-4, 2)
+    return SensorGrid(44, 44, PITCH, (float(x), float(y))).pressure(TIP, LINEAR, *truth)
+
+
+def stretched(truth: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    share = 1.0 + rng.normal(0.0, 0.01)
+    place = PLACE[0] * share, PLACE[1] * share
+    return SensorGrid(44, 44, PITCH * share, place).pressure(TIP, LINEAR, *truth)
+
+
+def clean(truth: tuple[float, float, float], _: np.random.Generator) -> np.ndarray:
+    return GRID.pressure(TIP, LINEAR, *truth)
+
+
+CASES: dict[str, tuple[Uncertainty, bool, Frame]] = {
+    "correlated": (
+        Uncertainty(correlation=CORRELATION),
+        True,
+        lambda truth, rng: clean(truth, rng) + correlated_noise(rng),
+    ),
+    "baseline": (
+        Uncertainty(baseline=1000.0),
+        True,
+        lambda truth, rng: clean(truth, rng) + white(rng) + rng.normal(0.0, 1000.0),
+    ),
+    "centre": (
+        Uncertainty(centre=5e-4),
+        True,
+        lambda truth, rng: moved(truth, rng) + white(rng),
+    ),
+    "pitch": (
+        Uncertainty(pitch=0.01),
+        True,
+        lambda truth, rng: stretched(truth, rng) + white(rng),
+    ),
+    "modulus": (
+        Uncertainty(modulus=0.05),
+        False,
+        lambda truth, rng: clean(truth, rng) * (1.0 + rng.normal(0.0, 0.05)) + white(rng),
+    ),
+    "all": (
+        Uncertainty(baseline=1000.0, centre=5e-4, correlation=CORRELATION),
+        True,
+        lambda truth, rng: moved(truth, rng) + correlated_noise(rng) + rng.normal(0.0, 1000.0),
+    ),
+}
+
+
+def nees(
+    known: Uncertainty | None, free: bool, frame: Frame, d: float, degrees: float
+) -> tuple[float, float]:
+    """Mean normalised square of the estimates' errors, a parameter; share of valid ones."""
+    theta = math.radians(degrees)
+    truth = (
+        d,
+        math.asin(math.sin(theta) * math.cos(1.0)),
+        math.asin(math.sin(theta) * math.sin(1.0)),
+    )
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, free_gain=free, known=known)
+    rng = np.random.default_rng(11)
+    n = 4 if free else 3
+    squares = []
+    for _ in range(FRAMES):
+        e = estimator(frame(truth, rng))
+        if e.contact and e.valid:
+            error = (np.array([e.d, e.tilt_x, e.tilt_y, e.gain]) - [*truth, 1.0])[:n]
+            squares.append(error @ np.linalg.solve(e.covariance[:n, :n], error))
+    return float(np.mean(squares)) / n, len(squares) / FRAMES
+
+
+@pytest.mark.parametrize(("d", "degrees"), [(0.001, 0.0), (0.002, 20.0), (0.006, 10.0)])
+@pytest.mark.parametrize("case", CASES)
+def test_the_errors_are_as_large_as_the_covariance_says(
+    case: str, d: float, degrees: float
+) -> None:
+    known, free, frame = CASES[case]
+    score, valid = nees(known, free, frame, d, degrees)
+    assert 0.8 < score < 1.3
+    assert valid > 0.9
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_without_it_they_are_not(case: str) -> None:
+    _, free, frame = CASES[case]
+    assert nees(None, free, frame, 0.002, 20.0)[0] > 5.0
+
+
+def test_what_frames_share_is_told_apart_and_nothing_known_adds_nothing() -> None:
+    frame = clean((0.003, 0.2, 0.0), np.random.default_rng(0))
+    plain = ContactEstimator(TIP, LINEAR, GRID, NOISE)(frame)
+    assert not plain.systematic.any()
+    shifted = ContactEstimator(TIP, LINEAR, GRID, NOISE, known=Uncertainty(centre=5e-4))(frame)
+    assert (shifted.d, shifted.tilt_x, shifted.gain) == (plain.d, plain.tilt_x, plain.gain)
+    np.testing.assert_allclose(shifted.covariance - shifted.systematic, plain.covariance, rtol=1e-3)
+    # The tip's place is taken for a turn about the tip's centre.
+    assert math.sqrt(shifted.systematic[2, 2]) == pytest.approx(5e-4 / 0.019, rel=0.05)
+
+
+def test_correlated_noise_raises_no_alarm_and_no_misfit() -> None:
+    estimator = ContactEstimator(
+        TIP, LINEAR, GRID, NOISE, known=Uncertainty(correlation=CORRELATION)
+    )
+    rng = np.random.default_rng(2)
+    for _ in range(300):
+        assert not estimator.update(correlated_noise(rng)).contact
+        assert not estimator.update(clean((0.003, 0.1, 0.0), rng) + correlated_noise(rng)).misfit
+
+
+def test_a_law_off_its_points_widens_what_it_says() -> None:
+    strain = np.linspace(0.025, 1.0, 40)
+    law = Material.from_points(strain, 1e5 * np.where(strain < 0.3, strain, 3.0 * strain - 0.6))
+    frame = GRID.pressure(TIP, law, 0.004)
+    exact = Material(law.coefficients)
+    known, unknown = (ContactEstimator(TIP, each, GRID, NOISE)(frame) for each in (exact, law))
+    assert unknown.d == known.d
+    assert unknown.d_std > 2.0 * known.d_std
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"baseline": -1.0}, {"centre": math.nan}, {"correlation": np.ones(3)}]
+)
+def test_refusals(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must"):
+        Uncertainty(**wrong)
