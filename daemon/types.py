@@ -72,6 +72,7 @@ class Contact:
     misfit: bool = False  # the frame fits no contact of the model: d and theta may be biased
     force: float = 0.0  # gain · F(d, total tilt of theta and tilt_y) by the contact table [N]
     energy: float = 0.0  # gain · U(d, total tilt) [J]
+    force_std: float = 0.0  # standard deviation of force [N], with the table's and the law's error
     inside: bool = True  # (d, θ) lies inside the model's domain
 
 

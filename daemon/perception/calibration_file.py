@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softfinger.daemon.errors import TactileError
 from softfinger.daemon.own_files import write_whole
-from softfinger.daemon.profile.settings import Finite, Positive, Settings
+from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Settings
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
 
@@ -51,12 +51,18 @@ class Sensor(_StepModel):
 
 
 class TareStep(_StepModel):
-    """Mean count of each unloaded cell, and their typical standard deviation [counts]."""
+    """Mean count of each unloaded cell, and their typical standard deviation [counts].
+
+    ``correlation`` of two cells' noise by their distance in rows and columns, empty for none;
+    ``drift``: standard deviation of what all cells do together [counts].
+    """
 
     date: str
     zero: list[list[Finite]]
     noise: Finite
     frames: int
+    correlation: list[list[Finite]] = []
+    drift: NonNegative = 0.0
 
 
 class EquilibrateStep(_StepModel):
@@ -79,13 +85,14 @@ class CurveStep(_StepModel):
 
 
 class CentreStep(_StepModel):
-    """Tip's centre on the sensor [m]; rotation [rad], null where it was not measured."""
+    """Tip's centre on the sensor, ``std`` its error [m]; rotation [rad], null: not measured."""
 
     date: str
     centre: tuple[Finite, Finite]
     rotation: Finite | None
     scale: Finite
     residual: Finite
+    std: NonNegative = 0.0
 
 
 class ModulusStep(_StepModel):
@@ -291,6 +298,9 @@ def _contradiction(calibration: Calibration) -> str:
             return f"{name}: expected {sensor.rows} rows of {sensor.cols} numbers"
         if min(min(row) for row in rows) < 0.0:
             return f"{name}: expected no number below 0"
+    rho = calibration.tare.correlation if calibration.tare else []
+    if rho and (len({len(row) for row in rho}) > 1 or rho[0][:1] != [1.0]):
+        return "tare.correlation: expected rows of equal length, the first beginning with 1"
     if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
         return "equilibrate.gain: every cell is dead"
     if calibration.curve:

@@ -35,6 +35,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
@@ -45,8 +46,13 @@ FloatArray = NDArray[np.float64]
 class ContactFilter:
     """The filter of one hand. Costs nothing but a comparison while no tip is touched."""
 
-    def __init__(self, settings: Settings, tables: tuple[ContactTable, ContactTable]) -> None:
-        """``tables``: each tip's, which may be of different materials."""
+    def __init__(
+        self,
+        settings: Settings,
+        tables: tuple[ContactTable, ContactTable],
+        materials: tuple[Material, Material] | None = None,
+    ) -> None:
+        """``tables``: each tip's; ``materials``: theirs, whose laws may be off their points."""
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._with_object = settings.scene.object_model
@@ -63,6 +69,14 @@ class ContactFilter:
         state.taper = state.assumed_taper = settings.object.taper
         state.alone = len(self._fingers) == 1
         state.t = -math.inf
+        shares = np.linspace(1e-3, 1.0, kernels.LAW_POINTS)
+        for finger, table in enumerate(tables):
+            law = (
+                np.zeros(shares.shape)
+                if materials is None
+                else materials[finger].force_error(shares)
+            )
+            state.tip[finger].law[:] = np.hypot(law, table.max_error)
         self._history: Any = np.zeros(
             round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
         )
@@ -108,7 +122,8 @@ class ContactFilter:
         if not live:
             tip = self._state.tip[finger]
             tip.live, tip.d.mean = False, 0.0
-            _fill_from_frame(contact, estimate, self._tables[finger])
+            law = self._state.tip[finger].law
+            _fill_from_frame(contact, estimate, self._tables[finger], law, self._state.radius)
             return
         kernels.correct(
             self._state.array,
@@ -117,6 +132,7 @@ class ContactFilter:
             frame.t_sample,
             (estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain),
             estimate.covariance,
+            estimate.systematic,
         )
 
     def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
@@ -140,6 +156,7 @@ class ContactFilter:
                     contact.energy,
                     contact.d_std,
                     contact.theta_std,
+                    contact.force_std,
                     contact.inside,
                 ) = tips[finger]
             contact.valid = self._sound[finger]
@@ -154,18 +171,27 @@ def _turning(table: ContactTable, radius: float) -> float:
     return float(contact.energy_theta / (contact.force * d)) / theta
 
 
-def _fill_from_frame(contact: Contact, estimate: ContactEstimate, table: FloatArray) -> None:
-    """Fill ``contact`` from one frame's estimate alone; ``table``: its tip's data."""
+def _fill_from_frame(
+    contact: Contact, estimate: ContactEstimate, table: FloatArray, law: FloatArray, radius: float
+) -> None:
+    """Fill ``contact`` from one frame's estimate alone; ``table`` and ``law``: its tip's."""
     touches = estimate.contact
     contact.d = estimate.d if touches else 0.0
     contact.theta = estimate.tilt_x if touches else 0.0
     contact.tilt_y = estimate.tilt_y if touches else 0.0
     contact.d_std = estimate.d_std if touches else 0.0
     contact.theta_std = estimate.tilt_x_std if touches else 0.0
-    contact.force = contact.energy = 0.0
+    contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
     if touches:
         tilt = total_tilt(contact.theta, contact.tilt_y)
-        force, energy, _, _, _, _, contact.inside = lookup(table, contact.d, tilt)
+        force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
         # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
         contact.force, contact.energy = contact.gain * force, contact.gain * energy
+        along = contact.theta / tilt if tilt > 0.0 else 0.0
+        across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
+        by_tilt *= contact.gain
+        slopes = np.array([contact.gain * by_d, by_tilt * along, by_tilt * across, force])
+        share = np.interp(contact.d / radius, np.linspace(0.0, 1.0, kernels.LAW_POINTS), law)
+        variance = slopes @ estimate.covariance @ slopes + (share * contact.force) ** 2
+        contact.force_std = math.sqrt(variance)

@@ -24,7 +24,7 @@ from softfinger.kinematics.hand.grasp_state import (
 )
 
 FloatArray = NDArray[np.float64]
-Tip = tuple[float, float, float, float, float, float, bool]  # what `write_grasp` returns of one
+Tip = tuple[float, float, float, float, float, float, float, bool]  # of `write_grasp`
 
 HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
@@ -35,6 +35,7 @@ _SHARE = 0.05  # error of a predicted motion, as a share of it
 _OUTLIER = 9.0  # variances off: the prediction was wrong, not the frame
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
 _STEP_VARIANCE = 1.0 / 12.0  # of a count
+LAW_POINTS = 17  # over d from 0 to the radius
 
 
 class Quantity(Record):
@@ -55,6 +56,10 @@ class TrackedTip(Record):
     q: float  # tracked joint [rad]
     unseen: float  # joint motion since the last frame that the velocity can't show [rad]
     torque: float  # of the joint [N·m]
+    covariance: Annotated[FloatArray, 3, 3]  # of (d, θ, gain) at the last frame
+    shared: Pair  # the variances of d and θ in it that all frames share
+    began: Pair  # the other ones, as the filter had them then
+    law: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
     live: bool  # touches, and is carried on
 
 
@@ -294,14 +299,18 @@ def correct(
     t: float,
     found: tuple[float, float, float, float],
     covariance: FloatArray,
+    systematic: FloatArray,
 ) -> None:
-    """Take in one finger's frame of time ``t``: d, θ, tilt_y and gain, and their covariance."""
+    """Take in one finger's frame of time ``t``: d, θ, tilt_y and gain, and their covariance.
+
+    ``systematic`` is the part of it that all frames share: it is no reason to wait for more.
+    """
     f = filters[0]
     tip = f.tip[finger]
     other = f.tip[1 - finger]
     d, theta, tilt_y, gain = found
-    d_std = math.sqrt(covariance[0, 0])
-    theta_std = math.sqrt(covariance[1, 1])
+    d_std = math.sqrt(covariance[0, 0] - systematic[0, 0])
+    theta_std = math.sqrt(covariance[1, 1] - systematic[1, 1])
     d_variance = d_std * d_std
     row, later, share = _rows_at(history, f.newest, t)
     before = history[row]
@@ -327,6 +336,7 @@ def correct(
             face = f.angle.mean - 0.5 * sense * f.taper
             _assume_taper(f, -sense, face, _face_variance(f, -sense))
             _weigh_angle(f, sense, turned, angle, angle_variance)
+        _keep_covariance(f, finger, 1.0, covariance, systematic)
         return
     # The errors of d and gain in a frame make up for each other: both get the same weight.
     weight = _weigh(tip.d, f.count * f.length, f.raw, moved, d, d_variance)
@@ -334,6 +344,45 @@ def correct(
     predicted = f.angle.mean
     _weigh_angle(f, sense, turned, angle, angle_variance)
     f.stray += f.angle.mean - predicted
+    _keep_covariance(f, finger, weight, covariance, systematic)
+
+
+@inner_kernel
+def _keep_covariance(
+    f: FilterState, finger: int, weight: float, covariance: FloatArray, systematic: FloatArray
+) -> None:
+    """What a frame of this ``weight`` leaves of the covariance of (d, θ, gain)."""
+    tip = f.tip[finger]
+    for i in range(3):
+        row = i if i < 2 else 3
+        for j in range(3):
+            column = j if j < 2 else 3
+            shared = systematic[row, column]
+            tip.covariance[i, j] = weight * (covariance[row, column] - shared) + shared
+    tip.shared[0] = systematic[0, 0]
+    tip.shared[1] = systematic[1, 1]
+    tip.began[0] = tip.d.variance
+    tip.began[1] = _face_variance(f, -1.0 if finger == 0 else 1.0)
+
+
+@inner_kernel
+def _force_variance(
+    tip: TrackedTip, slopes: tuple[float, float, float], grown: Two, share: float
+) -> float:
+    """Variance of F by its ``slopes`` in (d, θ, gain), ``grown`` that of d and θ since the frame.
+
+    F is the third slope times the gain; ``share`` is d over the tip's radius.
+    """
+    total: float = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += slopes[i] * tip.covariance[i, j] * slopes[j]
+    for i in range(2):
+        total += slopes[i] * slopes[i] * max(grown[i] - tip.began[i], 0.0)
+    t = min(max(share, 0.0), 1.0) * (LAW_POINTS - 1.001)
+    k = int(t)
+    law: float = tip.law[k] + (t - k) * (tip.law[k + 1] - tip.law[k])
+    return total + (law * tip.gain * slopes[2]) ** 2
 
 
 @inner_kernel
@@ -345,21 +394,30 @@ def _between(first: float, last: float, share: float) -> float:
 def _write_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -> Tip:
     tip = f.tip[finger]
     grasp = f.grasp
-    force, energy, stiffness, _, _, _, inside = lookup(
-        table, tip.d.mean, total_tilt(theta, tip.tilt_y)
-    )
+    tilt = total_tilt(theta, tip.tilt_y)
+    force, energy, stiffness, by_tilt, _, _, inside = lookup(table, tip.d.mean, tilt)
     grasp.q[finger] = tip.q
     grasp.d[finger] = max(tip.d.mean, 0.0)
     # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
     grasp.force[finger] = tip.gain * force
     grasp.stiffness[finger] = tip.gain * stiffness
+    d_variance = _variance(tip.d, f.count * f.length)
+    theta_variance = _face_variance(f, -1.0 if finger == 0 else 1.0)
+    along = theta / tilt if tilt > 0.0 else 0.0
+    force_variance = _force_variance(
+        tip,
+        (tip.gain * stiffness, tip.gain * by_tilt * along, force),
+        (d_variance, theta_variance),
+        tip.d.mean / f.radius,
+    )
     return (
         grasp.d[finger],
         theta,
         grasp.force[finger],
         tip.gain * energy,
-        math.sqrt(_variance(tip.d, f.count * f.length)),
-        math.sqrt(_face_variance(f, -1.0 if finger == 0 else 1.0)),
+        math.sqrt(d_variance + tip.shared[0]),
+        math.sqrt(theta_variance + tip.shared[1]),
+        math.sqrt(force_variance),
         inside,
     )
 
@@ -370,8 +428,8 @@ def write_grasp(
 ) -> tuple[Tip, Tip, float, float]:
     """Write what the estimates mean into ``grasp``.
 
-    Returns d, θ, force, energy, the standard deviations of d and θ, and whether they are inside the
-    table, for each tip; then the object's angle [rad] and width [m].
+    Returns d, θ, force, energy, the standard deviations of d, θ and the force, and whether they are
+    inside the table, for each tip; then the object's angle [rad] and width [m].
     """
     f = filters[0]
     grasp = f.grasp

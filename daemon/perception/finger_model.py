@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
-from softfinger.daemon.profile.factory import make_grid, make_material, make_table, make_tip
+from softfinger.daemon.profile.factory import (
+    law_problem,
+    make_grid,
+    make_material,
+    make_table,
+    make_tip,
+    worst_force_error,
+)
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
@@ -51,6 +61,9 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if calibration is not None and calibration.modulus is not None:
             material = calibration.modulus.material()
+            problem = law_problem(material, settings.material.force_error_max)
+            if problem:
+                raise SettingsError(f"{settings.tactile.calibration[finger]}: modulus: {problem}")
             table = make_table(settings, material, cache, on_event)
         else:
             if common is None:
@@ -61,6 +74,12 @@ def make_models(
         made.append(FingerModel(finger, material, table, grid, calibration))
         if calibration is not None and on_event is not None:
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
+        if material.misfits is not None and on_event is not None:
+            text = (
+                f"{name}: the law is within {material.fit_error:.0f} Pa of its points, which is "
+                f"{worst_force_error(material):.1%} of F at most"
+            )
+            on_event("info", "material", text)
     return made[0], made[1]
 
 
@@ -103,4 +122,25 @@ def make_estimator(
         free_gain=settings.estimator.free_gain,
         live=alive,
         readings=Readings(saturation, threshold, quantum),
+        known=uncertainty(settings, calibration),
     )
+
+
+def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertainty:
+    """What the frames don't show, by the settings or by what the calibration measured instead."""
+    tactile = settings.tactile
+    baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
+    modulus, correlation = settings.material.modulus_error, None
+    if calibration is not None:
+        tare, place = calibration.tare, calibration.centre
+        if tare is not None and tare.correlation:
+            correlation = np.array(tare.correlation)
+        if tare is not None and tare.drift > 0.0:
+            quantum = Converter(calibration, tactile.pascal_per_count).quantum
+            baseline = math.hypot(baseline, tare.drift * quantum)
+        if place is not None and place.std > 0.0:
+            centre = place.std
+            pitch = max(pitch, abs(place.scale - 1.0))
+        if calibration.modulus is not None:
+            modulus = max(modulus, calibration.modulus.residual)
+    return Uncertainty(baseline, centre, pitch, modulus, correlation)

@@ -39,7 +39,11 @@ class Perception:
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
         ]
-        self.filter = ContactFilter(settings, (models[0].table, models[1].table))
+        self.filter = ContactFilter(
+            settings,
+            (models[0].table, models[1].table),
+            (models[0].material, models[1].material),
+        )
 
     def update(self, state: State) -> None:
         """Take in new frames; write the contacts and the object's pose of this tick."""

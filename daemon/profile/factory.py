@@ -29,6 +29,25 @@ def make_tip(settings: Settings) -> Fingertip:
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base)
 
 
+SHALLOWEST = 0.05  # d over the radius from which a law's misfit of its points is judged
+
+
+def worst_force_error(material: Material) -> float:
+    """Largest relative error of F by the law's misfit of its points, from SHALLOWEST on."""
+    return float(material.force_error(np.linspace(SHALLOWEST, 1.0, 20)).max())
+
+
+def law_problem(material: Material, most: float) -> str:
+    """Why a law that misses its points by more than ``most`` of F can't be used; empty: it can."""
+    found = worst_force_error(material)
+    if found <= most:
+        return ""
+    return (
+        f"the smooth law misses its points by up to {material.fit_error:.4g} Pa, which makes "
+        f"{found:.1%} of F; expected {most:.1%} at most (material.force_error_max)"
+    )
+
+
 def make_material(law: MaterialSettings) -> Material:
     """The settings' stress-strain law. Raises SettingsError for points that are no usable law."""
     if law.law == "constant":

@@ -105,6 +105,8 @@ class MaterialSettings(Section):
     modulus: Modulus = 0.304e6  # Pa, for law = "constant"
     strain: tuple[Finite, ...] = ()  # for law = "points"
     stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
+    modulus_error: Annotated[float, Field(ge=0, le=1)] = 0.0  # relative, standard deviation
+    force_error_max: Positive = 0.05  # of F, by the law's misfit of its points, d > radius/20
 
 
 class TableSettings(Section):
@@ -152,6 +154,9 @@ class TactileSettings(Section):
     full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
     rate: Rate = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
+    baseline_error: NonNegative = 0.0  # Pa, likewise of a shift of all cells since the tare
+    centre_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, of the tip's centre, x and y
+    pitch_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number

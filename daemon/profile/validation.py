@@ -109,12 +109,17 @@ def _material(settings: Settings) -> Iterator[str]:
             f"expected {len(material.strain)} as in material.strain"
         )
         return
+    from softfinger.daemon.profile.factory import law_problem
     from softfinger.kinematics.contact.material import Material
 
     try:
-        Material.from_points(material.strain, material.stress)
+        law = Material.from_points(material.strain, material.stress)
     except ValueError as error:
         yield f"material.strain, material.stress: {error}"
+        return
+    problem = law_problem(law, material.force_error_max)
+    if problem:
+        yield f"material.strain, material.stress: {problem}"
 
 
 def _wedge(settings: Settings) -> Iterator[str]:

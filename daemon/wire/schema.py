@@ -85,6 +85,7 @@ class FingerState:
     energy: float = field("J", "elastic potential energy, gain · U(d, total tilt) likewise")
     d_std: float = field("m", "standard deviation of d")
     theta_std: float = field("rad", "standard deviation of theta")
+    force_std: float = field("N", "standard deviation of force, with that of the tip's law")
     gain: float = field("", "measured over modelled pressure")
     misfit: bool = field("", "the frame fits no contact of the model: d, theta may be biased")
     contact: bool = field("", "something touches the tip")

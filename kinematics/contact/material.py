@@ -64,7 +64,7 @@ class Material:
 
     coefficients: tuple[Fraction, ...]
     name: str = field(default="polynomial", compare=False)
-    fit_error: float = field(default=0.0, compare=False)  # largest misfit of given points [Pa]
+    misfits: FloatArray | None = field(default=None, repr=False, compare=False)  # see from_points
     law: FloatArray = field(init=False, repr=False, compare=False)
     energy_law: FloatArray = field(init=False, repr=False, compare=False)
 
@@ -118,17 +118,39 @@ class Material:
         """A smooth monotone law near measured points of strain (a ratio) and stress [Pa].
 
         The origin belongs to every curve and need not be given. Points beyond strain 1 are not
-        used; short of it the curve goes on with its last slope. ``fit_error`` is the law's largest
-        distance from the points. Raises MaterialError, with everything that is wrong, for points
-        that are too few, not finite, not rising, start off zero, or that no such law comes near to.
+        used; short of it the curve goes on with its last slope. ``misfits`` [2, n] are the points'
+        strains and the law's distances from them [Pa]. Raises MaterialError, with everything that
+        is wrong, for points that are too few, not finite, not rising, start off zero, or that no
+        such law comes near to.
         """
-        coefficients, misfit = fit_law(strain, stress)
-        return cls(tuple(coefficients), name="points", fit_error=misfit)
+        coefficients, misfits = fit_law(strain, stress)
+        return cls(tuple(coefficients), name="points", misfits=misfits)
 
     @property
     def reference_modulus(self) -> float:
         """E₀ = dσ/dε at zero strain [Pa]."""
         return float(self.coefficients[0])
+
+    @property
+    def fit_error(self) -> float:
+        """The law's largest distance from the points that it was made from [Pa]; 0 without."""
+        return 0.0 if self.misfits is None else float(self.misfits[1].max())
+
+    def force_error(self, share: ArrayLike) -> FloatArray:
+        """Relative error of F, upright, by the law's misfit, at displacements over the radius.
+
+        F/(2π h²) = ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d: the misfits, between the
+        points on straight lines from 0 at no strain, against the law. ``share`` in (0, 1].
+        """
+        shares = np.asarray(share, np.float64)
+        if self.misfits is None:
+            return np.zeros(shares.shape)
+        ends = np.minimum(shares[..., None], 0.999)
+        strain = ends * (np.arange(200) + 0.5) / 200
+        weight = (1.0 - strain) ** -3
+        x, misses = np.concatenate([np.zeros((2, 1)), self.misfits], axis=1)
+        missed = (np.interp(strain, x, misses) * weight).sum(axis=-1)
+        return np.asarray(missed / (self.stress(strain) * weight).sum(axis=-1))
 
     @property
     def is_linear(self) -> bool:

@@ -70,8 +70,8 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
     return x[used], y[used]
 
 
-def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float]:
-    """Coefficients c_1, c_2, … of σ(ε) [Pa] and the largest misfit of the points [Pa].
+def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], FloatArray]:
+    """Coefficients c_1, c_2, … of σ(ε) [Pa], and [2, n] the points' strains and misfits [Pa].
 
     The lowest degree is taken that comes about as near to the points as any. Beyond the last point
     the law goes on about straight.
@@ -94,7 +94,8 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], float
             f"{misfit * top:.4g} Pa of {top:.4g} Pa"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
-    return [value / (j + 1) for j, value in enumerate(rising)], misfit * top
+    misses = np.abs(_integrals(x, len(modulus) - 1) @ modulus - y / top) * top
+    return [value / (j + 1) for j, value in enumerate(rising)], np.stack([x, misses])
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

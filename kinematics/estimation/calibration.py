@@ -37,6 +37,8 @@ _FEW_CELLS = 4  # may be faulty
 _BINS = 24  # of strain
 _LEAST_TILT = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
+_LAGS = 8  # cells over which noise may be correlated
+_SEEN = 4.0  # standard errors
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -45,10 +47,17 @@ class CalibrationError(SoftfingerError, ValueError):
 
 @dataclass(frozen=True)
 class Tare:
-    """``zero``: mean count unloaded; ``noise``: standard deviation; both float64 [rows, cols]."""
+    """``zero``: mean count unloaded; ``noise``: standard deviation; both float64 [rows, cols].
+
+    ``correlation`` [k, m] is that of two cells' noise by their distance in rows and columns, empty
+    where the frames show none; ``drift`` [counts] the standard deviation of what all cells do
+    together.
+    """
 
     zero: FloatArray
     noise: FloatArray
+    correlation: FloatArray
+    drift: float
 
 
 def tare(frames: ArrayLike) -> Tare:
@@ -63,7 +72,37 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _RESTLESS * max(float(np.median(noise)), 0.5))
     if restless >= _FEW_CELLS:
         raise CalibrationError(f"tare: {restless} cells don't rest; does something touch the tip?")
-    return Tare(stack.mean(axis=0), noise)
+    return Tare(stack.mean(axis=0), noise, *noise_correlation(stack))
+
+
+def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
+    """``correlation`` and ``drift`` of a :class:`Tare`, from unloaded frames [n, rows, cols].
+
+    What is within four standard errors of none counts as none.
+    """
+    n, rows, cols = stack.shape
+    noise = stack - stack.mean(axis=0)
+    common = noise.mean(axis=(1, 2))
+    noise -= common[:, None, None]
+    shape = rows + _LAGS, cols + _LAGS
+    power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
+    products = np.fft.ifft2(power).real
+    # Both signs of one of the lags: what the noise does along one diagonal and the other.
+    both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAGS, :_LAGS]
+    pairs = (n - 1.0) * np.outer(rows - np.arange(_LAGS), cols - np.arange(_LAGS))
+    if rows < _LAGS or cols < _LAGS or not both[0, 0] > 0.0:
+        return np.empty((0, 0)), float(common.std(ddof=1))
+    rho = both / pairs / (both[0, 0] / pairs[0, 0])
+    rho[np.abs(rho) < _SEEN / np.sqrt(pairs)] = 0.0
+    used = np.argwhere(rho != 0.0).max(axis=0) + 1
+    rho = rho[: used[0], : used[1]]
+    twice = np.where(np.arange(max(used)) > 0, 2.0, 1.0)
+    together = float(twice[: used[0]] @ rho @ twice[: used[1]])
+    own = max(together, 0.0) * noise.var() / (rows * cols)
+    drift = math.sqrt(max(float(common.var(ddof=1)) - own, 0.0))
+    if drift < _SEEN * math.sqrt(own / n):
+        drift = 0.0
+    return (rho if rho.size > 1 else np.empty((0, 0))), drift
 
 
 @dataclass(frozen=True)
@@ -203,13 +242,15 @@ class Centre:
     """The tip's centre in the sensor's axes (x, y) [m], and the sensor's rotation [rad].
 
     ``rotation`` is None where no press was tilted. ``scale`` is the centroid's measured travel over
-    the model's, 1 for a true tip; ``residual`` the rms distance [m].
+    the model's, 1 for a true tip; ``residual`` the rms distance [m]; ``std`` the centre's standard
+    deviation in x and in y [m].
     """
 
     centre: tuple[float, float]
     rotation: float | None
     scale: float
     residual: float
+    std: float
 
 
 def fit_centre(
@@ -245,12 +286,12 @@ def fit_centre(
         force = stack.sum(axis=(1, 2)) * math.prod(grid.pitches)
         presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
         found, moved = fit_place(presses, tip, material, grid, tilted)
-        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved)
-    centre, rotation, scale, residual = grid.centre, None, 1.0, 0.0
+        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved, 0.0)
+    centre, rotation, scale, residual, std = grid.centre, None, 1.0, 0.0, 0.0
     for _ in range(4):
         at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)
         estimator = ContactEstimator(tip, material, at, noise, free_gain=True, live=live)
-        points, arms = np.empty((len(s), 2)), np.empty(len(s))
+        points, arms, stray = np.empty((len(s), 2)), np.empty(len(s)), np.empty(len(s))
         for k, frame in enumerate(stack):
             estimate = estimator(frame)
             if not (estimate.contact and estimate.valid):
@@ -258,17 +299,24 @@ def fit_centre(
             arms[k] = tip.radius - estimate.d / 3.0
             normal = math.sin(estimate.tilt_x), math.sin(estimate.tilt_y)
             points[k] = np.array(centre) + arms[k] * np.array(normal)
+            # A press is as upright as it can be told to be.
+            stray[k] = arms[k] * math.hypot(estimate.tilt_x_std, _UPRIGHT / math.sqrt(3.0))
         rows = np.ones((len(s), 1))
         if tilted:
             rows = np.stack([np.ones(len(s)), arms * s], axis=1)
         solution = np.linalg.lstsq(rows, points, rcond=None)[0]
         centre = float(solution[0, 0]), float(solution[0, 1])
-        residual = math.sqrt(2.0) * _rms(rows @ solution - points)
+        misses = rows @ solution - points
+        residual = math.sqrt(2.0) * _rms(misses)
+        freedom = 2 * (len(s) - rows.shape[1])
+        each = math.sqrt(float((misses**2).sum()) / freedom) if freedom else 0.0
+        each = max(each, float(stray.max()))
+        std = each * math.sqrt(float(np.linalg.inv(rows.T @ rows)[0, 0]))
         if tilted:
             # The finger's x axis in the sensor's: (cos, −sin) of the rotation.
             rotation = math.atan2(-solution[1, 1], solution[1, 0])
             scale = math.hypot(*solution[1])
-    return Centre(centre, rotation, scale, residual)
+    return Centre(centre, rotation, scale, residual, std)
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,6 @@ def set_budget(
     budget.baseline, budget.centre, budget.pitch = known.baseline, known.centre, known.pitch
     budget.modulus = 0.0 if options.free_gain else known.modulus
     budget.systematic = max(budget.shift, known.centre, known.pitch, budget.modulus) > 0.0
-    budget.sharing = 1.0
     level = options.patch_level
     weights = _NEIGHBOURS.copy()
     weights[2, 2] = 0.0

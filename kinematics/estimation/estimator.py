@@ -38,7 +38,8 @@ class ContactEstimate:
     ``contact``: something presses. ``valid`` promises one contact that the model describes: the
     fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
     frame's squared pressure, nothing else presses, and what it leaves smoothly over the footprint
-    could hide no more than 5 % of d (one standard deviation). Such a misfit and the known
+    could hide no more than 60 % of d (one standard deviation), or 3 % with a gain beyond 1/2 to 2,
+    where both say that this is another tip. Such a misfit, as of a curved face, and the known
     uncertainties are in the covariance. Without contact d and the tilts are 0 and that is valid.
     It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip that stands
     elsewhere on the sensor.
@@ -185,6 +186,7 @@ class ContactEstimator:
         options.patch_level = PATCH_LEVEL
         options.explained_min = _EXPLAINED_MIN
         options.modulus = material.reference_modulus
+        state.budget.sharing = 1.0
         options.blur = grid.blur
         options.rotation = grid.rotation
         self._solid: Any = None

@@ -23,7 +23,12 @@ from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_fa
 CLIPPED_MORE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
-HIDDEN_MAX = 0.05  # of d that a misfit smooth over the footprint may hide
+# What a misfit smooth over the footprint may hide of d, over d: as much as the curved face of a disc
+# does, which the covariance covers; hardly anything with a gain that is far from 1, where both say
+# that this is another tip, and the covariance doesn't cover it.
+HIDDEN_MAX = 0.6
+HIDDEN_MAX_FAR = 0.03
+GAIN_FAR = 2.0
 
 
 @inner_kernel
@@ -105,8 +110,17 @@ def _likelihood(
                 level += 2.0 * state.budget.baseline / signal.scale
                 estimate.second = presses_outside(state, frame, centres, level)
             if not estimate.second:
-                return estimate.hidden <= HIDDEN_MAX
+                return _is_this_tip(state)
     return False
+
+
+@inner_kernel
+def _is_this_tip(state: EstimatorState) -> bool:
+    """Whether a misfit leaves it possible that the model is the tip's."""
+    estimate = state.estimate
+    near = GAIN_FAR * state.options.fixed_gain > estimate.gain
+    near = near and GAIN_FAR * estimate.gain > state.options.fixed_gain
+    return bool(estimate.hidden <= (HIDDEN_MAX if near else HIDDEN_MAX_FAR))
 
 
 @inner_kernel
@@ -154,7 +168,7 @@ def _judge_moments(
     for i in range(4):
         for j in range(4):
             fit.covariance[i, j] *= wider
-    return estimate.explained >= state.options.explained_min and estimate.hidden <= HIDDEN_MAX
+    return estimate.explained >= state.options.explained_min and _is_this_tip(state)
 
 
 @inner_kernel

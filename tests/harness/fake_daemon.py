@@ -32,6 +32,7 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "energy": 12.34e-3,
         "d_std": 0.02e-3,
         "theta_std": math.radians(0.1),
+        "force_std": 0.05,
         "tilt_y": 0.0,
         "gain": 1.0,
         "misfit": False,

@@ -145,8 +145,21 @@ def _tare(step: Step) -> Done:
     found = tare(np.concatenate(step.loads.frames))
     noise = float(np.median(found.noise))
     count = sum(map(len, step.loads.frames))
-    result = TareStep(date=now(), zero=found.zero.tolist(), noise=noise, frames=count)
+    rho = found.correlation
+    result = TareStep(
+        date=now(),
+        zero=found.zero.tolist(),
+        noise=noise,
+        frames=count,
+        correlation=rho.tolist(),
+        drift=found.drift,
+    )
     line = f"{count} frames, zero up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
+    if rho.size:
+        beside = max(float(rho[0, 1:2].sum()), float(rho[1:2, 0].sum()))
+        line += f", correlated {beside:.2f} between neighbours"
+    if found.drift > 0.0:
+        line += f", all cells drift by {found.drift:.2f} counts"
     return step.result(tare=result), line, {"zero": found.zero, "noise": found.noise}
 
 
@@ -212,6 +225,7 @@ def _centre(step: Step) -> Done:
         rotation=found.rotation,
         scale=found.scale,
         residual=found.residual,
+        std=found.std,
     )
     x, y = found.centre
     rotation = (
@@ -220,7 +234,8 @@ def _centre(step: Step) -> Done:
         else f"rotation {math.degrees(found.rotation):.2f}°, travel {found.scale:.3f} of the model"
     )
     line = (
-        f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) mm; {rotation}; {found.residual * 1e6:.0f} µm rms"
+        f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) ± {found.std * 1e3:.3f} mm; {rotation}; "
+        f"{found.residual * 1e6:.0f} µm rms"
     )
     return step.result(centre=result), line, {"theta": step.theta, "centre": found}
 
