@@ -23,7 +23,7 @@ from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_fa
 CLIPPED_MORE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
 D_MAX = 0.75  # of the radius
-# What a misfit smooth over the footprint may hide of d, over d: as much as the curved face of a disc
+# What a misfit smooth over the footprint may hide of d, over d: as much as a disc's curved face
 # does, which the covariance covers; hardly anything with a gain that is far from 1, where both say
 # that this is another tip, and the covariance doesn't cover it.
 HIDDEN_MAX = 0.6
