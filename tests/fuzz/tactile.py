@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS
 from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.daemon.tactile.decoder import Decoder
 from softfinger.daemon.tactile.flexitac import FlexiTacDecoder

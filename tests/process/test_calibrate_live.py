@@ -13,8 +13,7 @@ import pytest
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.perception.calibration_file import load_calibration
-from softfinger.daemon.simulation.emulator.encoders import ENCODERS
-from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
+from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.types import Frame
 from softfinger.kinematics.contact.material import Material
 from softfinger.tools.cli import main

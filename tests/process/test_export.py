@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.wire import schema
+from softfinger.tools.recordings.export import BLOCK, CsvTable, ParquetTable, export
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.tables import BLOCK, CsvTable, ParquetTable, export
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import Inline
 from tests.harness.daemon_process import softfinger

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.simulation.emulator.encoders import encode_glove, encoder_for
+from softfinger.daemon.simulation.emulator.tactile_board import encode_glove, encoder_for
 from softfinger.daemon.tactile.glove import GloveDecoder, bits_of
 from tests.conftest import until
 from tests.harness.tactile import Rig

@@ -15,10 +15,10 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from softfinger.daemon.wire import schema
-from softfinger.tools.analysis import plot, plots, plots_model
+from softfinger.tools import style
+from softfinger.tools.analysis import plot, plots_model
 from softfinger.tools.analysis.plots_data import MODES, Missing, RecordedRun, load_run
 from softfinger.tools.cli import main
-from softfinger.tools.paper import style
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.daemon_process import softfinger
@@ -48,7 +48,7 @@ def run(path: Path) -> RecordedRun:
 
 def drawn(run: RecordedRun, page: str) -> Figure:
     with style.settings():
-        figure = plots.PAGES[page](run)
+        figure = plot.pages()[page](run)
         figure.draw_without_rendering()
     return figure
 
@@ -100,10 +100,6 @@ def test_a_page_by_name_as_svg(path: Path, tmp_path: Path, call: Call) -> None:
     assert [each.name for each in files] == ["angle.svg", "timing.svg"]
     for each in files:
         assert ElementTree.parse(each).getroot().tag.endswith("svg")
-
-
-def test_help_names_the_pages_there_are() -> None:
-    assert tuple(plot.PAGES) == tuple(plots.PAGES)
 
 
 def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: RecordedRun, path: Path) -> None:
@@ -253,7 +249,7 @@ def test_without_settings_there_is_no_model(path: Path, run: RecordedRun) -> Non
     )
     for page in ("angle", "landscape"):
         with pytest.raises(Missing, match="no reason"):
-            plots.PAGES[page](bare)
+            plot.pages()[page](bare)
     assert "within 2σ" in texts(drawn(bare, "error"))  # d and θ tell theirs by themselves
 
 
@@ -264,7 +260,7 @@ def test_one_finger_alone(tmp_path: Path) -> None:
     record_hand(path, due, 2.5, one)
     run = load_run(Recording(path), -math.inf, math.inf, None)
     assert run.fingers == ("left",)
-    for page in plots.PAGES:
+    for page in plot.PAGES:
         figure = drawn(run, page)
         assert "right" not in texts(figure).split("\n"), page
 

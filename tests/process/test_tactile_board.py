@@ -8,10 +8,11 @@ import select
 import numpy as np
 import pytest
 
-from softfinger.daemon.simulation.emulator.encoders import ENCODERS, encode_flexitac
 from softfinger.daemon.simulation.emulator.tactile_board import (
+    ENCODERS,
     FrameWriter,
     TactileBoard,
+    encode_flexitac,
 )
 from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
 from softfinger.daemon.types import Frame

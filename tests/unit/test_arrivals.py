@@ -9,8 +9,7 @@ import pytest
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.emulator.encoders import ENCODERS
-from softfinger.daemon.simulation.emulator.tactile_board import TactileBoard
+from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import Arrivals, SimulatedTactile
 from softfinger.daemon.tactile.cobs import CobsDecoder

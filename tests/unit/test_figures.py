@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from softfinger.tools import cli
-from softfinger.tools.paper import appendix, basin, figures, style
+from softfinger.tools import cli, style
+from softfinger.tools.paper import appendix, basin, figures
 from softfinger.tools.paper.integrals import double_integrals
 from softfinger.tools.paper.sheets import sheet
 

@@ -13,8 +13,8 @@ from softfinger.daemon.own_files import write_text
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, State
+from softfinger.tools import style
 from softfinger.tools.analysis.sources import Progress, Source
-from softfinger.tools.paper import style
 
 FloatArray = NDArray[np.float64]
 

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softfinger.tools.arguments import add_range, to_stderr
 from softfinger.tools.extras import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from softfinger.tools.analysis.plots_data import RecordedRun
 
 PAGES = {
     "time": "force, energy, displacement and the object's angle over time, with their targets",
@@ -49,18 +56,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_range(parser)
 
 
+def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
+    """What draws each page; matplotlib is imported when one is drawn."""
+    from softfinger.tools.analysis.plots_error import draw_error
+    from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
+    from softfinger.tools.analysis.plots_time import draw_joints, draw_time
+    from softfinger.tools.analysis.plots_timing import draw_timing
+
+    functions = draw_time, draw_angle, draw_landscape, draw_error, draw_joints, draw_timing
+    return dict(zip(PAGES, functions, strict=True))
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Draw; 1 when no page was drawn. Raises RecordingError, MissingExtra or OSError."""
     require("plot")  # before a long recording is read
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.daemon.profile.settings import Settings
-    from softfinger.tools.analysis import plots
+    from softfinger.tools import style
     from softfinger.tools.analysis.plots_data import Missing, load_run
-    from softfinger.tools.paper import style
     from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
     from softfinger.tools.recordings.reader import Recording
     from softfinger.tools.terminal.progress import Progress
 
+    draws = pages()
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
     recording = Recording(path, to_stderr("plot"))
@@ -72,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     with style.settings():
         for name in (name for name in PAGES if name in (arguments.pages or PAGES)):
             try:
-                figure = plots.PAGES[name](data)
+                figure = draws[name](data)
             except Missing as missing:
                 print(f"plot: page {name} left out: {missing}", file=sys.stderr)
                 continue

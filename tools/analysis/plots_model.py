@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools import style
 from softfinger.tools.analysis.plots_data import FloatArray, RecordedRun
 from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
-from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softfinger.tools import style
 from softfinger.tools.analysis.plots_data import MODES, FloatArray, RecordedRun
-from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softfinger.tools import style
 from softfinger.tools.analysis.plots_data import FloatArray, RecordedRun
 from softfinger.tools.analysis.plots_time import titled
-from softfinger.tools.paper import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -146,7 +146,7 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
             raise ValueError(f"--only {arguments.only}: it is found in no case of {name}")
     if arguments.plot:
         from softfinger.tools.extras import MissingExtra
-        from softfinger.tools.paper.style import settings
+        from softfinger.tools.style import settings
 
         if not {"contact", "estimator"} & set(names):
             raise ValueError("--plot: only contact and estimator have a picture")

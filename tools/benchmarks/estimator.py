@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.simulation.emulator.encoders import ENCODERS
+from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS
 from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.daemon.tactile.decoder import Decoder
 from softfinger.daemon.tactile.flexitac import FlexiTacDecoder

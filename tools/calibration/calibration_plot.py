@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softfinger.tools.paper import style
+from softfinger.tools import style
 
 
 def draw(step: str, data: dict[str, Any], path: Path) -> None:

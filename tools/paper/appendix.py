@@ -22,7 +22,7 @@ from softfinger.tools.paper.sheets import (
     Sheet,
     sheet,
 )
-from softfinger.tools.paper.style import GREY, INK, KINDS
+from softfinger.tools.style import GREY, INK, KINDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

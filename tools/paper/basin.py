@@ -17,7 +17,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.hand.upright import resting_share
 from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
-from softfinger.tools.paper.style import GREY, KINDS, MARKERS
+from softfinger.tools.style import GREY, KINDS, MARKERS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

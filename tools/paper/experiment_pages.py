@@ -26,7 +26,7 @@ from softfinger.tools.paper.sheets import (
     Sheet,
     sheet,
 )
-from softfinger.tools.paper.style import GREY, INK, KINDS, ordered
+from softfinger.tools.style import GREY, INK, KINDS, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -62,8 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def write(chosen: dict[str, FigurePage], folder: Path) -> None:
     """Write these pages into ``folder`` and print each file's path. Raises OSError."""
+    from softfinger.tools import style
     from softfinger.tools.extras import MissingExtra
-    from softfinger.tools.paper import style
     from softfinger.tools.paper.sheets import errata_sheet
 
     numbers = {name: page.sheets() for name, page in chosen.items()}

@@ -31,7 +31,7 @@ from softfinger.tools.paper.sheets import (
     sheet,
     summary,
 )
-from softfinger.tools.paper.style import GREY, INK, KINDS, ordered
+from softfinger.tools.style import GREY, INK, KINDS, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

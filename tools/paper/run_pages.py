@@ -20,7 +20,7 @@ from softfinger.tools.paper.sheets import (
     sheet,
     summary,
 )
-from softfinger.tools.paper.style import GREY, INK, KINDS, label_ends, ordered
+from softfinger.tools.style import GREY, INK, KINDS, label_ends, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

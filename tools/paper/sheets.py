@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.own_files import write_text
-from softfinger.tools.paper.style import caption, label_ends
+from softfinger.tools.style import caption, label_ends
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import math
 import sys
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.own_files import write_bytes, write_text
+from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import add_range, to_stderr
+from softfinger.tools.extras import require
+from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
 Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
@@ -31,8 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Export; 1 when there is nothing to export. Raises RecordingError, MissingExtra, OSError."""
-    from softfinger.tools.recordings.reader import Recording
-    from softfinger.tools.recordings.tables import CsvTable, ParquetTable, export
     from softfinger.tools.terminal.progress import Progress
 
     path: Path = arguments.file
@@ -59,3 +66,138 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
             known = ", ".join(each.decode() for each in recorded) or "none"
             raise RecordingError(f"found topic {word!r}, the recording has {known}")
     return wanted
+
+
+BLOCK = 2000  # rows
+Row = dict[str, Any]
+
+
+class CsvTable:
+    """A CSV file; floats with all their digits, NaN as an empty cell.
+
+    Columns are the schema's and what the first message has besides; bytes are left out.
+    """
+
+    suffix = ".csv"
+
+    def __init__(self, path: Path, topic: bytes, first: Row) -> None:
+        self._names = [name for name, kind in _columns(topic, first) if kind != "bin"]
+        self._file = write_text(path, newline="")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow(self._names)
+
+    def write(self, rows: list[Row]) -> None:
+        """Append rows."""
+        for row in rows:
+            self._writer.writerow([_cell(row.get(name)) for name in self._names])
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._file.close()
+
+
+class ParquetTable:
+    """A Parquet file with the schema's types; a grid's data is binary."""
+
+    suffix = ".parquet"
+
+    def __init__(self, path: Path, topic: bytes, first: Row) -> None:
+        """Raises MissingExtra."""
+        require("parquet")
+        import pyarrow
+        import pyarrow.parquet
+
+        kinds = {
+            "int": pyarrow.int64(),
+            "float": pyarrow.float64(),
+            "bool": pyarrow.bool_(),
+            "str": pyarrow.string(),
+            "bin": pyarrow.binary(),
+        }
+        fields = [(name, kinds[kind]) for name, kind in _columns(topic, first) if kind in kinds]
+        self._arrow = pyarrow
+        self._schema = pyarrow.schema(fields)
+        self._file = write_bytes(path)
+        self._writer = pyarrow.parquet.ParquetWriter(self._file, self._schema)
+
+    def write(self, rows: list[Row]) -> None:
+        """Append rows."""
+        self._writer.write_table(self._arrow.Table.from_pylist(rows, self._schema))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.close()
+        self._file.close()
+
+
+Table = CsvTable | ParquetTable
+
+
+def export(
+    recording: Recording,
+    folder: Path,
+    kind: type[Table],
+    topics: list[bytes],
+    start: float = -math.inf,
+    end: float = math.inf,
+    progress: Any = None,
+) -> list[Path]:
+    """Write each topic's table into ``folder``, and frames into one ``.npz`` file a sensor.
+
+    Returns the files. Raises OSError, and MissingExtra.
+    """
+    tables: dict[bytes, tuple[Table, list[Row]]] = {}  # with the rows that aren't written yet
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts by finger
+    files: list[Path] = []
+    try:
+        for topic, message in recording.messages(topics, start, end, progress):
+            row = _flat(message)
+            if topic not in tables:
+                files.append(folder / f"{topic.decode().replace('/', '-')}{kind.suffix}")
+                tables[topic] = kind(files[-1], topic, row), []
+            if topic == schema.TACTILE:
+                times, frames = grids.setdefault(message["finger"], ([], []))
+                shape = message["rows"], message["cols"]
+                times.append(message["timestamp"])
+                frames.append(np.frombuffer(message["data"], "<u2").reshape(shape))
+            table, rows = tables[topic]
+            rows.append(row)
+            if len(rows) >= BLOCK:
+                table.write(rows)
+                rows.clear()
+        for table, rows in tables.values():
+            table.write(rows)
+    finally:
+        for table, _ in tables.values():
+            table.close()
+    for finger, (times, frames) in sorted(grids.items()):
+        files.append(folder / f"tactile-{finger}.npz")
+        with write_bytes(files[-1]) as file:
+            t = np.array(times)
+            np.savez_compressed(file, frames=np.stack(frames), t=t - t[0])
+    return files
+
+
+def _flat(message: Row, outer: str = "") -> Row:
+    """A map without maps in it: ``left.force`` for the force in ``left``."""
+    row: Row = {}
+    for key, value in message.items():
+        if isinstance(value, dict):
+            row |= _flat(value, f"{outer}{key}.")
+        else:
+            row[f"{outer}{key}"] = value
+    return row
+
+
+def _columns(topic: bytes, first: Row) -> list[tuple[str, str]]:
+    fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
+    known = {field.name: field.kind for field in fields}
+    kinds = {bool: "bool", int: "int", float: "float", str: "str", bytes: "bin"}
+    more = {name: kinds.get(type(value), "") for name, value in first.items() if name not in known}
+    return [*known.items(), *more.items()]
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else repr(value)
+    return int(value) if isinstance(value, bool) else value

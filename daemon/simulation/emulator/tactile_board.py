@@ -1,6 +1,6 @@
 """An emulated tactile board: the simulated sensor's frames, in a board's framing, on a pty.
 
-Framings plug in as encoders (encoders.py), pure functions from counts to bytes. The faults that a
+Framings plug in as encoders (`ENCODERS`), pure functions from counts to bytes. The faults that a
 board may have are applied here too.
 """
 
@@ -13,12 +13,15 @@ import math
 import os
 import termios
 import tty
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.simulation.emulator.encoders import Encoder
+from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
 _TTY_ROOM = 2048  # bytes; a tty reports at most 4095 unread ones, so more is never asked for
@@ -205,3 +208,46 @@ class TactileBoard:
                 burst = self._random.bytes(int(self._random.integers(1, _NOISE_LENGTH + 1)))
                 data = burst + bytes(wrong)
         return data
+
+
+# counts [rows, cols], the scan's number, the board's time [s] → bytes
+Encode = Callable[[NDArray[np.uint16], int, float], bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder:
+    """A framing, and the byte that a board waits for before each frame; empty when it runs free."""
+
+    encode: Encode
+    request: bytes = b""
+
+
+def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
+    """``AA 55``, then one byte a cell, row-major; counts above 255 saturate."""
+    return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
+
+
+def encode_glove(
+    counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
+) -> bytes:
+    """Number + 11, each count's high and low half + 11, newline; counts beyond that saturate.
+
+    ``values`` of a half: 32 or, with a 12-bit converter, 64.
+    """
+    counts = np.minimum(counts, values * values - 1)
+    halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
+    return bytes((11 + number % 244,)) + halves.astype(np.uint8).tobytes() + b"\n"
+
+
+def encoder_for(backend: str, full_count: int) -> Encoder:
+    """The framing of a backend's board whose largest count is ``full_count``."""
+    if backend == "glove" and 1023 < full_count <= 4095:
+        return Encoder(partial(encode_glove, values=64), b"a")
+    return ENCODERS[backend]
+
+
+ENCODERS = {
+    "flexitac": Encoder(encode_flexitac),
+    "glove": Encoder(encode_glove, b"a"),
+    "cobs": Encoder(cobs.encode),
+}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softfinger.tools.paper import style
+from softfinger.tools import style
 
 # One measured thing; each key is the heading of its column, "name" the first of them.
 Row = dict[str, Any]
