@@ -24,7 +24,6 @@ class Backend(NamedTuple):
     hand: bool = False  # it needs the simulated hand
 
     def load(self) -> Any:
-        """The class or function."""
         module, _, name = self.place.partition(":")
         return getattr(import_module(f"softfinger.daemon.{module}"), name)
 

@@ -127,7 +127,6 @@ class Subscriber(Generic[_Record]):
         return self._decoder.unreadable
 
     def close(self) -> None:
-        """Unsubscribe."""
         self._socket.close()
 
     def _require_open(self) -> None:

@@ -78,11 +78,9 @@ class Config:
     stream_key: str = "stream.address"  # what errors call the stream's address
 
     def to_json(self) -> str:
-        """As a text."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> Config:
-        """From that text."""
         fields = json.loads(text)
         return cls(**fields | {"topics": Topics(**fields["topics"])})

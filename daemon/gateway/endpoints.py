@@ -42,11 +42,9 @@ class Poller:
         self._epoll.register(fd, events)
 
     def change(self, fd: int, events: int) -> None:
-        """Wait for something else."""
         self._epoll.modify(fd, events)
 
     def forget(self, fd: int) -> None:
-        """Wait for it no more."""
         del self._calls[fd]
         self._epoll.unregister(fd)
 
@@ -64,7 +62,6 @@ class Poller:
                 return
 
     def close(self) -> None:
-        """Forget all."""
         self._epoll.close()
 
 
@@ -91,7 +88,6 @@ class Endpoint:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Disconnect all."""
         raise NotImplementedError
 
 
@@ -173,7 +169,6 @@ class PlainEndpoint(Endpoint, Generic[_Connection]):
             self._poller.change(connection.fd, connection.events)
 
     def disconnect(self, connection: Connection) -> None:
-        """End a connection."""
         if not connection.alive:
             return
         connection.alive = False
@@ -207,7 +202,6 @@ class PlainEndpoint(Endpoint, Generic[_Connection]):
             connection.join_epoch()
 
     def close(self) -> None:
-        """Disconnect all."""
         self._poller.forget(self._listener.fileno())
         self._listener.close()
         for connection in list(self._connections.values()):
@@ -231,7 +225,6 @@ class CommandEndpoint(PlainEndpoint[CommandConnection]):
         return super()._leaves() or next(iter(self._connections.values()), None)
 
     def take(self, connection: CommandConnection, envelope: bytes, payload: bytes) -> None:
-        """One request."""
         fd = connection.fd
         self._connections[fd] = self._connections.pop(fd)  # it was silent for the shortest time
         self._requests.take(connection, envelope, payload, self.now)

@@ -131,7 +131,6 @@ class _KeyedEndpoint(Endpoint):
         return found
 
     def close(self) -> None:
-        """Disconnect all."""
         self._poller.forget(self._fd)
         self._socket.close()
         if self._file is not None:

@@ -132,7 +132,6 @@ class Server:
         return self._send(kind + loop_link.ASKED.pack(epoch, number) + packed)
 
     def _take_packets(self) -> None:
-        """Take in the loop's packets."""
         for _ in range(bounds.FROM_LOOP):
             try:
                 packet = self._end.recv(loop_link.LARGEST)

@@ -42,7 +42,6 @@ class Gateway:
 
     @property
     def process(self) -> int:
-        """The process's number."""
         return self._process.pid
 
     def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:

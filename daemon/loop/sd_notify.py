@@ -52,7 +52,6 @@ class Service:
         self._send(b"STOPPING=1")
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def _send(self, message: bytes) -> None:

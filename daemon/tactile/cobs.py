@@ -162,5 +162,4 @@ class Cobs(SerialReader):
     """A board with our framing under one fingertip."""
 
     def make_decoder(self) -> CobsDecoder:
-        """As :meth:`SerialReader.make_decoder`."""
         return CobsDecoder(self.settings.rows, self.settings.cols)

@@ -107,7 +107,6 @@ class DelimitedDecoder(Decoder):
         """
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """As :meth:`Decoder.feed`."""
         buffer = self._buffer
         buffer += data
         newest = None
@@ -137,7 +136,6 @@ class DelimitedDecoder(Decoder):
         return newest
 
     def diagnosis(self) -> str:
-        """As :meth:`Decoder.diagnosis`."""
         if self._reason:
             return f"{self._reason}; {self._grid()} expected"
         end = self._delimiter.hex().upper()

@@ -52,7 +52,6 @@ class FlexiTacDecoder(Decoder):
         self._markers: deque[int] = deque(maxlen=_MARKERS_KEPT)  # places in the stream, no lock
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """As :meth:`Decoder.feed`."""
         self._buffer += data
         self._pieces.append((self._start + len(self._buffer), t))
         newest = None
@@ -73,7 +72,6 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def pending(self) -> bool:
-        """As :attr:`Decoder.pending`."""
         return self.locked and len(self._buffer) >= self.frame_bytes
 
     @property
@@ -100,7 +98,6 @@ class FlexiTacDecoder(Decoder):
         return {**super().counters(), "ambiguous": self._ambiguous}
 
     def diagnosis(self) -> str:
-        """As :meth:`Decoder.diagnosis`."""
         expected = self._grid()
         found = self.found_cells
         if found:
@@ -223,6 +220,5 @@ class FlexiTac(SerialReader):
     """The FlexiTac board under one fingertip."""
 
     def make_decoder(self) -> FlexiTacDecoder:
-        """As :meth:`SerialReader.make_decoder`."""
         settings = self.settings
         return FlexiTacDecoder(settings.rows, settings.cols, BITS_PER_BYTE / settings.baud)

@@ -28,7 +28,6 @@ class GloveDecoder(DelimitedDecoder):
         self._values = 1 << bits  # of each half
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """As :meth:`DelimitedDecoder.parse`."""
         if len(packet) != self.longest - 1:
             cells = (len(packet) - 1) // 2
             self._reason = f"lines of {len(packet)} bytes, which is {cells} cells"
@@ -55,6 +54,5 @@ class Glove(SerialReader):
     request = b"a"
 
     def make_decoder(self) -> GloveDecoder:
-        """As :meth:`SerialReader.make_decoder`."""
         settings = self.settings
         return GloveDecoder(settings.rows, settings.cols, bits_of(settings.full_count))

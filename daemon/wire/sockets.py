@@ -83,7 +83,6 @@ class Listener:
             raise bind_error(address, key, error.errno, error.strerror or str(error)) from None
 
     def fileno(self) -> int:
-        """The descriptor."""
         return self._socket.fileno()
 
     def accept(self) -> tuple[socket.socket, Any]:

@@ -20,7 +20,6 @@ Writes FILE.contacts.csv and FILE.contacts.png (extra 'plot') beside it."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``analyse``."""
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE")
     add_profile(parser)

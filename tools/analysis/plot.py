@@ -33,7 +33,6 @@ Exit status: 0 when at least one page was drawn."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``plot``."""
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument(

@@ -39,7 +39,6 @@ _CAMPAIGN = "campaign"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``bench``."""
     single = ", ".join(f"{name} ({text})" for name, text in MEASUREMENTS.items())
     long = ", ".join(f"{name} ({text})" for name, text in CAMPAIGNS.items())
     parser.add_argument(

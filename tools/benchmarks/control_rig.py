@@ -57,11 +57,9 @@ class Watched:
 
     @property
     def mode(self) -> str:
-        """The hand's mode."""
         return self._daemon.loop.state.mode
 
     def command(self, name: str, **numbers: float) -> None:
-        """Carry out a command."""
         self._daemon.loop.command({"command": name, **numbers})
 
     def grasp(self, force: float) -> None:

@@ -152,7 +152,6 @@ class OurCycle:
         return self
 
     def __call__(self) -> None:
-        """One cycle."""
         self._servos.read(self._reading)
         self.failed += not self._reading.valid
         self._servos.write(self._goal)
@@ -187,7 +186,6 @@ class PlainCycle:
         return self
 
     def __call__(self) -> None:
-        """One cycle."""
         self.failed += self._read.fastSyncRead() != sdk.COMM_SUCCESS
         for servo in (1, 2):
             for address, size in (

@@ -29,7 +29,6 @@ A new equilibrate removes curve and modulus, a new curve removes modulus: they d
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``calibrate``."""
     parser.epilog = _EPILOG
     parser.add_argument("step", choices=STEPS)
     parser.add_argument("file", type=Path, metavar="FILE", help="the calibration; made if absent")

@@ -18,7 +18,6 @@ BY_NAME = ("basin",)  # the long ones, drawn only when they are named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``figures``."""
     parser.add_argument(
         "names",
         metavar="NAME",

@@ -145,7 +145,6 @@ class Plotted:
 
     @property
     def axis(self) -> str:
-        """The axis's label."""
         return f"{self.label} {self.symbol} [{self.unit}]"
 
     def columns(self, d: Numbers, theta: Numbers, at: str) -> list[tuple[str, str, FloatArray]]:

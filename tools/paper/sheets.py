@@ -100,7 +100,6 @@ class Panel:
     annotate: Callable[..., None] | None = None  # axes and sheets
 
     def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
-        """Draw it."""
         ended: list[tuple[float, float, str]] = []
         for curve in self.curves(*sheets):
             axes.plot(curve.x, curve.y, **curve.look, label=curve.label or None)

@@ -9,7 +9,6 @@ from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``compile``."""
     add_profile(parser)
     parser.add_argument(
         "--all", action="store_true", help="also what the other tools and the tests use"

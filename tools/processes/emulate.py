@@ -53,7 +53,6 @@ begins the record anew, --send "report forget" does both without a gap:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``emulate``."""
     parser.epilog = _FAULTS
     parser.add_argument(
         "--dir",

@@ -44,7 +44,6 @@ class EventLog:
         self._thread.start()
 
     def line(self, level: str, kind: str, text: str) -> None:
-        """Hand over one event."""
         if not self.quiet or self._file is not None:
             self._lines.append((time.time(), level, kind, text))
             self._news.set()

@@ -111,7 +111,6 @@ class _Workers:
             raise
 
     def close(self) -> None:
-        """End every process."""
         for worker in self._workers.values():
             worker.close()
         self._selector.close()
@@ -203,7 +202,6 @@ class _Worker:
         return "" if self.part is None else f"{self.part.name}: {self.kernel}"
 
     def build(self, part: Part) -> None:
-        """Let it build ``part``."""
         self.part, self.kernel = part, ""
         self._send(f"{part.name}\n")
 

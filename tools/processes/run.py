@@ -23,7 +23,6 @@ _STARTED = time.monotonic()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``run``."""
     add_profile(parser)
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(

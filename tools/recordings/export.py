@@ -25,7 +25,6 @@ which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``export``."""
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument(
@@ -87,12 +86,10 @@ class CsvTable:
         self._writer.writerow(self._names)
 
     def write(self, rows: list[Row]) -> None:
-        """Append rows."""
         for row in rows:
             self._writer.writerow([_cell(row.get(name)) for name in self._names])
 
     def close(self) -> None:
-        """Finish the file."""
         self._file.close()
 
 
@@ -121,11 +118,9 @@ class ParquetTable:
         self._writer = pyarrow.parquet.ParquetWriter(self._file, self._schema)
 
     def write(self, rows: list[Row]) -> None:
-        """Append rows."""
         self._writer.write_table(self._arrow.Table.from_pylist(rows, self._schema))
 
     def close(self) -> None:
-        """Finish the file."""
         self._writer.close()
         self._file.close()
 

@@ -48,7 +48,6 @@ _BATCH = 1000  # messages between two looks at the clock
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``record``."""
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not exist yet")
     add_stream(parser)

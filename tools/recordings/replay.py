@@ -39,7 +39,6 @@ _DIFFERENT = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``replay``."""
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument("--address", default=StreamSettings().address, help="where to publish")

@@ -36,7 +36,6 @@ one beside it, and doctor --fix again."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``doctor``."""
     parser.epilog = _EPILOG
     add_profile(parser)
     parser.add_argument("--fix", action="store_true", help="repair what can be repaired from here")

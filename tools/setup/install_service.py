@@ -92,7 +92,6 @@ KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``install-service``."""
     parser.epilog = _EPILOG
     parser.add_argument("--config", type=Path, metavar="PROFILE", help="the hand's profile")
     parser.add_argument("--user", default="", help="the user it runs as (default: root)")

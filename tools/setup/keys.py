@@ -17,7 +17,6 @@ Exit status: 0 made, 1 refused."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``keys``."""
     parser.epilog = _EPILOG
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("clients", nargs="*", metavar="CLIENT")

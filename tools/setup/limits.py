@@ -10,7 +10,6 @@ from softfinger.tools.arguments import add_profile, profile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``limits``."""
     add_profile(parser)
 
 

@@ -12,7 +12,6 @@ from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, search
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``scan``."""
     parser.epilog = "Exit status: 0 when a servo answered, 1 when none did or no port can be used."
     parser.add_argument(
         "ports", metavar="PORT", nargs="*", help="where to look (default: every serial port)"

@@ -28,12 +28,10 @@ class FeedSubscriber:
         self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_LIMIT)
 
     def drain(self, now: float) -> None:
-        """Take what waits."""
         for message in drain(self._socket, _DRAIN_LIMIT):
             self.feed.take(message, now)
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 

@@ -45,7 +45,6 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add this command's arguments to ``parser``."""
     parser.description = (
         "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and\n"
         "choose the force. Prints a plain line a second when the output is not a terminal."

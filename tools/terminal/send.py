@@ -22,7 +22,6 @@ but the servos have not confirmed torque off yet."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``send``."""
     parser.epilog = _EPILOG
     parser.add_argument("command", metavar="COMMAND")
     parser.add_argument("values", metavar="key=value", nargs="*")

@@ -250,7 +250,6 @@ class LiveStream:
                 return count
 
     def close(self) -> None:
-        """Close the sockets."""
         self._context.destroy(linger=0)
 
     def __enter__(self) -> LiveStream:

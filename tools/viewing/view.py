@@ -18,7 +18,6 @@ Exit status: 0, or 1 with the reason when nothing could be shown."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``view``."""
     parser.epilog = _EPILOG
     parser.add_argument(
         "file", type=Path, nargs="?", metavar="FILE.mcap", help="a recording, instead of the stream"

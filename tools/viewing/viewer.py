@@ -89,7 +89,6 @@ class Viewer:
         return f"the viewer has ended ({status}){': ' + lines[-1] if lines else ''}"
 
     def close(self) -> None:
-        """End it."""
         if self._page is not None:
             self._page.close()
         if self._process.poll() is None:

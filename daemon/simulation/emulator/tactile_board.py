@@ -181,7 +181,6 @@ class TactileBoard:
             self.sent += self._writer.send(data)
 
     def close(self) -> None:
-        """Close the pty."""
         self.unplug()
 
     def _spoil(self, frame: Frame) -> bytes:

@@ -87,7 +87,6 @@ class EmulatedServo:
 
     @property
     def id(self) -> int:
-        """The ID it answers to."""
         return self.table.memory[reg.ID]
 
     @property
@@ -97,7 +96,6 @@ class EmulatedServo:
 
     @property
     def baud(self) -> int:
-        """The rate it listens at."""
         return reg.BAUD_RATES[self.table.memory[reg.BAUD_RATE]]
 
     @property
@@ -122,7 +120,6 @@ class EmulatedServo:
 
     @property
     def mode(self) -> int:
-        """The operating mode."""
         return self.table.memory[reg.OPERATING_MODE]
 
     def awake(self, t: float) -> bool:

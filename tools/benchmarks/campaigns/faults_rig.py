@@ -105,7 +105,6 @@ class Rig:
             self.daemon = None
 
     def close(self) -> None:
-        """End everything that was started."""
         for process in (self.daemon, self.hand):
             if process is not None and process.poll() is None:
                 process.send_signal(signal.SIGCONT)
@@ -123,7 +122,6 @@ class Rig:
         self.close()
 
     def log(self) -> list[str]:
-        """The daemon's log."""
         try:
             return (self.folder / "daemon.log").read_text(encoding="utf-8").splitlines()
         except OSError:
@@ -131,7 +129,6 @@ class Rig:
 
     @property
     def alive(self) -> bool:
-        """Whether the daemon's process lives."""
         return self.daemon is not None and self.daemon.poll() is None
 
     def send(self, words: str) -> str:
