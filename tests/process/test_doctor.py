@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.diagnosis import addresses as sockets
-from softfinger.daemon.diagnosis import hand, machine, ports
-from softfinger.daemon.diagnosis import hand as repair
+from softfinger.daemon.diagnosis import devices, machine, ports
 from softfinger.daemon.diagnosis import machine as kernels
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop import warm_up
@@ -76,7 +75,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for less than on metal, and leave the sockets of this machine alone."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UPS", 5)
-    whole = hand.check_servos
+    whole = devices.check_servos
     monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.5, 0.5))
     # The emulator shares this process's interpreter lock.
     monkeypatch.setattr(provisioning, "PING_TIMEOUT", 0.2)
@@ -264,10 +263,10 @@ def test_latency_timer_is_judged_and_repaired(tmp_path):
     assert slow.failed
     assert "softfinger doctor --fix" in slow.fix
     assert ports.check_latency_timer(path, 0.05, sysfs).status == "warn"
-    assert repair.repair_latency_timer(path, sysfs).status == "fixed"
+    assert devices.repair_latency_timer(path, sysfs).status == "fixed"
     assert ports.latency_file(path, sysfs).read_text() == "1"
     assert ports.check_latency_timer(path, 0.004, sysfs).status == "pass"
-    assert repair.repair_latency_timer(path, sysfs) is None
+    assert devices.repair_latency_timer(path, sysfs) is None
     assert ports.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
 
 
@@ -278,7 +277,7 @@ def test_a_latency_timer_that_can_not_be_set_is_told_with_the_command(tmp_path, 
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "write_text", refuse)
-    found = repair.repair_latency_timer(path, sysfs)
+    found = devices.repair_latency_timer(path, sysfs)
     assert found.status == "warn"
     assert found.fix == f"echo 1 | sudo tee {ports.latency_file(path, sysfs)}"
 

@@ -12,7 +12,7 @@ import pytest
 from softfinger import ContactTable, Fingertip, Material
 from softfinger.daemon import own_files
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile import factory as table_files
+from softfinger.daemon.profile import factory
 from softfinger.daemon.profile.factory import (
     load_or_build,
     load_table,
@@ -107,7 +107,7 @@ def test_the_daemon_keeps_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     settings = Settings()
     asked = []
     monkeypatch.setattr(
-        table_files, "table_file", lambda *words: asked.append(words) or tmp_path / "one.table"
+        factory, "table_file", lambda *words: asked.append(words) or tmp_path / "one.table"
     )
     table = make_table(settings, CONSTANT, tmp_path)
     assert asked == [(tmp_path, Fingertip(settings.tip.radius), CONSTANT, settings.table.tolerance)]

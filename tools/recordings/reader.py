@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.tools.extras import require
-from softfinger.tools.recordings.layout import ENCODING, PROFILE, Converter, from_json, topic_of
+from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
     from mcap.records import Chunk, McapRecord

@@ -13,7 +13,7 @@ from typing import Any
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.tools.extras import require
-from softfinger.tools.recordings.layout import (
+from softfinger.tools.recordings.channels import (
     ENCODING,
     LIBRARY,
     PROFILE,

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from softfinger.daemon.backends import SERVOS, TACTILE
 from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
-from softfinger.daemon.diagnosis.hand import (
+from softfinger.daemon.diagnosis.devices import (
     check_board,
     check_servos,
     repair_latency_timer,

@@ -20,7 +20,7 @@ from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.terminal.feed import field, number, printable, text
-from softfinger.tools.viewing import layout
+from softfinger.tools.viewing import views
 from softfinger.tools.viewing.drawing import Drawing
 from softfinger.tools.viewing.known import ShownHand, read_settings
 
@@ -78,7 +78,7 @@ class Bridge:
         self._mode = ""
         self._first = math.nan  # time of the first state or frame
         self._same_schema = True
-        self._plots: dict[str, layout.Plot] = {}
+        self._plots: dict[str, views.Plot] = {}
         self.time = math.nan  # Unix time of the newest state [s]
         self.shown = 0
         self.dropped = 0
@@ -202,14 +202,14 @@ class Bridge:
 
     def _begin(self) -> Drawing:
         """Log the layout and everything that stands still, for the hand as it is known now."""
-        self._recording.send_blueprint(layout.blueprint(self._hand))
+        self._recording.send_blueprint(views.blueprint(self._hand))
         drawing = Drawing(self._recording, self._hand)
-        self._plots = layout.plots(self._hand)
+        self._plots = views.plots(self._hand)
         for plot in self._plots.values():
             self._recording.log(plot.entity, plot.style(), static=True)
         self._recording.log(
             "mode",
-            rr.StateConfiguration(values=list(layout.MODES), colors=list(layout.MODES.values())),
+            rr.StateConfiguration(values=list(views.MODES), colors=list(views.MODES.values())),
             static=True,
         )
         self._mode = ""
@@ -226,7 +226,7 @@ class Bridge:
             return [factor * values(name, key) for name in self._hand.fingers]
 
         stamps = values("timestamp")
-        times = [rr.TimeColumn(layout.TIME, timestamp=stamps)]
+        times = [rr.TimeColumn(views.TIME, timestamp=stamps)]
         force = values("goal_force")
         landscape = drawing.landscape
         energy = np.full_like(force, np.nan) if landscape is None else landscape.energy_of(force)
@@ -267,7 +267,7 @@ class Bridge:
                 rr.TextLog(
                     f"{clock}  {kind}: {text(event, 'text')}",
                     level={"warning": "WARN", "error": "ERROR"}.get(level, "INFO"),
-                    color=layout.LEVELS.get(level, layout.GOAL),
+                    color=views.LEVELS.get(level, views.GOAL),
                 ),
             )
         if self._statistics is not None:
@@ -288,7 +288,7 @@ class Bridge:
         stamp = number(message, "timestamp")
         if stamp < self._first:
             stamp = self._first
-        self._recording.set_time(layout.TIME, timestamp=stamp)
+        self._recording.set_time(views.TIME, timestamp=stamp)
 
 
 def statistics_table(message: dict[str, Any]) -> str:

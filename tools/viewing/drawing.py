@@ -18,7 +18,7 @@ from softfinger.daemon.client.records import read
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.terminal.feed import field, number
-from softfinger.tools.viewing import layout
+from softfinger.tools.viewing import views
 from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.landscape import Landscape
 from softfinger.tools.viewing.planar import (
@@ -58,7 +58,7 @@ class Drawing:
         self._still(
             "hand/palm",
             rr.LineStrips2D(
-                [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[layout.SPRING], radii=[1.2]
+                [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[views.SPRING], radii=[1.2]
             ),
         )
         if self.landscape is not None:
@@ -86,7 +86,7 @@ class Drawing:
                 labels=[*names, *(name for _, name in ticks)],
                 show_labels=True,
                 radii=rr.Radius.ui_points(0.0),
-                colors=[(235, 235, 235)] * len(spots) + [layout.GOAL] * len(ticks),
+                colors=[(235, 235, 235)] * len(spots) + [views.GOAL] * len(ticks),
                 draw_order=2.0,
             ),
         )
@@ -116,12 +116,12 @@ class Drawing:
         for name, finger in zip(self._hand.fingers, lines, strict=True):
             for strip, radius in ((finger.link, 2.6), (finger.base, 1.2), (finger.skin, 0.5)):
                 strips.append(_view(strip))
-                colours.append((*layout.COLOURS[name], 255))
+                colours.append((*views.COLOURS[name], 255))
                 radii.append(radius)
             for spring, strain in zip(finger.springs, finger.strain, strict=True):
                 share = min(4.0 * float(strain), 1.0)
                 strips.append(_view(spring))
-                colours.append((*_between(layout.SPRING, layout.LEVELS["error"], share), 200))
+                colours.append((*_between(views.SPRING, views.LEVELS["error"], share), 200))
                 radii.append(0.25 + 0.35 * share)
         self._recording.log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
 
@@ -138,9 +138,9 @@ class Drawing:
             origins.append(_view(at[None])[0])
             vectors.append(_view(length * direction[None])[0])
             labels.append(f"{contact.force:.1f} N")
-            colours.append(layout.COLOURS[name])
+            colours.append(views.COLOURS[name])
         strips = [*faces, *normals]
-        shades = [layout.OBJECT] * len(faces) + [layout.GOAL] * len(normals)
+        shades = [views.OBJECT] * len(faces) + [views.GOAL] * len(normals)
         radii = [1.0] * len(faces) + [0.35] * len(normals)
         self._recording.log(
             "hand/contact", rr.LineStrips2D(strips, colors=shades, radii=radii, draw_order=2)
@@ -175,7 +175,7 @@ class Drawing:
         else:
             self._object.lose()
         self._recording.log(
-            "hand/object", rr.LineStrips2D(outlines, colors=[layout.OBJECT], radii=[0.7])
+            "hand/object", rr.LineStrips2D(outlines, colors=[views.OBJECT], radii=[0.7])
         )
 
     def truth(self, truth: dict[str, Any]) -> None:
@@ -186,7 +186,7 @@ class Drawing:
         outline = _outline(simulated.object_shape, simulated, x, y, angle)
         strips = [] if outline is None or not np.isfinite(outline).all() else [_view(outline)]
         self._recording.log(
-            "hand/simulated", rr.LineStrips2D(strips, colors=[layout.GOAL], radii=[0.3])
+            "hand/simulated", rr.LineStrips2D(strips, colors=[views.GOAL], radii=[0.3])
         )
 
     def _points(self, contacts: list[Touch | None]) -> None:
@@ -202,8 +202,8 @@ class Drawing:
             d, theta = np.array(trail).T
             trails.append(self.landscape.place(d, theta))
             now.append(trails[-1][-1])
-            colours.append(layout.COLOURS[name])
-            shades.append((*layout.COLOURS[name], 170))
+            colours.append(views.COLOURS[name])
+            shades.append((*views.COLOURS[name], 170))
         self._recording.log(
             "landscape/trails",
             rr.LineStrips2D(trails, colors=shades, radii=rr.Radius.ui_points(1.4), draw_order=3.0),
@@ -239,7 +239,7 @@ class Drawing:
                 f"pressure/{name}/rim",
                 rr.LineStrips2D(
                     [tip_circle(grid, radius)],
-                    colors=[(*layout.COLOURS[name], 120)],
+                    colors=[(*views.COLOURS[name], 120)],
                     radii=rr.Radius.ui_points(0.7),
                 ),
             )
@@ -264,7 +264,7 @@ class Drawing:
         # With a white rim: the right finger's orange would be lost on a bright map.
         spots: list[Any] = [] if place is None else [place.centroid, place.centroid]
         sizes: list[Any] = [rr.Radius.ui_points(6.5), rr.Radius.ui_points(4.5)][: len(spots)]
-        shades = [(255, 255, 255), layout.COLOURS[name]][: len(spots)]
+        shades = [(255, 255, 255), views.COLOURS[name]][: len(spots)]
         self._recording.log(
             f"pressure/{name}/centroid",
             rr.Points2D(
