@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -130,3 +131,13 @@ def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture() -
 def test_clients_and_gateway_know_neither_loop_nor_profile() -> None:
     graph = rooms("daemon")
     assert not {"loop", "profile"} & (graph["client"] | graph["gateway"])
+
+
+def test_each_class_has_a_name_of_its_own() -> None:
+    names = Counter(
+        node.name
+        for file in modules().values()
+        for node in ast.parse(file.read_bytes()).body
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in names.items() if count > 1] == []
