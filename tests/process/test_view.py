@@ -329,7 +329,7 @@ def test_waiting_is_told_and_a_signal_ends_it(tmp_path: Path) -> None:
         assert process.stderr is not None
         assert f"waiting for a stream from {fake.state_address}" in process.stderr.readline()
         fake.silent.clear()
-        assert "the stream is here" in process.stderr.readline()
+        assert "the stream has begun" in process.stderr.readline()
         shown = fake.published + 50
         until(lambda: fake.published > shown)
         process.send_signal(signal.SIGTERM)

@@ -142,7 +142,7 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
         if texts is CAMPAIGNS and not _module(name).known(arguments.only):
-            raise ValueError(f"--only {arguments.only}: it is found in no case of {name}")
+            raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
     if arguments.plot:
         from softfinger.tools.extras import MissingExtra
         from softfinger.tools.style import settings

@@ -125,7 +125,7 @@ class Session:
                 if count:
                     last = now
                     if silent:
-                        self._say("the stream is here")
+                        self._say("the stream has begun")
                     silent = False
                 elif arguments.no_wait and now - last > PATIENCE:
                     raise ViewError(no_stream(arguments.address, arguments.keys))
