@@ -11,7 +11,7 @@ import pytest
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_share, upright_spring
-from softfinger.tools.benchmarks.control_rig import Watched
+from softfinger.tools.benchmarks.framework.watched import Watched
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make
 
 LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
