@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import softfinger.kinematics.contact as contact
-from softfinger.tools.solid_tip.evaluate import SolidTip, centroid_and_extent
+from softfinger.tools.solid_tip.evaluate import SolidTip, centroid_and_extent, rms_difference
 from softfinger.tools.solid_tip.fit import NU, THETA_MAX
 
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
+REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
 BASES = ("bonded", "lying")
 PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in radii
 
@@ -69,3 +70,24 @@ def test_forces_of_an_axisymmetric_computation(
     assert push * 0.304 * 20**2 == pytest.approx(force, rel=0.01)
     _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
     assert sigma == pytest.approx(9.7 * MM, abs=0.2 * MM)
+
+
+def test_frames_of_three_dimensional_elements(arrays: dict[str, np.ndarray]) -> None:
+    """tests/harness/solid_reference.py: another mesh, element, solver and contact algorithm."""
+    with np.load(REFERENCE) as data:
+        names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
+        rows = list(zip(*(data[name] for name in names), strict=True))
+    place = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH
+    inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # the rim's stress is singular
+    assert len(rows) >= 12
+    for base, poisson, d, theta, push, energy, force, frame in rows:
+        tip = SolidTip(arrays, str(base), poisson)
+        its_push, its_energy, pressure = tip.press(d, theta)
+        assert its_push == pytest.approx(push, rel=0.002)
+        assert its_energy == pytest.approx(energy, rel=0.002)
+        assert its_push * np.cos(theta) == pytest.approx(force, rel=0.002)
+        mine = tip.frame(pressure, PITCH, CELLS)
+        assert rms_difference(mine[inner], frame[inner]) < 0.012
+        assert rms_difference(mine, frame) < 0.04
+        moments = centroid_and_extent(mine, PITCH), centroid_and_extent(frame, PITCH)
+        np.testing.assert_allclose(*moments, rtol=0, atol=0.02 * MM)

@@ -15,7 +15,7 @@ from softfinger.tools.extras import require
 from softfinger.tools.solid_tip import fit
 from softfinger.tools.solid_tip.contact import TiltedPlane
 from softfinger.tools.solid_tip.evaluate import SolidTip, rms_difference
-from softfinger.tools.solid_tip.green import green
+from softfinger.tools.solid_tip.green import green, shear_response
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -28,6 +28,8 @@ Lengths in a, stresses in E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = �
 Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1, and ν on nu_range:
 N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]), F = N cos θ;
 p = N (cos θ B_0(r) + Σ P[coef_k] sin^m_k θ B_k(r) cos m_k φ); basis: means of B_k over rings.
+A shear force T on the face adds T B_T(r) cos(φ − φ_T); shear holds B_T's means over the rings
+(for a force at the pole), as Chebyshev coefficients in ν.
 Base bonded: u = 0. Lying: u_z = 0 (held down: it may pull), free to slide but for a uniform shear
 that carries N sin θ. error, force_error, pressure_error: largest differences in N and in a sensor's
 frame from a file of a coarser mesh. Largest and rms differences between file and presses:
@@ -117,6 +119,11 @@ def main() -> None:
         for base in BASES:
             part = [samples[base, rings, poisson] for poisson in nodes]
             found = fit.fit(part, nodes, np.pi / 2 / rings, arguments.tolerance)
+            shear = []
+            for poisson in nodes:
+                radius, pressure = shear_response(rings, poisson, base == "bonded")
+                shear.append(fit.ring_means(radius) @ pressure)
+            found["shear"] = fit.over_nu(np.array(shear)).astype(np.float32)
             files[rings] |= {f"{base}.{name}": value for name, value in found.items()}
     arrays = files[arguments.rings]
     for base in BASES:

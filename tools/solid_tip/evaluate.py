@@ -47,7 +47,7 @@ class SolidTip:
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
         """Means over a square grid of cells centred under the tip, rows along y."""
-        parts, turns = 4, 720  # each ring goes to the cells in so many pieces
+        parts, turns = 10, 2000  # each ring goes to the cells in so many pieces
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
             np.arange(self.edges.size),

@@ -16,6 +16,7 @@ from softfinger.tools.solid_tip.meridian import GAUSS, FloatArray, IntArray, Mer
 
 STIFF = 1e4  # of the springs (in E) that hold what harmonic 1 would leave free
 CONTACT_END = np.radians(85.0)  # rings nearer to the rim carry no contact
+CAP = 0.2  # polar angle of the cap that a shear force acts on [rad]
 
 
 class Green(NamedTuple):
@@ -124,3 +125,23 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
             pressure = to_pressure.solve(matrix[base_z] @ moved)
             base[m][:, :, active] = pressure.reshape(-1, 3, active.size)
     return Green(bonded, poisson, place, weight, cells, out, base_radius, base)
+
+
+def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
+    """Nodes of the base, and its pressure's harmonic 1 for a unit shear force on the pole's cap."""
+    mesh = Meridian(rings)
+    _, _, nodal, angle = arc_loads(mesh)
+    load = np.zeros(3 * len(mesh.nodes))
+    for k in np.flatnonzero(angle < CAP):
+        nodes = mesh.number[-1, 2 * k : 2 * k + 3]
+        share = nodal[k] * np.sqrt(1 - (angle[k] / CAP) ** 2)
+        load[3 * nodes] += share
+        load[3 * nodes + 1] -= share
+    force = np.pi * (load[0::3].sum() - load[1::3].sum())
+    matrix = mesh.stiffness(1, poisson)
+    free = np.setdiff1d(np.arange(load.size), fixed(mesh, 1, bonded))
+    moved = np.zeros_like(load)
+    held = (matrix + supports(mesh, 1, bonded)).tocsc()[free][:, free]
+    moved[free] = splu(held).solve(load[free] / force)
+    radius = mesh.nodes[mesh.base, 0]
+    return radius, splu(base_mass(radius)).solve(matrix[3 * mesh.base + 2] @ moved)
