@@ -127,26 +127,19 @@ def main() -> None:
             files[rings] |= {f"{base}.{name}": value for name, value in found.items()}
     arrays = files[arguments.rings]
     for base in BASES:
-        force, pressure = mesh_errors(arrays, files[arguments.coarser], base)
-        arrays |= {f"{base}.force_error": np.array(force)}
-        arrays |= {f"{base}.pressure_error": np.array(pressure)}
+        errors = mesh_errors(arrays, files[arguments.coarser], base)
+        for name, value in zip(("force_error", "pressure_error"), errors, strict=True):
+            arrays[f"{base}.{name}"] = np.array(value)
     arrays["error"] = np.array(max(arrays[f"{base}.force_error"] for base in BASES))
-    errors = [
+    rows = [
         f"{base}, {rings} elements, ν {poisson:.4f}{'' if poisson in nodes else ' (not fitted)'}: "
         + differences(SolidTip(files[rings], base, poisson), each)
         for (base, rings, poisson), each in samples.items()
     ]
-    notes = NOTES.format(rings=arguments.rings, nodes=arguments.nodes, errors="\n".join(errors))
+    notes = NOTES.format(rings=arguments.rings, nodes=arguments.nodes, errors="\n".join(rows))
     arrays["notes"] = np.array(notes)
-    np.savez_compressed(arguments.out, allow_pickle=False, **arrays)
-    print(
-        notes,
-        {
-            name: float(value)
-            for name, value in arrays.items()
-            if value.ndim == 0 and "error" in name
-        },
-    )
+    np.savez_compressed(arguments.out, **arrays)  # type: ignore[arg-type]
+    print(notes)
 
 
 if __name__ == "__main__":
