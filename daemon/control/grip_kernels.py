@@ -25,6 +25,7 @@ _INTEGRAL_SHARE = 0.3  # the integral's bound, as a share of the force wanted
 _SHARE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
 _SHARE_ANGLE = 3e-3  # rad that the object may turn by that
 _QUIET = 3.0  # standard deviations of the angle that the joints at rest don't follow
+_LONGEST_PAUSE = 0.05  # s of the dither's time that passes at once after ticks without
 _STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
 _TURN_MIN = 0.1  # of the object over a joint's lean, likewise
 
@@ -71,6 +72,7 @@ class GripState(Record):
     lean: float  # speed of the offset that turns the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
     shaken: float  # since the dither began [s]
+    seen: float  # when the joints were last read while both pushed alike [s]
     shift: float  # of the offset, to share the force out between the tips [rad]
     closed: float  # goal of (q1 + q2)/2 in pure position control [rad]
     closing_friction: float  # share of the joints' friction that is given for closing
@@ -93,6 +95,7 @@ def start(
     g.offset = 0.5 * (q[0] - q[1])
     g.closed = 0.5 * (q[0] + q[1])
     g.steering = False
+    g.seen = grasps[0].t
 
 
 @kernel
@@ -323,9 +326,12 @@ def _equal_torques(
         fading = 1.0 - g.shaken / law.dither_time
         turn = fading * law.dither_torque * math.sin(law.dither_rate * g.shaken) - spring * lean
         if setpoint.arrived(g.force):
-            g.shaken += law.dt
+            # By the clock and not by ticks: where these come late the dither must not become slow,
+            # for the fingers on the tips swing by themselves at one to two hertz.
+            g.shaken += min(max(grasp.t - g.seen, 0.0), _LONGEST_PAUSE)
     else:
         turn += g.joint_stiffness * (g.offset - lean)
+    g.seen = grasp.t
     g.torque[0] = push + turn
     g.torque[1] = push - turn
     return g.torque[0], g.torque[1]

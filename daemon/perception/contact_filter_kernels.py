@@ -66,6 +66,7 @@ class TrackedTip(Record):
 class GraspState(Record):
     """How the held object answers the joints at this tick: what a grip law needs."""
 
+    t: float  # when the joints were read [s]
     d: Pair  # displacements [m]
     force: Pair  # of the tips, gain times their tables' [N]
     angle_std: float  # standard deviation of the object's angle [rad]
@@ -442,6 +443,7 @@ def write_grasp(
     theta2 = angle + 0.5 * taper - right.q
     seen1 = _write_tip(f, 0, theta1, table1)
     seen2 = _write_tip(f, 1, theta2, table2)
+    grasp.t = f.t
     grasp.angle_std = math.sqrt(_variance(f.angle, f.count))
     grasp.taper = taper
     grasp.stray = f.stray

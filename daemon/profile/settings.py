@@ -244,7 +244,7 @@ class ControlSettings(Section):
     rotate_bandwidth: NonNegative = 4.0  # Hz of the angle integral
     joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
     dither_torque: NonNegative = 0.3  # N·m, antisymmetric, by which "upright" frees the joints
-    dither_frequency: Annotated[float, Field(gt=0, le=50)] = 5.0  # Hz
+    dither_frequency: Annotated[float, Field(ge=3, le=50)] = 5.0  # Hz; slower, the grip would swing
     dither_time: Delay = 2.0  # s in which it fades
     joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
     damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
