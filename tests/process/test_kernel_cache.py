@@ -27,6 +27,21 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 def twice(x):
     return 2.0 * x
 """,
+    "softfinger/kinematics/array.py": """
+import numpy as np
+from softfinger.kinematics.compiled.kernel import kernel
+
+@kernel
+def ramp(x):
+    out = np.empty(3)
+    for k in range(3):
+        out[k] = k * x
+    return out
+
+@kernel
+def total(x):
+    return ramp(x).sum()
+""",
     "softfinger/kinematics/caller.py": """
 from softfinger.kinematics import layout
 from softfinger.kinematics.callee import twice
@@ -37,6 +52,11 @@ def caller(x):
     return twice(x) + layout.OFFSET
 """,
 }
+KEPT = """
+import sys
+import softfinger.kinematics.array as a
+print(a.ramp(3.0).sum(), sum(a.ramp.stats.cache_hits.values()), "numba.np.linalg" in sys.modules)
+"""
 RUN = """
 import softfinger.kinematics.caller as c
 print(c.caller(1.0), sum(c.caller.stats.cache_hits.values()))
@@ -61,12 +81,12 @@ class Package:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
 
-    def run(self) -> tuple[list[str], str]:
+    def run(self, script: str = RUN) -> tuple[list[str], str]:
         """What the kernel gave and how often it came from the cache; what was warned of."""
         environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
         environment.pop("NUMBA_CACHE_DIR", None)
         done = subprocess.run(
-            [sys.executable, "-c", RUN],
+            [sys.executable, "-c", script],
             env=environment,
             cwd=self.folder,
             capture_output=True,
@@ -93,6 +113,14 @@ def test_a_changed_callee_or_constant_is_compiled_anew(package: Package) -> None
     assert package.run()[0] == ["12.0", "0"]
     package.write("softfinger/kinematics/layout.py", "OFFSET = 1.0\n")
     assert package.run()[0] == ["6.0", "1"], "the folder of these sources is still there"
+
+
+def test_a_kept_kernel_runs_without_what_compiles_and_is_compiled_into_others(
+    package: Package,
+) -> None:
+    assert package.run(KEPT) == (["9.0", "0", "True"], "")
+    assert package.run(KEPT) == (["9.0", "1", "False"], "")
+    assert package.run(KEPT.replace("ramp(3.0).sum()", "total(3.0)"))[0][0] == "9.0"
 
 
 def test_the_folder_is_the_users_own_and_others_may_not_write_to_it(package: Package) -> None:

@@ -51,7 +51,8 @@ def _start(folder: Path) -> _Start:
     words = ["--set", f"stream.address={stream}"]
     words += ["--set", f"commands.address=ipc://{folder}/commands"]
     environment = os.environ | {"XDG_CACHE_HOME": str(folder)}
-    environment.pop("NUMBA_CACHE_DIR", None)
+    for each in ("NUMBA_CACHE_DIR", "PYTHONDONTWRITEBYTECODE"):  # a user has neither
+        environment.pop(each, None)
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.subscribe("hand/state")
         socket.setsockopt(zmq.LINGER, 0)
