@@ -82,8 +82,13 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     """
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
-    common = noise.mean(axis=(1, 2))
-    noise -= common[:, None, None]
+    spread = noise.std(axis=0)
+    rests = (spread > 0.0) & (spread <= _RESTLESS * np.median(spread))  # not dead or faulty
+    noise *= rests
+    common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
+    noise -= common[:, None, None] * rests
+    own = float(noise.var())
+    noise /= np.where(rests, spread, 1.0)
     shape = rows + _LAGS, cols + _LAGS
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
@@ -98,7 +103,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     rho = rho[: used[0], : used[1]]
     twice = np.where(np.arange(max(used)) > 0, 2.0, 1.0)
     together = float(twice[: used[0]] @ rho @ twice[: used[1]])
-    own = max(together, 0.0) * noise.var() / (rows * cols)
+    own *= max(together, 0.0) / (rows * cols)
     drift = math.sqrt(max(float(common.var(ddof=1)) - own, 0.0))
     if drift < _SEEN * math.sqrt(own / n):
         drift = 0.0

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
+    CentreStep,
     ModulusStep,
+    TareStep,
+    load_calibration,
     now,
     save_calibration,
     sensor_of,
 )
+from softfinger.daemon.perception.finger_model import make_models, uncertainty
 from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
 LEFT = 0.25e6  # Pa, a constant modulus
@@ -47,6 +54,43 @@ def settings(tmp_path):
     raw = base.model_dump()
     raw["tactile"]["calibration"] = tuple(files)
     return Settings.model_validate(raw)
+
+
+def test_what_a_calibration_measured_of_its_errors_reaches_the_estimator():
+    settings = Settings.model_validate({"tactile": {"baseline_error": 300.0, "pitch_error": 0.01}})
+    zero = np.zeros((settings.tactile.rows, settings.tactile.cols)).tolist()
+    calibration = Calibration(
+        sensor=sensor_of(settings, 0),
+        date=now(),
+        tare=TareStep(
+            date=now(), zero=zero, noise=1.0, frames=64, correlation=[[1.0, 0.5]], drift=100.0
+        ),
+        centre=CentreStep(
+            date=now(), centre=(0.0, 0.0), rotation=0.0, scale=1.02, residual=0.0, std=1e-4
+        ),
+    )
+    known = uncertainty(settings, calibration)
+    assert known.baseline == pytest.approx(math.hypot(300.0, 100.0 * 4.0))
+    assert (known.centre, known.pitch, known.modulus) == (1e-4, pytest.approx(0.02), 0.0)
+    np.testing.assert_array_equal(known.correlation, [[1.0, 0.5]])
+    assert uncertainty(Settings(), None) == Uncertainty()
+
+
+def test_a_calibrated_law_too_far_off_its_points_is_refused_by_file_and_key(settings):
+    path = Path(settings.tactile.calibration[1])
+    strain = np.linspace(0.05, 1.0, 20)
+    kinked = 1e5 * np.where(strain < 0.3, strain, 3.0 * strain - 0.6)
+    step = ModulusStep(
+        date=now(),
+        modulus=LEFT,
+        offset=0.0,
+        residual=0.0,
+        strain=strain.tolist(),
+        stress=kinked.tolist(),
+    )
+    save_calibration(path, load_calibration(path).model_copy(update={"modulus": step}))
+    with pytest.raises(SettingsError, match=r"right\.json: modulus: .*material\.force_error_max"):
+        make_models(settings, None)
 
 
 def test_each_tips_material_reaches_estimate_table_and_prediction(settings):

@@ -51,6 +51,21 @@ def test_a_tare_while_something_presses_is_refused():
         tare(frames)
 
 
+def test_a_tare_measures_how_noise_correlates_and_all_cells_drift():
+    rng = np.random.default_rng(4)
+    white = 2.0 * rng.standard_normal((100, 44, 45))
+    plain = tare(50.0 + white)
+    assert plain.correlation.size == 0
+    assert plain.drift == 0.0
+    # Each cell's noise is half its right neighbour's own.
+    shared = 50.0 + (white[:, :, 1:] + white[:, :, :-1]) / math.sqrt(2.0)
+    shared[:, 3, 3] += 100.0 * rng.standard_normal(100)  # a faulty cell
+    found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))
+    assert found.correlation.shape == (1, 2)
+    np.testing.assert_allclose(found.correlation, [[1.0, 0.5]], atol=0.02)
+    assert found.drift == pytest.approx(0.7, rel=0.2)
+
+
 def test_equilibration_makes_cells_alike_and_finds_the_dead():
     gain = 1.0 + 0.2 * RNG.standard_normal((8, 8))
     gain[2, 3] = 0.0
@@ -129,6 +144,7 @@ def test_centre_and_rotation_are_found_from_tilted_presses(rotation):
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.scale == pytest.approx(1.0, abs=5e-3)
     assert found.residual < 3e-5
+    assert 2e-5 < found.std < 2e-4  # a press is upright within half a degree
 
 
 def test_upright_presses_tell_the_centre_and_no_rotation():
@@ -137,6 +153,7 @@ def test_upright_presses_tell_the_centre_and_no_rotation():
     found = fit_centre(frames, [0.0, 0.0], TIP, LINEAR, GRID, 600.0)
     assert found.centre == pytest.approx(true.centre, abs=2e-6)
     assert found.rotation is None
+    assert 2e-5 < found.std < 2e-4
 
 
 @pytest.mark.parametrize("tilts", [[0.2, 0.2], [0.1, 0.12], [-0.3]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from softfinger.daemon.perception.contact_filter import ContactFilter
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Contact, Frame, ObjectPose, Reading
+from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 SETTINGS = Settings()
@@ -29,6 +31,46 @@ ESTIMATE = ContactEstimate(
     tilt_x=0.1,
     covariance=np.diag([5e-5**2, 5e-3**2, 0.0, 0.0]),
 )
+
+
+def test_what_frames_share_stays_however_many_come(contact_filter: ContactFilter) -> None:
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    shared = np.diag([2e-5**2, 4e-3**2, 0.0, 0.0])
+    estimate = replace(ESTIMATE, covariance=ESTIMATE.covariance + shared, systematic=shared)
+    for k in range(100):
+        t = 5.0 + 0.01 * k
+        contact_filter.advance(Reading(t=t, q=[0.15, 0.15], valid=True))
+        contact_filter.correct(0, frame(t), estimate, contacts[0])
+        contact_filter.write_contacts(t, contacts, pose)
+        if k == 0:
+            first = replace(contacts[0])
+    contact = contacts[0]
+    assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
+    assert 2e-5 < contact.d_std < 0.7 * first.d_std
+    assert 4e-3 < contact.theta_std < first.theta_std
+    # The force's follows d's by ∂F/∂d = 2F/d, of a law that is known, and θ's by F tan θ.
+    by_d, by_theta = 2.0 * contact.force / contact.d * contact.d_std, contact.force * 0.1 * 4e-3
+    assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta), rel=0.2)
+
+
+def test_the_law_misfit_is_in_the_force(contact_filter: ContactFilter) -> None:
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    strain = np.linspace(0.025, 1.0, 40)
+    law = Material.from_points(strain, 1e5 * strain**0.7)
+    known, unknown = (
+        ContactFilter(SETTINGS, (make_table(SETTINGS, law, None),) * 2, materials)
+        for materials in (None, (law, law))
+    )
+    found = []
+    for each in (known, unknown):
+        for read in (False, True):
+            if read:
+                each.advance(Reading(t=5.0, q=[0.15, 0.15], valid=True))
+            each.correct(0, frame(5.0), ESTIMATE, contacts[0])
+            each.write_contacts(5.0, contacts, pose)
+            found.append(contacts[0].force_std / contacts[0].force)
+    by_law = law.force_error(0.003 / SETTINGS.tip.radius)
+    np.testing.assert_allclose(found[2:], np.hypot(found[:2], by_law), rtol=0.05)
 
 
 def frame(t: float) -> Frame:

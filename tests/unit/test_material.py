@@ -163,6 +163,20 @@ def test_any_rising_points_give_a_rising_law_or_a_reason(steps: list[float], sca
     assert material.fit_error <= 0.05 * y[-1]
 
 
+def test_the_force_error_is_what_the_misfit_makes_of_the_force() -> None:
+    x = np.linspace(0.025, 1.0, 40)
+    curve = 1e5 * x**0.7
+    law = Material.from_points(x, curve)
+    # Upright, F = 2π h² ∫ σ/(1 − ε)³ dε: the measured curve's against the law's.
+    for share in (0.05, 0.1, 0.3):
+        strain = share * (np.arange(2000) + 0.5) / 2000
+        weight = (1.0 - strain) ** -3
+        true = (1e5 * strain**0.7 * weight).sum()
+        missed = abs((law.stress(strain) * weight).sum() / true - 1.0)
+        assert 0.6 * missed < law.force_error(share) < 1.5 * missed + 0.02
+    assert Material.table_i().force_error([0.1, 0.5]).tolist() == [0.0, 0.0]
+
+
 @pytest.mark.parametrize(
     ("strain", "stress", "words"),
     [

@@ -217,6 +217,11 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> N
             '[material]\nlaw = "points"\nstrain = [0.0, 0.2, 0.1]\nstress = [0.0, 1.0, 2.0]',
             "material.strain, material.stress: ",
         ),
+        (
+            '[material]\nlaw = "points"\nstrain = [0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0]\n'
+            "stress = [1e4, 2e4, 3e4, 6e4, 12e4, 18e4, 24e4]\nforce_error_max = 0.01",
+            "material.strain, material.stress: the smooth law misses its points by up to",
+        ),
     ],
 )
 def test_absurd_settings_are_told_in_one_line(tmp_path: Path, text: str, line: str) -> None:
