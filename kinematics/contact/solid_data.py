@@ -6,6 +6,9 @@ in. The energy is U = E a³ t⁵ g(t, sin² θ), whose partials are the push alo
 N = ∂U/∂d and the moment ∂U/∂θ. The face is frictionless, so the force on the base is N cos θ, and
 
     p(r, φ) = N/a² [cos θ B_0(r) + Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r)].
+
+A shear force T on the face, towards φ_T, adds T/a² B_T(r) cos(φ − φ_T), where T counts as if it
+were at the height a: its moment about the base's middle is T a.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ class SolidData:
     shares: FloatArray  # q [k, i, j]; none of the first
     edges: FloatArray  # of the rings in r/a [rings + 1]
     modes: FloatArray  # B [k, rings], means over the rings
+    shear: FloatArray  # B_T [rings]
     error: float  # of N, relative, against finer meshes
 
 
@@ -80,6 +84,7 @@ def solid_data(tip: Fingertip) -> SolidData:
         np.stack([powers(by_poisson(each)) for each in kept["coef"]]),
         kept["ring_edges"],
         kept["basis"],
+        by_poisson(kept["shear"]),
         float(kept.get("error", 0.0)),
     )
 

@@ -63,6 +63,8 @@ class ContactEstimate:
     iterations: int = 0
     rejected: int = 0  # outliers left out
     second: bool = False  # something else presses too, off the footprint
+    shear_x: float = 0.0  # force along the face [N], which a solid tip's base feels
+    shear_y: float = 0.0
     sharing: float = 1.0  # cells for each whose noise is independent
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
@@ -290,6 +292,9 @@ class ContactEstimator:
             result.contact,
             result.valid,
             result.second,
+            _,
+            result.shear_x,
+            result.shear_y,
             *_,
         ) = self._estimate.item()
         self._seq = seq

@@ -256,6 +256,8 @@ def _begin(state: EstimatorState, scale: float, step: float) -> None:
     estimate.iterations = 0
     estimate.second = False
     estimate.hidden = 0.0
+    estimate.shear_x = 0.0
+    estimate.shear_y = 0.0
     estimate.covariance[:] = 0.0
     estimate.systematic[:] = 0.0
     state.budget.covariance[:] = 0.0

@@ -5,6 +5,9 @@ is projected on the pictures once, and the iteration works on these sums and on 
 products alone. Cells that don't read the pressure as it is, since it ends at a floor or is cut at 0
 where the model pulls, are given what they would have read, by the model before: the frame is then
 projected again until that settles.
+
+A shear force on the face adds two pictures of its own, which look much like a tilt's. It is fitted
+along, by taking out of all other pictures what they share with these two.
 """
 
 from __future__ import annotations
@@ -12,8 +15,10 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
+import numpy as np
+
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.compiled.layout import Record
+from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.compiled.simd import IntPointer, Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -30,8 +35,9 @@ from softfinger.kinematics.sensing.solid_pressure import (
     weights_of,
 )
 
-_PASSES = 8  # projections of a frame
-_SETTLED = 0.05  # squared step, in units of the noise floor, at which readings by the model stay
+_PASSES = 24  # projections of a frame
+_LIMITED = 4  # of them that may end where the data do, one after the other
+_SETTLED = 0.1  # squared step, in units of the noise floor, at which readings by the model stay
 _MOST_HALVINGS = 5
 _LOST = 0.01  # squared noise floor that a picture may count to be left out
 _NEAR = 0.03  # rad round a contact for which that holds
@@ -39,6 +45,7 @@ _STARTS = 8  # depths from which a frame alone is fitted
 
 Sums = Annotated[FloatArray, PICTURES]
 Products = Annotated[FloatArray, PICTURES, PICTURES]
+Likeness = Annotated[FloatArray, PICTURES, 2]  # how much of each shear picture is in each other
 
 
 class SolidFit(Record):
@@ -52,10 +59,15 @@ class SolidFit(Record):
     projected: Sums  # Σ picture · reading
     count: int  # pictures that count in the contact at work: the first ones
     low: int  # those of m ≤ 2
-    pulls: bool  # some contact has cells that the model pulls
-    first: float  # Σ of the first picture, which any contact shows most
-    products: Products  # Σ picture · picture over live cells
-    used: Products  # and over those that count in this frame
+    first: float  # mean of the first picture, which any contact shows most
+    spread: float  # √Σ(first picture − mean)²
+    plain: Products  # Σ picture · picture over live cells, shear's two last
+    products: Products  # the same without what is like shear
+    used: Products  # and over the cells that count in this frame
+    whole: Likeness
+    likeness: Likeness  # in this frame
+    shear: Pair  # of the model [Pa]
+    strongest: float  # cell of shear's pictures
     sides: Annotated[FloatArray, 4, PICTURES]  # products times columns of the Jacobian
     d: float  # of the contact at work
     n_x: float
@@ -71,11 +83,15 @@ def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
     fit = SolidFit()
     fit.weights.assign(weights_of(tip, material))
     count, fit.cells = live.shape
-    fit.products[:count, :count] = live @ live.T
-    fit.first = live[0].sum()
+    fit.plain[:count, :count] = plain = live @ live.T
+    both = plain[-2:, -2:]
+    fit.whole[: count - 2] = likeness = plain[:-2, -2:] @ np.linalg.inv(both)
+    fit.products[: count - 2, : count - 2] = plain[:-2, :-2] - likeness @ both @ likeness.T
+    fit.strongest = np.abs(live[-2:]).max()
+    fit.first = live[0].mean()
+    fit.spread = live[0].std() * math.sqrt(fit.cells)
     low = fit.weights.harmonics[: fit.weights.modes] <= 2
     fit.low = pictures_of(fit.weights.harmonics[: fit.weights.modes][low])
-    fit.pulls = tip.base == "lying"
     return fit
 
 
@@ -103,9 +119,8 @@ def presses(
         readings[k] = frame[places[k]]
         total += readings[k]
     shown = _dot(further(arena, solid.packed), readings, solid.cells)
-    mean = solid.first / solid.cells
-    spread = math.sqrt(solid.products[0, 0] - mean * solid.first)
-    return bool(shown - mean * total > state.options.patch_level * state.signal.noise * spread)
+    level = state.options.patch_level * state.signal.noise * solid.spread
+    return bool(shown - solid.first * total > level)
 
 
 @inner_kernel
@@ -133,6 +148,9 @@ def _set_model(solid: SolidFit, arena: Pointer, gain: float) -> None:
     for j in range(solid.count):
         picture = further(arena, solid.packed + j * solid.cells)
         add_picture(picture, gain * solid.weights.value[j], 0, solid.cells, model)
+    for k in range(2):
+        picture = further(arena, solid.packed + (solid.weights.pictures + k) * solid.cells)
+        add_picture(picture, solid.shear[k], 0, solid.cells, model)
 
 
 @inner_kernel
@@ -169,6 +187,7 @@ def _read(
     clip = math.sqrt(signal.variance) if signal.clipped else 0.0
     near = floor + CLIP_END * clip
     count = solid.count
+    pictures = solid.weights.pictures + 2
     solid.counted = float(solid.cells)
     square = raw = 0.0
     changed = False
@@ -182,10 +201,10 @@ def _read(
         if full or outlier:
             # Saturated, or an outlier: it doesn't count.
             if solid.counted == solid.cells:
-                solid.used[:] = solid.products
-            for i in range(count):
+                solid.used[:] = solid.plain
+            for i in range(pictures):
                 value = arena[solid.packed + i * solid.cells + k]
-                for j in range(count):
+                for j in range(pictures):
                     solid.used[i, j] -= value * arena[solid.packed + j * solid.cells + k]
             solid.counted -= 1.0
             readings[k] = 0.0
@@ -196,12 +215,51 @@ def _read(
             changed = True
         readings[k] = reading
         square += reading * reading
-    solid.square = square
     solid.raw = raw
+    last = further(arena, solid.packed + (pictures - 2) * solid.cells)
+    x = _dot(last, readings, solid.cells)
+    y = _dot(further(last, solid.cells), readings, solid.cells)
+    if solid.counted == solid.cells:
+        solid.likeness[:] = solid.whole
+        solid.square = square - _along_shear(solid.plain, pictures, (x, y), solid.shear)
+    else:
+        solid.square = square - _along_shear(solid.used, pictures, (x, y), solid.shear)
+        _take_out_shear(solid, pictures)
     for j in range(count):
         picture = further(arena, solid.packed + j * solid.cells)
-        solid.projected[j] = _dot(picture, readings, solid.cells)
+        shown = _dot(picture, readings, solid.cells)
+        solid.projected[j] = shown - solid.likeness[j, 0] * x - solid.likeness[j, 1] * y
     return changed
+
+
+@inner_kernel
+def _along_shear(
+    products: FloatArray, pictures: int, sums: tuple[float, float], shear: FloatArray
+) -> float:
+    """Fit shear's two pictures alone: ``shear`` by their ``sums``, and the squares they explain."""
+    k = pictures - 2
+    x, y = sums
+    p = products[k, k]
+    q = products[k, k + 1]
+    r = products[k + 1, k + 1]
+    inverse = 1.0 / (p * r - q * q)
+    shear[0] = (r * x - q * y) * inverse
+    shear[1] = (p * y - q * x) * inverse
+    explained: float = shear[0] * x + shear[1] * y
+    return explained
+
+
+@inner_kernel
+def _take_out_shear(solid: SolidFit, pictures: int) -> None:
+    """Take what is like shear out of this frame's products, where some cells don't count."""
+    count = pictures - 2
+    used = solid.used
+    likeness = solid.likeness
+    for j in range(count):
+        _along_shear(used, pictures, (used[j, count], used[j, count + 1]), likeness[j])
+    for i in range(count):
+        for j in range(count):
+            used[i, j] -= likeness[i, 0] * used[count, j] + likeness[i, 1] * used[count + 1, j]
 
 
 @inner_kernel
@@ -353,6 +411,7 @@ def start_solid(
                 estimate.n_x = solid.n_x
                 estimate.n_y = solid.n_y
                 estimate.gain = fit.gain
+    solid.shear[:] = 0.0
 
 
 @inner_kernel
@@ -373,22 +432,28 @@ def fit_solid(
     solid.n_y = estimate.n_y
     fit.gain = estimate.gain
     total = 0
-    exact = not (solid.pulls or state.signal.clipped or math.isfinite(state.signal.saturation))
-    model = further(arena, solid.model)
-    if exact:
-        for k in range(solid.cells):
-            model[k] = math.inf
+    limited = 0
     for _ in range(_PASSES):
         solid.count = _counting(state, solid)
-        if not exact:
-            _set_model(solid, arena, fit.gain)
+        x = solid.shear[0]
+        y = solid.shear[1]
+        _set_model(solid, arena, fit.gain)
         changed = _read(state, solid, frame, arena, height, places)
         # What is read off the model settles more slowly than Gauss-Newton does.
         steps = _descend(state, solid, min(tolerance, _SETTLED) if changed else tolerance)
         total += steps
         if steps == 0:
             return False
-        if steps == 1 or not (changed or _counting(state, solid) > solid.count):
+        # What the pictures leave of the shear that was fitted alone.
+        for k in range(2):
+            for j in range(solid.count):
+                solid.shear[k] -= fit.gain * solid.likeness[j, k] * solid.weights.value[j]
+        limited = limited + 1 if solid.limited else 0
+        if limited == _LIMITED:
+            return False
+        sheared = solid.strongest * math.hypot(solid.shear[0] - x, solid.shear[1] - y)
+        same = steps == 1 or not (changed or _counting(state, solid) > solid.count)
+        if same and limited == 0 and sheared < 0.5 * math.sqrt(state.signal.variance):
             return _finish(state, solid, total)
     return False
 
@@ -400,7 +465,12 @@ def _finish(state: EstimatorState, solid: SolidFit, iterations: int) -> bool:
     estimate = state.estimate
     free = state.options.free_gain
     variance = state.signal.variance
-    freedom = solid.counted - (4.0 if free else 3.0)
+    freedom = solid.counted - (6.0 if free else 5.0)
+    area = state.grid.radius * state.grid.radius
+    along = area * math.cos(state.options.rotation)
+    across = area * math.sin(state.options.rotation)
+    estimate.shear_x = along * solid.shear[0] - across * solid.shear[1]
+    estimate.shear_y = across * solid.shear[0] + along * solid.shear[1]
     misfit = max(fit.sums.misfit - fit.decrement, 0.0)
     estimate.d = solid.d
     estimate.n_x = solid.n_x
@@ -419,4 +489,4 @@ def _finish(state: EstimatorState, solid: SolidFit, iterations: int) -> bool:
     for i in range(4):
         for j in range(4):
             fit.covariance[(i + 3) % 4, (j + 3) % 4] = wider * fit.inverse[i, j]
-    return bool(freedom > 0.0 and not solid.limited)
+    return bool(freedom > 0.0)

@@ -102,6 +102,8 @@ class Estimate(Record):
     valid: bool
     second: bool
     warm: bool
+    shear_x: float  # force on the face [N], of a solid tip
+    shear_y: float
     n_x: float
     n_y: float
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]

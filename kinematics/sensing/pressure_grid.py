@@ -210,7 +210,7 @@ class SensorGrid:
             raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
         if tip.physics == "solid":
             SolidPressure(tip, material, self.pictures(tip))(
-                d, *self.to_sensor(n_x, n_y), gain, out
+                (d, *self.to_sensor(n_x, n_y)), gain, out
             )
             return out
         work: Any = np.empty(1, Rendering.dtype)  # a record's views take longer than to set fields
@@ -230,7 +230,7 @@ class SensorGrid:
         return out
 
     def pictures(self, tip: Fingertip) -> FloatArray:
-        """The cells' means of a solid tip's modes, see `solid_pressure`: [pictures, cells]."""
+        """The cells' means of a solid tip's modes and shear, see `solid_pressure`: [·, cells]."""
         return _pictures(replace(self, rotation=0.0), tip)
 
     def finer(self, parts: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:

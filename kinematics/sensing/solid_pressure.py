@@ -23,7 +23,7 @@ from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes,
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
-PICTURES = 2 * MODES
+PICTURES = 2 * MODES  # with shear's two
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
 
 _INSIDE, _CUT = 6, 24  # points a side of a cell, and of one that the rim cuts
@@ -65,9 +65,9 @@ def pictures_of(harmonics: IntArray) -> int:
 
 
 def pictures(tip: Fingertip, cells: Grid) -> FloatArray:
-    """The modes' means over each cell, float64 [pictures, rows · cols]."""
+    """The modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
     data = solid_data(tip)
-    out = np.zeros((pictures_of(data.harmonics), cells.rows * cells.cols))
+    out = np.zeros((pictures_of(data.harmonics) + 2, cells.rows * cells.cols))
     x, y = (
         (low + pitch * np.arange(count)) / cells.radius
         for low, pitch, count in (
@@ -100,7 +100,8 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
     inside = (r < 1.0) / z.shape[1]
     turn = z / np.maximum(r, 1e-12)
     found: list[FloatArray] = []
-    for m, mode in zip(data.harmonics.tolist(), data.modes, strict=True):
+    modes = zip([*data.harmonics.tolist(), 1], [*data.modes, data.shear], strict=True)
+    for m, mode in modes:
         # Where m > 0 a mode goes to 0 at the middle.
         start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
         end = 1.5 * mode[-1] - 0.5 * mode[-2]
@@ -202,10 +203,13 @@ def render_solid(
     weights: Records[Weights],
     shown: FloatArray,
     contact: tuple[float, float, float],
+    shear: tuple[float, float],
     gain: float,
     out: FloatArray,
 ) -> None:
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
+
+    ``shear`` [N] is the force along x and y on the face, as at the height a.
 
     ``shown`` are the grid's pictures. d ≤ 0 gives zeros; beyond what the data cover the deepest
     and the most tilted contact of that azimuth.
@@ -227,6 +231,10 @@ def render_solid(
     for k in range(each.pictures):
         picture = further(address(shown), k * cells)
         add_picture(picture, gain * each.value[k], 0, cells, start)
+    area = table.radius * table.radius
+    for k in range(2):
+        picture = further(address(shown), (each.pictures + k) * cells)
+        add_picture(picture, gain * shear[k] / area, 0, cells, start)
     for k in range(cells):
         start[k] = max(start[k], 0.0)
 
@@ -238,6 +246,12 @@ class SolidPressure:
         self._weights = weights_of(tip, material).array
         self._shown = shown
 
-    def __call__(self, d: float, n_x: float, n_y: float, gain: float, out: FloatArray) -> None:
+    def __call__(
+        self,
+        contact: tuple[float, float, float],
+        gain: float,
+        out: FloatArray,
+        shear: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         """As :func:`render_solid`."""
-        render_solid(self._weights, self._shown, (d, n_x, n_y), gain, out)
+        render_solid(self._weights, self._shown, contact, shear, gain, out)

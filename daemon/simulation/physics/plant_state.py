@@ -74,6 +74,7 @@ class SampleRow(Record):
     theta: Pair
     gain: Pair
     bend: Pair
+    tangential: Pair
 
 
 class Edge(Record):

@@ -49,6 +49,9 @@ def take_sample(plant: Plant, ring: Records[SampleRow]) -> None:
         row.theta[finger] = now.theta - share * (now.theta - before.theta[finger])
         row.gain[finger] = now.gain - share * (now.gain - before.gain[finger])
         row.bend[finger] = now.bend
+        row.tangential[finger] = now.tangential - share * (
+            now.tangential - before.tangential[finger]
+        )
     plant.samples += 1
 
 

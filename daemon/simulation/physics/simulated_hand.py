@@ -39,6 +39,7 @@ class Sample(NamedTuple):
     theta: FloatArray  # rad
     gain: FloatArray  # of the force over that on a plane at d and θ
     bend: FloatArray  # curvature of what is touched, across the hand's plane [1/m]
+    tangential: FloatArray  # force along the face [N]
 
 
 class SimulatedHand:

@@ -186,19 +186,21 @@ class SensorModel:
         t: float = 0.0,
         bend: float = 0.0,
         share: float = 1.0,
+        shear: float = 0.0,
     ) -> None:
         """Let the cells feel the contact of time ``t`` without reading them.
 
         ``bend`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face: that
         of a cylinder whose axis is along the finger's y. A solid tip shows it as a ``share`` of the
-        plane's pressure alone.
+        plane's pressure alone, and it shows the ``shear`` [N] along x, as at the height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
         elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
         self._t = t
         if self._solid is not None:
-            self._solid(d, n_x, n_y, share, pressure)
+            along = self.grid.to_sensor(shear, 0.0)
+            self._solid((d, n_x, n_y), share, pressure, along)
         else:
             contact = self._curved if bend > 0.0 else self._plane
             contact.d, contact.n_x, contact.n_y = d, n_x, n_y

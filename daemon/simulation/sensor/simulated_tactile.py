@@ -124,7 +124,8 @@ class SimulatedTactile:
         if abs(theta) >= 0.5 * math.pi:
             d = 0.0
         if self._solid:
-            self._model.press(d, theta, 0.0, number * self._period, bend, share)
+            shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
+            self._model.press(d, theta, 0.0, number * self._period, bend, share, shear)
             return True
         # What is left without the curvature's own share, which the cells are to show themselves.
         share *= math.sqrt(1.0 + bend * self._radius)
