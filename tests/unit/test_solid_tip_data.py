@@ -51,6 +51,14 @@ def test_the_push_is_the_energy_s_slope_and_the_base_carries_it(
                 assert pressure[0] @ areas == pytest.approx(push * np.cos(theta), rel=1e-6)
 
 
+def test_a_shear_force_turns_the_base_by_its_height(arrays: dict[str, np.ndarray]) -> None:
+    levers = np.pi * np.diff(arrays["ring_edges"] ** 3) / 3
+    for base in BASES:
+        each_nu, *others = arrays[f"{base}.shear"].T @ levers  # Chebyshev's, along ν
+        assert each_nu == pytest.approx(0.992, abs=1e-3)  # mean height of the cap it acts on
+        assert others == pytest.approx([0.0] * len(others), abs=1e-4)
+
+
 def test_the_other_tilt_mirrors_the_pressure(arrays: dict[str, np.ndarray]) -> None:
     for tip in tips(arrays):
         push, energy, pressure = tip.press(0.2, 0.4)

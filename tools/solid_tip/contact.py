@@ -26,7 +26,6 @@ class Press(NamedTuple):
     push: float  # N along the plane's normal
     energy: float  # U
     base: FloatArray  # (H, B) base pressure's cosine harmonics at the base's nodes
-    rim: float  # least angle between the contact and the rim, seen from the centre [rad]
 
 
 class TiltedPlane:
@@ -98,6 +97,5 @@ class TiltedPlane:
             where, load, share = self.parts[ring]
             each = (load @ push[where] * share[:, 0])[:, : len(base)]
             base -= np.einsum("mba,am->mb", self.green.base[..., ring], each)
-        r, z = self.green.place[self.ring[touching].max()]
         energy = float(push @ overlap / 2)
-        return Press(d, self.theta, float(push.sum()), energy, base, float(np.arctan2(z, r)))
+        return Press(d, self.theta, float(push.sum()), energy, base)

@@ -22,8 +22,6 @@ CAP = 0.2  # polar angle of the cap that a shear force acts on [rad]
 class Green(NamedTuple):
     """Response of rings and base; components are (r, φ, z), rings go from the pole outwards."""
 
-    bonded: bool
-    poisson: float
     place: FloatArray  # (R, 2) mean r and z of each ring [a]
     weight: FloatArray  # (R,) ∫ r ds of each ring [a²]
     cells: IntArray  # (R,) cells around each ring, an even number
@@ -124,7 +122,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
         if m <= base_harmonics:
             pressure = to_pressure.solve(matrix[base_z] @ moved)
             base[m][:, :, active] = pressure.reshape(-1, 3, active.size)
-    return Green(bonded, poisson, place, weight, cells, out, base_radius, base)
+    return Green(place, weight, cells, out, base_radius, base)
 
 
 def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
