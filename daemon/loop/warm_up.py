@@ -192,12 +192,12 @@ def _many(scene: WantedScene) -> None:
     scene.models[0].table(np.zeros(2), np.zeros(2))
 
 
-_TABLE = Part("contact table", 26, _table)
+_TABLE = Part("contact table", 27, _table)
 _ESTIMATOR = Part("estimator", 67, _estimator)
 _HAND = Part("simulated hand", 61, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
-_FILTER = Part("contact filter", 30, _filter, after=_TABLE.name)
-_GRIP = Part("grip and timing", 30, _grip)
+_FILTER = Part("contact filter", 25, _filter, after=_TABLE.name)
+_GRIP = Part("grip and timing", 33, _grip)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
