@@ -1,8 +1,9 @@
-"""A rigid plane without friction on the hemisphere: a linear complementarity problem on its cells.
+"""A rigid plane pressed on the hemisphere: a linear complementarity problem on its surface's cells.
 
-A cell's unknown is its push q ≥ 0 along the plane's normal n = (sin θ, 0, cos θ), both mirror
-images y and −y together. With the compliance C the cells move by C q; the plane overlaps them by
-δ = X·n − (a − d); so q ≥ 0, C q − δ ≥ 0, q·(C q − δ) = 0.
+Without friction a cell's unknown is its push q ≥ 0 along the plane's normal n = (sin θ, 0, cos θ),
+both mirror images y and −y together. With the compliance C the cells move by C q; the plane
+overlaps them by δ = X·n − (a − d); so q ≥ 0, C q − δ ≥ 0, q·(C q − δ) = 0. Sticking adds two
+forces along the plane to each cell, which keep it where it was when it came to touch.
 """
 
 from __future__ import annotations
@@ -26,37 +27,41 @@ class Press(NamedTuple):
     push: float  # N along the plane's normal
     energy: float  # U
     base: FloatArray  # (H, B) base pressure's cosine harmonics at the base's nodes
+    shear: float  # force along (cos θ, 0, −sin θ), against the tip; 0 without friction
 
 
 class TiltedPlane:
-    """The plane at tilt θ [rad]; presses up to depth ``d_max`` [a]."""
+    """The plane at tilt θ [rad]; presses up to depth ``d_max`` [a], with or without sticking."""
 
-    def __init__(self, green: Green, theta: float, d_max: float) -> None:
+    def __init__(self, green: Green, theta: float, d_max: float, sticking: bool = False) -> None:
         self.green, self.theta = green, theta
         sine, cosine = np.sin(theta), np.cos(theta)
-        m = np.arange(len(green.rings))[:, None]
+        axes = np.array([[sine, 0.0, cosine], [cosine, 0.0, -sine], [0.0, 1.0, 0.0]])
+        self.axes = axes = axes if sticking else axes[:1]
+        m = np.arange(len(green.rings))[:, None, None]
         rings, reach = [], []
-        self.parts = []  # of each ring: slice of cells, loads (3, M, n), shares (M, 1)
+        self.parts = []  # of each ring: slice of forces, loads (3, M, n), shares (M, 1)
         count = 0
         for ring, (cells, (r, z)) in enumerate(zip(green.cells, green.place, strict=True)):
             phi = 2 * np.pi * (np.arange(cells // 2) + 0.5) / cells
             height = r * np.cos(phi) * sine + z * cosine
             near = height > 1 - d_max - BEYOND
-            phi, half = phi[near], cells // 2
-            # n in cylindrical components, and its harmonics up to what the ring's cells resolve.
-            load = np.array(
-                [
-                    sine * np.cos(phi) * np.cos(m * phi),
-                    -sine * np.sin(phi) * np.sin(m * phi),
-                    cosine * np.cos(m * phi),
-                ]
-            )
+            phi, half = phi[near, None], cells // 2
+            # The axes in cylindrical components, and harmonics up to what the ring's cells resolve.
+            x, y, upright = axes.T
+            load = np.stack(
+                np.broadcast_arrays(
+                    (x * np.cos(phi) + y * np.sin(phi)) * np.cos(m * phi),
+                    (y * np.cos(phi) - x * np.sin(phi)) * np.sin(m * phi),
+                    upright * np.cos(m * phi),
+                )
+            ).reshape(3, len(m), -1)
             share = np.where((m == 0) | (m == half), 1.0, 2.0) * (m <= half) / (2 * np.pi)
-            where = slice(count, count + phi.size)
-            self.parts.append((where, load / green.weight[ring], share))
+            where = slice(count, count + load.shape[2])
+            self.parts.append((where, load / green.weight[ring], share[:, 0]))
             rings.append(np.full(phi.size, ring))
             reach.append(height[near])
-            count += phi.size
+            count += load.shape[2]
         self.ring, self.reach = np.concatenate(rings), np.concatenate(reach)
         self.compliance = np.zeros((count, count))
         used = np.unique(self.ring)
@@ -71,31 +76,37 @@ class TiltedPlane:
                 block = np.tensordot(left[:, :top], moved, axes=([0, 1], [0, 1]))
                 self.compliance[at_i, at_j] = block
                 self.compliance[at_j, at_i] = block.T
-        self.push = np.zeros(count)
+        self.touching = np.zeros(self.reach.size, dtype=np.bool_)
+        self.moved = np.zeros(count)
 
     def press(self, d: float) -> Press:
         """Solve at depth ``d``, beginning with the cells that touched at the last press.
 
-        Raises RuntimeError where the active sets do not settle.
+        Sticking depends on the way: press deeper in small steps. Raises RuntimeError where the
+        active sets do not settle.
         """
-        overlap = self.reach - (1 - d)
-        touching = self.push > 0 if self.push.any() else overlap > 0.4 * d
+        overlap, step = self.reach - (1 - d), len(self.axes)
+        touching = self.touching if self.touching.any() else overlap > 0.4 * d
+        wanted = self.moved.copy()
+        wanted[::step] = overlap
         for _ in range(60):
-            held = np.ix_(touching, touching)
-            factors = cho_factor(self.compliance[held], check_finite=False)
-            push = np.zeros_like(overlap)
-            push[touching] = cho_solve(factors, overlap[touching], check_finite=False)
-            now = np.where(touching, push > 0, self.compliance @ push < overlap)
+            active = np.repeat(touching, step)
+            factors = cho_factor(self.compliance[np.ix_(active, active)], check_finite=False)
+            force = np.zeros_like(wanted)
+            force[active] = cho_solve(factors, wanted[active], check_finite=False)
+            moved = self.compliance @ force
+            now = np.where(touching, force[::step] > 0, moved[::step] < overlap)
             if (now == touching).all():
                 break
             touching = now
         else:
             raise RuntimeError(f"no contact found at d = {d} a, θ = {self.theta} rad")
-        self.push = push
+        self.touching, self.moved = touching, moved
         base = np.zeros(self.green.base.shape[:2])
         for ring in np.unique(self.ring):
             where, load, share = self.parts[ring]
-            each = (load @ push[where] * share[:, 0])[:, : len(base)]
+            each = (load @ force[where] * share[:, 0])[:, : len(base)]
             base -= np.einsum("mba,am->mb", self.green.base[..., ring], each)
-        energy = float(push @ overlap / 2)
-        return Press(d, self.theta, float(push.sum()), energy, base)
+        push, energy = float(force[::step].sum()), float(force @ moved / 2)
+        shear = float(force[1::step].sum()) if step > 1 else 0.0
+        return Press(d, self.theta, push, energy, base, shear)
