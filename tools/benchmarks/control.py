@@ -62,19 +62,26 @@ CASES: dict[str, tuple[Sections, bool, dict[str, Any]]] = {
         {"law": "position", "force_bandwidth": 0.0, "rotate_bandwidth": 0.0},
     ),
 }
-# How an object that was put askew may come upright: settings of `control`, whether it is then
-# turned to 0 by its measured angle, settings of `simulation`, aim for what is left [°].
-_ALONE = {"force_bandwidth": 0.0, "rotate_bandwidth": 0.0}
-_RELAXING = {"tip_creep_time": 20.0, "tip_micro_slip": True}
-WAYS: dict[str, tuple[dict[str, Any], bool, dict[str, Any], float | None]] = {
-    "equal torques (blind)": ({"law": "blind"}, False, {}, None),
-    "equal torques, tips that relax": ({"law": "blind"}, False, _RELAXING, None),
-    "position alone": ({"law": "position", **_ALONE}, False, {}, None),
-    "two_phase": ({"law": "two_phase"}, False, {}, None),
-    "energy": ({"law": "energy"}, False, {}, None),
-    "energy, steered to 0": ({"law": "energy"}, True, {}, 0.2),
-    "upright (blind)": ({"law": "upright"}, False, {}, 0.5),
-    "upright, tips that relax": ({"law": "upright"}, False, _RELAXING, 0.5),
+# How an object that was put askew may come upright: settings, whether it is then turned to 0 by its
+# measured angle, and the aim for what is left [°].
+_ALONE = {"law": "position", "force_bandwidth": 0.0, "rotate_bandwidth": 0.0}
+_RELAXING: Sections = {"simulation": {"tip_creep_time": 20.0, "tip_micro_slip": True}}
+_SOLID: Sections = {
+    "tip": {"physics": "solid"},
+    "material": {"law": "constant", "modulus": 0.15e6},
+    "estimator": {"free_gain": False},
+}
+WAYS: dict[str, tuple[Sections, bool, float | None]] = {
+    "equal torques (blind)": ({"control": {"law": "blind"}}, False, None),
+    "equal torques, tips that relax": ({"control": {"law": "blind"}, **_RELAXING}, False, None),
+    "equal torques, solid tips": ({"control": {"law": "blind"}, **_SOLID}, False, None),
+    "position alone": ({"control": _ALONE}, False, None),
+    "two_phase": ({"control": {"law": "two_phase"}}, False, None),
+    "energy": ({"control": {"law": "energy"}}, False, None),
+    "energy, steered to 0": ({"control": {"law": "energy"}}, True, 0.2),
+    "upright (blind)": ({"control": {"law": "upright"}}, False, 0.5),
+    "upright, tips that relax": ({"control": {"law": "upright"}, **_RELAXING}, False, 0.5),
+    "upright, solid tips": ({"control": {"law": "upright"}, **_SOLID}, False, 0.5),
 }
 # What is judged of each: unit and aim.
 FIGURES = {
@@ -185,10 +192,10 @@ def _upright(draws: int) -> Report:
         for k in range(draws)
     ]
     rows = []
-    for name, (control, steered, simulation, aim) in WAYS.items():
+    for name, (sections, steered, aim) in WAYS.items():
         left = []
         for draw in drawn:
-            with Watched({"control": control, "simulation": draw | simulation}) as hand:
+            with Watched(_with(sections, **draw)) as hand:
                 hand.grasp(_FORCE)
                 hand.run(_FOUND - 2.0 if steered else _FOUND)
                 if steered:
