@@ -10,7 +10,6 @@ _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
     "view": ("the viewer needs rerun-sdk", ("rerun", "rerun_cli")),
-    "fem": ("finite elements need scipy", ("scipy",)),
     "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
 }
 

@@ -181,7 +181,7 @@ def main() -> None:
     """Compute every point and write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--scale", type=float, default=1.0, help="of the elements' size")
+    parser.add_argument("--scale", type=float, default=1.25, help="of the elements' size")
     parser.add_argument("--base", choices=[*POINTS], action="append")
     arguments = parser.parse_args()
     mesh = quarter_ball(arguments.scale)

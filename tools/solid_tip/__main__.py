@@ -1,4 +1,4 @@
-"""``python -m softfinger.tools.solid_tip``: compute the solid tip's data file anew."""
+"""``python -m softfinger.tools.solid_tip``: compute the solid tip's data anew (extra ``fem``)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.tools.extras import require
 from softfinger.tools.solid_tip import fit
 from softfinger.tools.solid_tip.contact import TiltedPlane
 from softfinger.tools.solid_tip.evaluate import SolidTip, rms_difference
@@ -96,7 +95,6 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="where presses are kept")
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
-    require("fem")
     arguments.folder.mkdir(parents=True, exist_ok=True)
     nodes = fit.chebyshev_nodes(*fit.NU, arguments.nodes)
     work = [
