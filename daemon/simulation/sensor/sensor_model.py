@@ -1,6 +1,6 @@
 """The simulated pressure sensor: from a contact to the counts that a board would send.
 
-Delay and lost frames are in arrivals.py.
+Delay and lost frames are in `simulated_tactile`.
 """
 
 from __future__ import annotations
