@@ -29,6 +29,7 @@ SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
     "doctor": ("setup", "check ports, servos, boards and this machine, and say what mends them"),
     "scan": ("setup", "find the servos on a port, at any rate"),
     "calibrate": ("calibration", "calibrate the pressure sensor under a tip, step by step"),
+    "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
     "limits": ("setup", "list every limit: condition, consequence, setting"),
     "compile": ("processes", "compile a hand's kernels ahead of its first start"),
     "keys": ("setup", "make the keys that addresses outside this machine need"),

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+from softfinger.daemon.control.envelope import Envelope
 from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Refused, ServoError, TactileError
@@ -127,6 +128,7 @@ class Requests:
             "status": lambda: None,
         }
         self._lease = Lease(settings.commands.lease)
+        self._envelope = Envelope(settings)
 
     def carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
         """Do what is asked at the present tick; the reply. Raises Refused with the reason."""
@@ -145,6 +147,9 @@ class Requests:
         reply: dict[str, Any] = {"mode": control.mode.value}
         if queued:
             reply |= {"queued": name, "until": Mode.HOLDING.value}
+        elif name == "grasp" and (warning := self._envelope.warning(numbers["force"])):
+            reply["warning"] = warning
+            self._emit("warning", "grasp", warning)
         elif name in ("stop", "disarm"):
             reply["torque_off"] = "confirmed" if self._torque.off() else "unconfirmed"
         elif name == "status":

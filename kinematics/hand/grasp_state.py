@@ -49,7 +49,9 @@ def held_motion(
     as tips roll and come nearer to each other. Between parallel faces arm [m] is the lever of the
     normal force about the pivot, and in the symmetric grasp turn1 + turn2 is
     2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m],
-    ``width`` the distance of the contacts along n, W cos(α/2).
+    ``width`` the distance of the contacts along n, W cos(α/2). A W under half a tip's radius is
+    taken for that in turn_i: so thin an object is slower than rolling says, by its inertia and the
+    tips' shear, and a prediction that takes it at its word runs away.
     """
     q1, q2 = q
     d1, d2 = d
@@ -63,7 +65,7 @@ def held_motion(
     vx1, vy1 = tip_velocity(q1, 1.0, length, offset)
     vx2, vy2 = tip_velocity(q2, -1.0, length, offset)
     across = d1 + d2 - 2.0 * radius + longer * ((x2 - x1) * nx + (y2 - y1) * ny)
-    bounded = max(across, 0.1 * radius)
+    bounded = max(across, 0.5 * radius)
     return (
         longer * (vx1 * nx + vy1 * ny) - lean * (radius - d1),
         -longer * (vx2 * nx + vy2 * ny) - lean * (radius - d2),

@@ -1,1 +1,1 @@
-"""What is done before a hand runs: `doctor`, `scan`, `keys`, `limits`, `install-service`."""
+"""Before a hand runs: `doctor`, `scan`, `keys`, `limits`, `envelope`, `install-service`."""

@@ -1,0 +1,64 @@
+"""What the hand holds: tried on virtual time, kept as a map, and asked by `grasp`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.control.envelope import Envelope
+from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.benchmarks.framework.watched import Watched
+from softfinger.tools.cli import main
+
+
+def settings(width: float = 0.040, **control: Any) -> Settings:
+    """The built-in hand with an object of that width [m]."""
+    return Settings.model_validate({"object": {"width": width}, "control": control})
+
+
+def test_what_it_is_asked_for_as_it_comes_is_inside_the_packaged_map() -> None:
+    for width in (0.020, 0.040, 0.060, 0.090):
+        assert Envelope(settings(width)).warning(10.0) == ""
+
+
+def test_outside_of_it_the_reply_says_what_and_why() -> None:
+    text = Envelope(settings(0.002)).warning(10.0)
+    assert "2 mm (object.width) at friction 0.6 (control.tip_friction) and 0 kg" in text
+    assert "no grip comes about" in text
+    # 1 kg at a friction of 0.2 with 10 N, or half of it with 5 N.
+    for load, force in ((9.5, 10.0), (4.5, 5.0)):
+        found = Envelope(settings(0.040, tip_friction=0.25, object_load=load)).warning(force)
+        assert "slips out" in found
+    # Another hand, and another law: nothing is known.
+    assert Envelope(settings(0.002, law="position")).warning(10.0) == ""
+    other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
+    assert Envelope(other).warning(10.0) == ""
+
+
+def test_a_grasp_outside_is_warned_of_in_its_reply() -> None:
+    for width, warned in ((0.002, True), (0.040, False)):
+        with Watched({"object": {"width": width, "width_min": 0.0005}}) as hand:
+            loop = hand._daemon.loop
+            loop.advance(0.3)
+            loop.command({"command": "arm"})
+            loop.advance(0.2)
+            reply = loop.command({"command": "grasp", "force": 10.0})
+            assert reply["mode"] == "grasping"
+            assert ("warning" in reply) == warned
+
+
+def test_a_map_is_found_printed_drawn_and_read_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept, picture = tmp_path / "map.toml", tmp_path / "map.png"
+    words = ["envelope", "--shape", "rectangle", "--size", "2", "40", "--mass", "1"]
+    words += ["--friction", "0.2", "0.6"]
+    assert main([*words, "--keep", str(kept), "--plot", str(picture)]) == 0
+    rows = [line.split()[-2:] for line in capsys.readouterr().out.splitlines()[3:]]
+    assert rows == [["r", "l"], ["r", "h"]]
+    assert picture.stat().st_size > 1000
+    assert "no grip" in Envelope(settings(0.002), kept).warning(10.0)
+    assert "slips out" in Envelope(settings(0.04, tip_friction=0.2), kept).warning(10.0)
+    assert Envelope(settings(0.04), kept).warning(10.0) == ""

@@ -1,0 +1,203 @@
+"""``softfinger envelope``: what a hand holds: shapes, sizes, frictions, masses on virtual time."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from softfinger.daemon.control.envelope import HELD, LOST, MEANING, REFUSED, TURNED, identity
+from softfinger.daemon.own_files import write_text
+from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.arguments import add_profile, profile
+from softfinger.tools.extras import require
+
+SHAPES = ("rectangle", "disc")
+SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm: width or diameter
+FRICTIONS = (0.2, 0.4, 0.6, 0.8)
+MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
+_SETTLE = 3.0  # s for the grip to come about
+_LIFT = 1.0  # s in which the weight comes on
+_AFTER = 1.0  # s that it then is watched
+_STEPS = 20  # of the weight
+_TURNED = math.radians(5.0)
+_AWAY = 0.010  # m along the faces: lost
+_GRAVITY = 9.81  # m/s²
+_COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
+
+
+class Cell(NamedTuple):
+    """What came of one grasp."""
+
+    outcome: str  # a key of MEANING
+    turned: float  # by the object, at most [rad]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of ``envelope``."""
+    add_profile(parser)
+    parser.add_argument("--force", type=float, default=10.0, metavar="N", help="grip (default: 10)")
+    parser.add_argument("--shape", choices=SHAPES, action="append", help="of these only")
+    parser.add_argument("--size", type=float, nargs="+", metavar="MM", help="of these only")
+    parser.add_argument("--friction", type=float, nargs="+", metavar="F", help="of these only")
+    parser.add_argument("--mass", type=float, nargs="+", metavar="KG", help="of these only")
+    parser.add_argument(
+        "--keep", type=Path, metavar="FILE", help="write the map, as grasp reads it"
+    )
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it (extra 'plot')")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Try each, print the map, and write what was asked for.
+
+    Raises SettingsError, OSError, and MissingExtra without matplotlib.
+    """
+    settings = profile(arguments)
+    if arguments.plot:
+        require("plot")
+    shapes = tuple(arguments.shape or SHAPES)
+    axes = (
+        tuple(arguments.friction or FRICTIONS),
+        tuple(arguments.mass or MASSES),
+        tuple(arguments.size or SIZES),
+    )
+    print(f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in MEANING.items()))
+    found: dict[str, list[list[Cell]]] = {}
+    for shape in shapes:
+        print(f"\n{shape}, width [mm]:".ljust(28) + "".join(f"{each:>5g}" for each in axes[2]))
+        found[shape] = []
+        for friction, mass, row in _rows(settings, shape, axes, arguments.force):
+            found[shape].append(row)
+            cells = "".join(f"{cell.outcome:>5}" for cell in row)
+            print(f"friction {friction:g}, {mass:g} kg".ljust(27) + cells, flush=True)
+    if arguments.keep:
+        _keep(arguments.keep, settings, arguments.force, axes, found)
+    if arguments.plot:
+        _draw(arguments.plot, arguments.force, axes, found)
+    return 0
+
+
+def _rows(
+    settings: Settings, shape: str, axes: tuple[tuple[float, ...], ...], force: float
+) -> Iterator[tuple[float, float, list[Cell]]]:
+    frictions, masses, sizes = axes
+    for friction in frictions:
+        for mass in masses:
+            yield (
+                friction,
+                mass,
+                [grasped(settings, shape, 1e-3 * size, friction, mass, force) for size in sizes],
+            )
+
+
+def grasped(
+    settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
+) -> Cell:
+    """Grasp an object on the table, then let its weight [kg] pull it out of the fingers.
+
+    The settings say what it is: its width or diameter ``size`` [m], friction and weight. Not its
+    shape: to the daemon all are blocks.
+    """
+    from softfinger.tools.benchmarks.framework.watched import Watched
+
+    weight = mass * _GRAVITY
+    told: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
+    changes: dict[str, dict[str, Any]] = {
+        "simulation": {
+            "object_shape": shape,
+            "object_width": size,
+            "object_radius": 0.5 * size,
+            "object_mass": mass,
+            "tip_friction": friction,
+        },
+        "object": {"width": size, "width_min": min(settings.object.width_min, 0.25 * size)},
+        "control": {"tip_friction": friction, "object_load": weight},
+    }
+    for name, values in changes.items():
+        told[name] = told.get(name, {}) | values
+    with Watched(told) as hand:
+        hand.grasp(force)
+        angle = float(hand.plant.object_pose[2])
+        hand.run(_SETTLE)
+        if hand.mode != "holding":
+            return Cell(REFUSED, math.nan)
+        before = hand.plant.object_pose.copy()
+        pull = weight * (1.0 + settings.simulation.table_friction)  # which the table would hold
+        for k in range(_STEPS):
+            load, phi = pull * (k + 1) / _STEPS, float(hand.plant.object_pose[2])
+            hand.plant.push(-load * math.sin(phi), load * math.cos(phi))
+            hand.run(_LIFT / _STEPS)
+        hand.run(_AFTER)
+        moved = math.dist(hand.plant.object_pose[:2], before[:2])
+        if hand.mode != "holding" or moved > _AWAY:
+            return Cell(LOST, math.nan)
+        turned = abs(float(hand.plant.object_pose[2]) - angle)
+        return Cell(TURNED if turned > _TURNED else HELD, turned)
+
+
+def _keep(
+    path: Path,
+    settings: Settings,
+    force: float,
+    axes: tuple[tuple[float, ...], ...],
+    found: dict[str, list[list[Cell]]],
+) -> None:
+    frictions, masses, sizes = axes
+    lines = [
+        "# What the hand holds, by `softfinger envelope --keep`; a row for each friction and mass,",
+        "# a letter for each size: " + ", ".join(f"{k} {text}" for k, text in MEANING.items()),
+        f"force = {force!r}",
+        f"friction = {json.dumps([float(each) for each in frictions])}",
+        f"mass = {json.dumps([float(each) for each in masses])}",
+        f"size = {json.dumps([round(1e-3 * each, 6) for each in sizes])}",
+        f"shapes = {json.dumps(list(found))}",
+    ]
+    for shape, rows in found.items():
+        texts = ",\n".join(f'    "{"".join(cell.outcome for cell in row)}"' for row in rows)
+        lines.append(f"{shape} = [\n{texts},\n]")
+    for name, section in identity(settings).items():
+        if name == "law":
+            lines.insert(2, f"identity.law = {json.dumps(section)}")
+        else:
+            lines += [f"[identity.{name}]"]
+            lines += [f"{key} = {json.dumps(value)}" for key, value in section.items()]
+    with write_text(path) as file:
+        file.write("\n".join(lines) + "\n")
+
+
+def _draw(
+    path: Path,
+    force: float,
+    axes: tuple[tuple[float, ...], ...],
+    found: dict[str, list[list[Cell]]],
+) -> None:
+    import numpy as np
+
+    from softfinger.tools import style
+
+    frictions, masses, sizes = axes
+    with style.settings():
+        figure = style.new_figure(1.0 + 0.28 * len(sizes) * len(found), 1.2 + 1.2 * len(frictions))
+        figure.suptitle(f"What the hand holds with {force:g} N", fontsize=10)
+        grid = figure.subplots(len(frictions), len(found), squeeze=False, sharex=True, sharey=True)
+        for (k, i), axes_ in np.ndenumerate(grid):
+            shape = list(found)[i]
+            axes_.set_title(f"{shape}, friction {frictions[k]:g}", loc="left")
+            axes_.grid(visible=False)
+            for j in range(len(masses)):
+                for x, cell in enumerate(found[shape][k * len(masses) + j]):
+                    axes_.barh(j, 0.94, 0.92, x - 0.47, color=_COLOURS[cell.outcome])
+                    if cell.turned > _TURNED:
+                        text = f"{math.degrees(cell.turned):.0f}°"
+                        axes_.text(x, j, text, ha="center", va="center", fontsize=6)
+            axes_.set(yticks=range(len(masses)), yticklabels=[f"{each:g} kg" for each in masses])
+            axes_.set(xticks=range(len(sizes)), xticklabels=[f"{each:g}" for each in sizes])
+            if k == len(frictions) - 1:
+                axes_.set_xlabel("width or diameter [mm]")
+        for outcome, colour in _COLOURS.items():
+            grid[0, 0].barh([0], [0], color=colour, label=MEANING[outcome])
+        figure.legend(loc="outside lower center", ncols=2)
+        style.save(figure, path)
