@@ -164,6 +164,7 @@ def _judge_moments(
     _explain(state, energy)
     wider = variance / signal.variance
     if state.budget.correlated:
+        # Moments weigh the large scales alone, as all of a deep footprint's patterns do.
         wider *= math.sqrt(state.budget.inflation[-1, 1, 1] * state.budget.inflation[-1, 2, 2])
     for i in range(4):
         for j in range(4):

@@ -12,7 +12,7 @@ from softfinger.tools.extras import MissingExtra, require
 STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law")
 _EPILOG = """\
 steps, in this order; each is written into FILE, which keeps the others:
-  tare         unloaded: the zero of each cell
+  tare         unloaded: the zero of each cell; its noise, how that correlates, and drift
   equilibrate  several uniform pressures: the gain of each cell, and dead cells
   curve        known weights upright on the tip (--force), or a run of known displacement (--d)
   centre       presses upright or of known tilt (--theta): the tip's place and rotation
