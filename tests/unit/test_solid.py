@@ -119,6 +119,35 @@ def test_the_estimate_is_at_its_bound_whatever_the_shear(tip: Fingertip, counts:
     assert 0.7 < np.mean(squares) < 1.4
 
 
+def test_frames_of_other_elements_are_estimated_as_what_they_are() -> None:
+    rng = np.random.default_rng(6)
+    with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
+        known = {name: file[name] for name in file.files}
+    modulus, squares = 0.304e6, []
+    for k, base in enumerate(known["base"]):
+        tip = Fingertip(0.020, "solid", float(known["nu"][k]), str(base))  # type: ignore[arg-type]
+        table = ContactTable.build(tip, RUBBER)
+        estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
+        d, theta = known["d"][k] * tip.radius, float(known["theta"][k])
+        force = known["force"][k] * modulus * tip.radius**2
+        frame = np.maximum(known["frame"][k] * modulus, 0.0)
+        for _ in range(4):
+            found = estimator(frame + NOISE * rng.standard_normal(GRID.shape))
+            assert found.contact
+            assert found.valid
+            error = [found.d - d, found.tilt_x - theta, found.tilt_y]
+            squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
+            # Within the aims, or within the noise where that hides them: at 0.5 and 1 mm.
+            turned = math.radians(1.5) + 3.0 * found.tilt_x_std
+            assert found.d == pytest.approx(d, rel=0.05, abs=3.0 * found.d_std)
+            assert math.hypot(*error[1:]) < turned
+            tilt = math.asin(math.hypot(math.sin(found.tilt_x), math.sin(found.tilt_y)))
+            assert float(table(found.d, tilt).force) == pytest.approx(
+                force, rel=0.03 if d > 0.9e-3 else 0.12
+            )
+    assert np.mean(squares) < 1.6
+
+
 def test_noise_and_shifted_zeros_are_no_contact() -> None:
     rng = np.random.default_rng(4)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
