@@ -28,8 +28,8 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 
 # The same examples on every machine, however slow; --hypothesis-profile=search looks for others.
-hypothesis.settings.register_profile("same", deadline=None, derandomize=True)
-hypothesis.settings.register_profile("search", deadline=None)
+hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
 
 pytest_plugins = ["pytester"]  # for the test of this file
@@ -59,12 +59,13 @@ def pytest_unconfigure() -> None:
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """Ends the processes that a test started and left, and gives Ctrl-C back to pytest."""
+    """Ends the processes that a test started and left; gives pytest Ctrl-C and collector back."""
     before = descendants.running()
     handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield
     for each, handler in handlers.items():
         signal.signal(each, handler)
+    gc.enable()  # which a daemon's command in this process has switched off
     descendants.end(descendants.running() - before)
 
 
@@ -149,7 +150,7 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     return run
 
 
-def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
     """Call ``condition`` until it holds; the time allowed only bounds a hang."""
     deadline = time.monotonic() + seconds
     while not condition():

@@ -16,6 +16,7 @@ from typing import Any
 
 import pyte
 
+_CAPACITY = 1 << 16  # bytes that wait on a terminal at most
 ENVIRONMENT = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8"}
 
 
@@ -47,9 +48,13 @@ class TerminalProcess:
             self.screen.reset()
 
     def pump(self, seconds: float = 0.02) -> None:
-        """Take what it writes within ``seconds``; returns at the first quiet moment."""
-        while select.select([self.master], [], [], seconds)[0]:
-            data = os.read(self.master, 65536)
+        """Take what it has written, and what it writes within ``seconds`` where that is nothing.
+
+        No more than a terminal holds: a page may be written faster than it is followed here.
+        """
+        end = len(self.written) + _CAPACITY
+        while len(self.written) < end and select.select([self.master], [], [], seconds)[0]:
+            data = os.read(self.master, _CAPACITY)
             self.written += data
             self._stream.feed(data)
             seconds = 0.0
@@ -57,7 +62,7 @@ class TerminalProcess:
     def text(self) -> str:
         return "\n".join(self.screen.display)
 
-    def wait(self, condition: Callable[[], Any], seconds: float = 60.0) -> None:
+    def wait(self, condition: Callable[[], Any], seconds: float = 150.0) -> None:
         """Follow the page until ``condition`` holds; fail with the page when it doesn't."""
         deadline = time.monotonic() + seconds
         while not condition():
@@ -65,8 +70,12 @@ class TerminalProcess:
             if time.monotonic() > deadline:
                 raise AssertionError(f"not within {seconds:g} s; the page:\n{self.text()}")
 
-    def shows(self, *texts: str, seconds: float = 60.0) -> None:
-        self.wait(lambda: all(text in self.text() for text in texts), seconds)
+    def shows(self, *texts: str, seconds: float = 150.0) -> None:
+        def shown() -> bool:
+            page = self.text()
+            return all(text in page for text in texts)
+
+        self.wait(shown, seconds)
 
     def type(self, keys: bytes) -> None:
         os.write(self.master, keys)

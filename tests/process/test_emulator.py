@@ -17,6 +17,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator import emulator as module
 from softfinger.daemon.simulation.emulator.emulator import (
     DEFAULT_BOARD,
+    EmulatedServos,
     Emulator,
     EmulatorClock,
     EmulatorError,
@@ -25,9 +26,9 @@ from softfinger.daemon.simulation.emulator.emulator import (
 from softfinger.daemon.simulation.emulator.link_folder import LINKS, FolderError, LinkFolder
 from softfinger.tools.cli import main
 from tests.conftest import until
-from tests.harness.emulated import HIL, READY_WITHIN, SdkServos, board
+from tests.harness.emulated import HIL, READY_WITHIN, SdkServos, board, emulated
 
-OPERATING_MODE, TORQUE_ENABLE = 11, 64
+RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE = 9, 11, 64
 GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
 
 
@@ -149,25 +150,15 @@ def test_clients_may_come_and_go(hand):
         sensor.close()
 
 
-def test_a_folder_in_use_is_refused_and_the_first_lives_on(hand, servos):
-    with Process("--dir", hand) as second:
-        out, err = second.popen.communicate(timeout=READY_WITHIN)
-        assert second.popen.returncode == 1
-    assert out == ""
+def test_a_folder_in_use_is_refused_and_the_first_lives_on(hand, servos, inline):
+    status, out, err = inline("emulate", "--dir", hand)
+    assert (status, out) == (1, "")
     assert "in use by another emulator (process " in err
     assert len(err.splitlines()) == 1
     assert servos.ping(1) == 1020
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_cleanly(tmp_path, number):
-    with Process("--dir", tmp_path / "new", "--config", HIL) as process:
-        process.ready()
-        assert process.end(number) == (0, "", "")
-    assert list((tmp_path / "new").iterdir()) == []
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_it_cleanly_while_it_starts(tmp_path, number):
     with Process("--dir", tmp_path / "new", "--config", HIL) as process:
         # The folder is taken as the first thing, long before anything answers.
@@ -177,13 +168,16 @@ def test_a_signal_ends_it_cleanly_while_it_starts(tmp_path, number):
 
 
 def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived(tmp_path):
-    options = ("--model", "XL330-M288", "--ids", "7,3")
-    with Process("--dir", tmp_path, *options) as process:
+    with Process("--dir", tmp_path, "--model", "XL330-M288", "--factory") as process:
         process.ready()
+        servos = SdkServos(tmp_path)
+        assert servos.read(1, OPERATING_MODE, 1) == 3
+        assert servos.read(2, RETURN_DELAY, 1) == 250
+        servos.close()
         process.popen.kill()
         process.popen.wait()
     assert all((tmp_path / name).is_symlink() for name in LINKS)
-    with Process("--dir", tmp_path, *options) as process:
+    with Process("--dir", tmp_path, "--model", "XL330-M288", "--ids", "7,3") as process:
         process.ready()
         servos = SdkServos(tmp_path)
         assert (servos.ping(7), servos.ping(3)) == (1200, 1200)
@@ -193,12 +187,12 @@ def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived
         process.popen.send_signal(signal.SIGCONT)
         assert servos.ping(7) == 1200  # the answer to the one or to the other
         servos.close()
-        process.end()
+        assert process.end(signal.SIGHUP) == (0, "", "")
+    assert not any(path.is_symlink() for path in tmp_path.iterdir())
 
 
 def test_paced_servos_wait_for_the_latency_timer_and_are_deaf_at_another_rate(tmp_path):
-    with Process("--dir", tmp_path, "--baud", "1000000", "--latency", "8") as process:
-        process.ready()
+    with emulated(tmp_path, servos=EmulatedServos(1_000_000, 0.008)):
         servos = SdkServos(tmp_path, 1_000_000)
         assert servos.ping(1) == 1020
         start = time.monotonic()
@@ -211,7 +205,6 @@ def test_paced_servos_wait_for_the_latency_timer_and_are_deaf_at_another_rate(tm
             servos = SdkServos(tmp_path, baud)
             assert servos.silent(1)
             servos.close()
-        process.end()
 
 
 def test_something_else_in_a_links_place_is_left_alone(tmp_path):
@@ -301,15 +294,6 @@ def test_something_else_in_the_control_sockets_place_is_left_alone(tmp_path):
         Emulator(Settings(), tmp_path)
     assert (tmp_path / "control").read_text() == "mine"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["control"]
-
-
-def test_factory_new_servos(tmp_path):
-    with Process("--dir", tmp_path, "--factory", "--model", "XL330-M288").ready() as process:
-        servos = SdkServos(tmp_path)
-        assert servos.read(1, OPERATING_MODE, 1) == 3
-        assert servos.read(2, 9, 1) == 250
-        servos.close()
-        assert process.end() == (0, "", "")
 
 
 def test_an_adapters_latency_timer_has_its_range(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import select
@@ -44,14 +45,13 @@ class Board:
         """Send the frames of images 0, 1, … until closed."""
 
         def run() -> None:
-            k = 0
+            k, rest = 0, b""
             os.set_blocking(self.master, False)
             while not self._stop.wait(period):
-                try:
-                    os.write(self.master, images(k))
-                except OSError:
-                    continue
-                k += 1
+                rest = rest or images(k)
+                with contextlib.suppress(OSError):  # full: nobody reads for the moment
+                    rest = rest[os.write(self.master, rest) :]
+                    k += not rest
 
         self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()

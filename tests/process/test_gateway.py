@@ -31,7 +31,7 @@ from softfinger.daemon.wire.keys import make_keys
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running, softfinger
+from tests.harness.daemon_process import SOFTFINGER, Running, ask, insist, softfinger
 from tests.harness.terminal_process import TerminalProcess
 from tests.harness.zmtp_client import RawClient
 from tests.process.test_strangers import place
@@ -82,7 +82,7 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
 ) -> None:
     gateway, loop = gateway_of(ticking), ticking.loop
     with Hand(*addresses, timeout=60.0) as hand:
-        hand.arm()
+        insist(hand.arm)
         stream = hand.stream(timeout=60.0)
         next(stream)
         first, ticks = gateway.process, loop.state.seq
@@ -94,7 +94,7 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
         state = next(stream)
         assert state.mode == "armed"
         assert state.seq > ticks
-        assert hand.status()["torque"] is True
+        assert ask(addresses[1], "status")["torque"] is True
 
 
 def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events(
@@ -202,7 +202,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
     ticking: Daemon, addresses: tuple[str, str]
 ) -> None:
     with Hand(*addresses, timeout=60.0) as hand:
-        hand.arm()
+        insist(hand.arm)
         os.kill(gateway_of(ticking).process, signal.SIGSTOP)  # nobody is served
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
@@ -219,12 +219,12 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
             os.kill(gateway_of(ticking).process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque).mode == "disarmed"
         hand.stop()
-        hand.arm()  # what comes after its answer is heard
+        insist(hand.arm)  # what comes after its answer is heard
         hand.stop()
 
 
 def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
-    send(addresses[1], {"command": "arm"}, timeout=60.0)
+    assert ask(addresses[1], "arm")["ok"]
     os.kill(gateway_of(ticking).process, signal.SIGSTOP)
     try:
         done = softfinger("send", "stop", "--address", addresses[1])
@@ -240,7 +240,7 @@ def test_the_live_page_takes_that_way(ticking: Daemon, addresses: tuple[str, str
     where = ["--state", stream, "--commands", commands]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("DISARMED")
-        send(commands, {"command": "arm"}, timeout=60.0)
+        assert ask(commands, "arm")["ok"]
         page.shows("ARMED")
         os.kill(gateway_of(ticking).process, signal.SIGSTOP)
         try:

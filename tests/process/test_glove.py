@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.simulation.emulator.tactile_board import encode_glove, encoder_for
@@ -52,7 +52,6 @@ def test_the_usual_board_has_2050_bytes_a_frame():
     assert GloveDecoder().frame_bytes == len(encode_glove(counts(1, 32, 32))) == 2050
 
 
-@settings(max_examples=100)
 @given(
     seeds=st.lists(st.integers(0, 99), min_size=1, max_size=5),
     start=st.integers(0, 25),

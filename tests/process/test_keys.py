@@ -20,8 +20,8 @@ from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.daemon.gateway.endpoints import StartAnew
 from softfinger.daemon.gateway.keyed import Keys
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
-from tests.conftest import until
-from tests.harness.daemon_process import Running, insist, softfinger, until_it_says
+from tests.conftest import Inline, until
+from tests.harness.daemon_process import Running
 from tests.harness.gateway import Served
 
 
@@ -298,31 +298,6 @@ def test_who_stops_is_answered_while_others_stop_without_pause(
 # --- the daemon -------------------------------------------------------------------------------
 
 
-def test_a_running_daemon_with_keys(
-    start: Callable[..., Running],
-    profile: Callable[..., Path],
-    addresses: tuple[str, str],
-    folder: Path,
-) -> None:
-    """Tools with the key work, tools without get no answer; the monitor beside it is let in."""
-    path = profile(f'access.keys = "{folder}"\n')
-    running = start("--config", str(path))
-    words = ("status", "--address", addresses[1], "--keys", str(folder), "--timeout", "60")
-    told = softfinger("send", *words)
-    assert told.returncode == 0, told.stderr
-    with pytest.raises(NoAnswer):
-        send(addresses[1], {"command": "status"}, timeout=0.3)
-    # Who could end the daemon may stop it, too.
-    assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"]
-    with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
-        assert hand.state().mode == "disarmed"
-        insist(hand.arm)
-        assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
-    where = ("--state", addresses[0], "--commands", addresses[1])
-    until_it_says(("monitor", "--plain", "--keys", folder / "alice", *where), "armed")
-    assert running.end() == 0
-
-
 def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
     profile: Callable[..., Path],
     addresses: tuple[str, str],
@@ -362,9 +337,11 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
     assert running.end() == 0
 
 
-def test_the_command_makes_keys_and_refuses_to_make_them_again(tmp_path: Path) -> None:
-    words = ("keys", str(tmp_path / "keys"), "alice")
-    first, again = softfinger(*words), softfinger(*words)
+def test_the_command_makes_keys_and_refuses_to_make_them_again(
+    tmp_path: Path, inline: Inline
+) -> None:
+    words = ("keys", tmp_path / "keys", "alice")
+    first, again = inline(*words), inline(*words)
     assert first.returncode == 0
     assert first.stdout.split() == [
         str(tmp_path / "keys" / name) for name in ("server", "local", "alice")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,13 +15,21 @@ import pytest
 
 from softfinger.daemon.client import AsyncHand, Hand, NoStream
 from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import make_keys
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.replay import Wire
 from tests.conftest import own_addresses, until
-from tests.harness.daemon_process import SOFTFINGER, Running, insist, softfinger, until_it_says
-
-Profile = Callable[[str], Path]
+from tests.harness.daemon_process import (
+    SOFTFINGER,
+    Running,
+    ask,
+    insist,
+    softfinger,
+    until_it_says,
+)
+from tests.process.test_record import written
+from tests.unit.test_schema import sample
 
 
 class Guarded(NamedTuple):
@@ -28,6 +37,7 @@ class Guarded(NamedTuple):
 
     folder: Path
     addresses: tuple[str, str]
+    recording: Path  # of itself
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +50,9 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
         f'access.keys = "{place / "keys"}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n',
         encoding="utf-8",
     )
-    daemon = Running("--config", str(place / "profile.toml"))
-    yield Guarded(place / "keys", (stream, commands))
+    own = place / "own.mcap"
+    daemon = Running("--config", str(place / "profile.toml"), "--record", str(own))
+    yield Guarded(place / "keys", (stream, commands), own)
     try:
         assert daemon.end() == 0
     finally:
@@ -58,7 +69,7 @@ def record(path: Path, *words: str) -> None:
 
 
 def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Path) -> None:
-    folder, addresses = guarded
+    folder, addresses, _ = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
     path, shown = tmp_path / "a.mcap", tmp_path / "a.rrd"
@@ -70,7 +81,8 @@ def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Pa
     with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
         insist(hand.arm)
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
-        assert hand.status()["torque"] is True
+        told = softfinger("send", "status", "--address", commands, *alice, "--timeout", "60")
+        assert json.loads(told.stdout)["torque"] is True
     where = ("--state", stream, "--commands", commands)
     until_it_says(("monitor", "--plain", *where, *alice), " armed  left")
 
@@ -80,6 +92,8 @@ def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Pa
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"
+    # Who could end the daemon may stop it, too, without a key.
+    assert ask(commands, "stop")["ok"]
 
 
 def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
@@ -108,23 +122,18 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
     assert not path.exists()
 
 
-def test_a_daemon_with_keys_records_itself(
-    profile: Profile, guarded: Guarded, start: Callable[..., Running], tmp_path: Path
-) -> None:
-    path = tmp_path / "own.mcap"
-    config = profile(f'access.keys = "{guarded.folder}"\n')
-    daemon = start("--config", str(config), "--record", str(path), "--duration", "1")
-    assert daemon.process.wait(120) == 0
-    recording = Recording(path)
-    first = next(message for _, message in recording.messages([b"hand/input"]))
+def test_a_daemon_with_keys_records_itself(guarded: Guarded) -> None:
+    until(lambda: guarded.recording.stat().st_size > 3000)
+    first = next(message for _, message in Recording(guarded.recording).messages([b"hand/input"]))
     assert first["seq"] == 1
 
 
 def test_a_recording_is_replayed_to_holders_of_keys(
-    guarded: Guarded, addresses: tuple[str, str], tmp_path: Path
+    addresses: tuple[str, str], tmp_path: Path
 ) -> None:
-    path, folder = tmp_path / "run.mcap", guarded.folder
-    record(path, "--address", guarded.addresses[0], "--keys", str(folder))
+    path, folder = tmp_path / "run.mcap", tmp_path / "keys"
+    make_keys(folder, ["alice"])
+    written(path, 20)
     replay = subprocess.Popen(
         [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--keys", str(folder)],
         stdout=subprocess.PIPE,
@@ -133,7 +142,7 @@ def test_a_recording_is_replayed_to_holders_of_keys(
     )
     try:
         with Hand(*addresses, keys=folder / "alice") as hand, Hand(*addresses) as stranger:
-            assert hand.stream(60.0).next(60.0).mode == "disarmed"
+            assert hand.stream(60.0).next(60.0).mode == sample(schema.STATE)["mode"]
             with pytest.raises(NoStream):
                 stranger.state(0.3)
     finally:

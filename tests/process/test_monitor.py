@@ -17,7 +17,7 @@ import pytest
 
 from softfinger.daemon.client import Hand
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running
+from tests.harness.daemon_process import SOFTFINGER, Running, insist
 from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
@@ -36,7 +36,7 @@ def command(fake: FakeDaemon, *more: str) -> list[str]:
     return [*SOFTFINGER, "monitor", *where, *more]
 
 
-def test_page_shows_the_hand(fake: FakeDaemon) -> None:
+def test_page_shows_the_hand_and_whether_its_stream_is_there(fake: FakeDaemon) -> None:
     with TerminalProcess(command(fake)) as page:
         fake.send_event("mode", "before the page was there")
         page.shows("HOLDING", "● live", "LEFT contact", "RIGHT contact", "kPa", "▀" * 22)
@@ -48,9 +48,16 @@ def test_page_shows_the_hand(fake: FakeDaemon) -> None:
         assert len(bright) > 10  # the footprint is a hill of many colours
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
+        fake.silent.set()
+        page.shows("◐ stale")
+        page.shows("○ lost", "the stream has stopped")
+        fake.changes = {}
+        fake.silent.clear()
+        page.shows("● live", "HOLDING")
+        assert "has stopped" not in page.text()
 
 
-@pytest.mark.parametrize("how", ["q", "ctrl-c", "term", "hup", "exception", "duration"])
+@pytest.mark.parametrize("how", ["ctrl-c", "hup", "exception", "duration"])
 def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
     call = command(fake, *(["--duration", "1.2"] if how == "duration" else []))
     if how == "exception":
@@ -60,10 +67,10 @@ def test_terminal_is_left_as_it_was(fake: FakeDaemon, how: str) -> None:
             page.shows("HOLDING")
             assert termios.tcgetattr(page.slave) != page.attributes
             assert not page.is_restored()
-        if how in ("q", "ctrl-c"):
-            page.type(b"q" if how == "q" else b"\x03")
-        elif how in ("term", "hup"):
-            page.process.send_signal(signal.SIGTERM if how == "term" else signal.SIGHUP)
+        if how == "ctrl-c":
+            page.type(b"\x03")
+        elif how == "hup":
+            page.process.send_signal(signal.SIGHUP)
         assert page.ended() == (1 if how == "exception" else 0)
         assert page.is_restored()
         after = page.written[page.written.rfind(b"\x1b[?1049l") :]
@@ -74,14 +81,14 @@ BREAKS_AT_THE_TENTH_PAGE = """
 import argparse, sys
 from softfinger.tools.terminal import monitor
 from softfinger.tools.terminal import monitor_page
-whole, count = monitor_page.Page.lines, 0
+whole, count = monitor_page.MonitorPage.lines, 0
 def lines(*arguments):
     global count
     count += 1
     if count == 10:
         raise RuntimeError("the tenth page")
     return whole(*arguments)
-monitor_page.Page.lines = lines
+monitor_page.MonitorPage.lines = lines
 parser = argparse.ArgumentParser()
 monitor.add_arguments(parser)
 sys.exit(monitor.run(parser.parse_args()))
@@ -112,17 +119,6 @@ def test_suspended_and_continued(fake: FakeDaemon) -> None:
         page.type(b"q")
         assert page.ended() == 0
         assert page.is_restored()
-
-
-def test_stream_stale_lost_and_back(fake: FakeDaemon) -> None:
-    with TerminalProcess(command(fake)) as page:
-        page.shows("● live")
-        fake.silent.set()
-        page.shows("◐ stale")
-        page.shows("○ lost", "the stream has stopped")
-        fake.silent.clear()
-        page.shows("● live", "HOLDING")
-        assert "has stopped" not in page.text()
 
 
 def test_keys_command_the_hand(fake: FakeDaemon) -> None:
@@ -211,7 +207,7 @@ def test_beside_another_commander_of_a_real_daemon(
         page.shows("DISARMED", "running, disarmed")  # told before the page was there
         page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook") as hand:
-            hand.arm()
+            insist(hand.arm)
             page.shows("ARMED", "notebook commands the hand")
             page.type(b"g")
             page.shows("✗ grasp: notebook commands the hand (")
@@ -221,16 +217,9 @@ def test_beside_another_commander_of_a_real_daemon(
         page.shows("○ lost")
 
 
-def test_a_stop_that_the_servos_have_not_confirmed(fake: FakeDaemon) -> None:
-    fake.replies["stop"] = {"ok": True, "mode": "disarmed", "torque_off": "unconfirmed"}
-    with TerminalProcess(command(fake)) as page:
-        page.shows("HOLDING")
-        page.type(b" ")
-        page.shows("✗ stop: the servos have not confirmed torque off yet")
-
-
-def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:
+def test_a_refused_turn_does_not_count_nor_a_stop_that_is_not_confirmed(fake: FakeDaemon) -> None:
     fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
+    fake.replies["stop"] = {"ok": True, "mode": "disarmed", "torque_off": "unconfirmed"}
     with TerminalProcess(command(fake)) as page:
         page.shows("HOLDING")
         for n in (1, 2):
@@ -239,6 +228,8 @@ def test_refused_turn_does_not_count(fake: FakeDaemon) -> None:
             page.shows("✗ rotate: angle: too much")
         angles = [request["angle"] for request in fake.requests]
         assert angles == pytest.approx([-0.00035, -0.00035], abs=1e-4)
+        page.type(b" ")
+        page.shows("✗ stop: the servos have not confirmed torque off yet")
 
 
 def test_commands_without_a_daemon() -> None:
@@ -368,15 +359,13 @@ class Beside(TerminalProcess):
             return True
 
 
-def test_page_yields_to_the_daemon(fake: FakeDaemon, tmp_path: Path) -> None:
+def test_the_page_yields_to_the_daemon_and_quitting_it_ends_both(
+    fake: FakeDaemon, tmp_path: Path
+) -> None:
     with Beside(fake, tmp_path) as page:
         assert os.getpriority(os.PRIO_PROCESS, page.child) == min(
             os.getpriority(os.PRIO_PROCESS, page.process.pid) + 5, 19
         )
-
-
-def test_quitting_the_page_ends_the_daemon(fake: FakeDaemon, tmp_path: Path) -> None:
-    with Beside(fake, tmp_path) as page:
         page.type(b"\x1a")  # would stop the daemon with the hand stiff: it does nothing here
         page.type(b"q")
         assert page.ended() == 0

@@ -18,10 +18,9 @@ from softfinger.daemon.wire import schema
 from softfinger.tools import style
 from softfinger.tools.analysis import plot, plots_model
 from softfinger.tools.analysis.plots_data import MODES, Missing, RecordedRun, load_run
-from softfinger.tools.cli import main
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.writer import RecordingWriter
-from tests.harness.daemon_process import softfinger
+from tests.conftest import Inline
 from tests.harness.recorded_hand import record_hand
 
 DUE = {
@@ -48,9 +47,7 @@ def run(path: Path) -> RecordedRun:
 
 def drawn(run: RecordedRun, page: str) -> Figure:
     with style.settings():
-        figure = plot.pages()[page](run)
-        figure.draw_without_rendering()
-    return figure
+        return plot.pages()[page](run)
 
 
 def texts(figure: Figure) -> str:
@@ -70,18 +67,18 @@ Call = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
+def call(inline: Inline) -> Call:
     """``softfinger plot`` in this process: exit status and what it says on standard error."""
 
     def plotted(*words: object) -> tuple[int, str]:
-        status = main(["plot", *map(str, words)])
-        return status, capsys.readouterr().err
+        status, _, said = inline("plot", *words)
+        return status, said
 
     return plotted
 
 
-def test_command_line_writes_every_page_in_print_quality(path: Path) -> None:
-    done = softfinger("plot", str(path))
+def test_command_line_writes_every_page_in_print_quality(path: Path, inline: Inline) -> None:
+    done = inline("plot", path)
     assert (done.returncode, done.stderr) == (0, "")
     folder = path.with_name("run.mcap.plots")
     names = [f"{page}.png" for page in plot.PAGES]

@@ -137,6 +137,15 @@ def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
 
 
 def test_servos_stop_by_themselves_and_the_hand_works_again(rig: Rig) -> None:
+    # Boards of another size than the profile's are no start.
+    where = ("--config", str(rig.config), "--dir", str(rig.folder))
+    done = softfinger("run", *where, "--set", "tactile.rows=16")
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert "1024" in last
+    assert "16" in last
+    assert "Traceback" not in done.stderr
+
     # Killed: nothing is left that could say anything to the servos.
     daemon = rig.start()
     rig.at_work()
@@ -168,7 +177,15 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig: Rig) -> None:
     until(rig.cleared)
     send_words(rig.folder, "forget")
     rig.works()
-    assert daemon.end() == 0
+
+    # The other end of the line is gone for good.
+    assert rig.send("arm")["ok"]
+    rig.hand.kill()
+    until(lambda: rig.status()["mode"] == "fault")
+    assert rig.status()["fault_name"] == "servos.bus"
+    assert not rig.send("clear")["ok"]
+    assert daemon.end() == 1
+    assert "ended with a fault" in "".join(daemon.lines)
 
 
 def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig: Rig) -> None:

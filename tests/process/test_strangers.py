@@ -16,7 +16,7 @@ import zmq
 
 from softfinger.daemon.client import Hand
 from tests.conftest import own_addresses
-from tests.harness.daemon_process import Running
+from tests.harness.daemon_process import Running, ask, insist
 
 
 def old_frame(body: bytes, more: bool = False) -> bytes:
@@ -81,10 +81,10 @@ def test_a_web_page_commands_nothing(
 ) -> None:
     request = wrap(old_command("arm") + old_command("arm")[2:], daemon[1])
     with Hand(*daemon) as hand:
-        answer = said_to(request, daemon[1], lambda: [hand.status() for _ in range(20)])
+        answer = said_to(request, daemon[1], lambda: [ask(daemon[1], "status") for _ in range(20)])
         assert b"ok" not in answer
         assert hand.state().mode == "disarmed"
-        hand.arm()  # a client is still heard
+        insist(hand.arm)  # a client is still heard
         assert hand.wait_for(lambda state: state.torque).mode == "armed"
         hand.stop()
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger import Fingertip
@@ -78,7 +78,6 @@ def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, compl
 
 
 @given(radius=radii, modulus=moduli, part=fractions, share=shares)
-@settings(max_examples=150)
 def test_partials_are_the_derivatives(
     radius: float, modulus: float, part: float, share: float
 ) -> None:
@@ -93,7 +92,6 @@ def test_partials_are_the_derivatives(
 
 
 @given(radius=radii, modulus=moduli, part=fractions, share=shares)
-@settings(max_examples=150)
 def test_identities(radius: float, modulus: float, part: float, share: float) -> None:
     d = radius * part
     theta = float(Fingertip(radius).theta_limit(d)) * share

@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from softfinger.daemon.tactile.cobs import CobsDecoder, encode, longest_frame, unstuff
@@ -51,7 +51,6 @@ messages = st.one_of(
 )
 
 
-@settings(max_examples=150)
 @given(messages)
 @example(b"")
 @example(bytes(300))
@@ -61,7 +60,6 @@ def test_unstuffing_undoes_what_the_plain_twin_stuffed(message):
     assert unstuffed(plain_stuff(message)) == message
 
 
-@settings(max_examples=150)
 @given(
     st.one_of(
         st.lists(st.integers(1, 255), min_size=1, max_size=600).map(bytes),

@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 import pytest
 import zmq
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.client.command_client import NoAnswer, send
@@ -124,7 +124,6 @@ maps = st.dictionaries(st.text(max_size=5), values, max_size=3)
         st.builds(lambda more, name: msgpack.packb({**more, "command": name}), maps, values),
     )
 )
-@settings(max_examples=300)
 def test_any_bytes_are_decoded_or_refused(payload: bytes) -> None:
     try:
         request = decode(payload)

@@ -54,8 +54,7 @@ def settled(hand: Watched, angle: float) -> float:
     return seen.settled(off > math.radians(0.2))
 
 
-@pytest.mark.parametrize("mass", [0.07, 0.13])
-@pytest.mark.parametrize("modulus", [0.7, 1.3])
+@pytest.mark.parametrize(("mass", "modulus"), [(0.07, 1.3), (0.13, 0.7)])
 @pytest.mark.parametrize("law", ["energy", "two_phase"])
 def test_grasps_and_turns_with_mass_and_modulus_30_percent_off(
     law: str, mass: float, modulus: float
@@ -117,8 +116,10 @@ def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(
         assert math.hypot(moved[0], moved[1]) < 3e-4
 
 
-@pytest.mark.parametrize("last", ["grasp", "rotate", "hold"])
-@pytest.mark.parametrize("law", ["energy", "position"])
+@pytest.mark.parametrize(
+    ("law", "last"),
+    [("energy", "grasp"), ("energy", "rotate"), ("energy", "hold"), ("position", "hold")],
+)
 def test_an_object_that_is_taken_away_ends_the_grip(law: str, last: str) -> None:
     with daemon({"control": {"law": law}}) as built:
         loop, events = built.loop, []
@@ -208,7 +209,7 @@ def test_any_commands_streamed_right_after_arm_are_safe() -> None:
         assert 5.0 < max(forces) < 16.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_each_tip_by_itself_keeps_a_light_grip(seed: int) -> None:
     off = (0.7, 1.3)
     with watched(PAPER, seed=seed, object_mass=0.1 * off[seed % 2]) as hand:

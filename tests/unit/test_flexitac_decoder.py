@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from softfinger.daemon.tactile.flexitac import MARKER, FlexiTacDecoder
@@ -146,7 +146,6 @@ def test_a_frame_keeps_the_time_its_last_byte_was_read_and_its_own_array():
     assert np.array_equal(first.data, kept)
 
 
-@settings(max_examples=100)
 @given(
     images=st.lists(st.one_of(payloads, nasty), min_size=1, max_size=8),
     start=st.integers(0, STRIDE),
@@ -173,7 +172,6 @@ def test_any_cut_of_a_stream_gives_the_same_frames(images, start, cuts):
         assert newest[-1] == expected[-1]
 
 
-@settings(max_examples=100)
 @given(
     images=st.lists(nasty, min_size=2, max_size=6),
     start=st.integers(0, STRIDE),
@@ -188,7 +186,6 @@ def test_no_wrong_frame_whatever_the_images_hold(images, start):
     assert images[-1] in found
 
 
-@settings(max_examples=100)
 @given(
     garbage=st.one_of(st.binary(max_size=200), nasty),
     images=st.lists(payloads, min_size=3, max_size=5),
@@ -204,7 +201,6 @@ def test_garbage_before_a_stream_costs_at_most_its_first_frames(garbage, images)
     balance(decoder, sum(map(len, stream)))
 
 
-@settings(max_examples=100)
 @given(
     images=st.lists(nasty, min_size=4, max_size=8),
     torn=st.integers(2, 3),
@@ -228,7 +224,6 @@ def test_a_truncated_frame_is_dropped_and_the_stream_found_again(images, torn, k
         assert decoder.counters()["resyncs"] >= 1
 
 
-@settings(max_examples=100)
 @given(st.lists(st.one_of(st.binary(max_size=300), nasty), max_size=12))
 def test_random_bytes_never_break_the_decoder(pieces):
     decoder = FlexiTacDecoder(ROWS, COLS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from dynamixel_sdk import PacketHandler as sdk_handler
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.servos.crc import crc16
@@ -154,7 +154,6 @@ def test_parser_finds_every_packet_however_the_bytes_come(
     assert parser.dropped == 0
 
 
-@settings(max_examples=200)
 @given(st.binary(max_size=60), payloads)
 def test_parser_recovers_after_any_noise(noise: bytes, body: bytes) -> None:
     parser = PacketParser(gap=0.0015)

@@ -75,7 +75,7 @@ def undisturbed() -> dict[str, Any]:
         return ticked(daemon, TICKS)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5)
 @given(late=st.lists(st.sampled_from([0.0, 0.0, 0.0, 1e-4, 0.0019, 0.01, 0.3, 5.0]), max_size=300))
 def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(
     undisturbed: dict[str, Any], late: list[float]

@@ -75,7 +75,7 @@ def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
     generator = np.random.default_rng(3)
     step = 1e-7
     checked = 0
-    for _ in range(400):
+    for _ in range(150):
         finger = int(generator.integers(2))
         q = generator.uniform(0, 0.9)
         pose = generator.uniform([0, 0.05, -0.9], [0, 0.10, 0.9])
@@ -105,12 +105,12 @@ def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
             slope, rel=1e-5, abs=1e-5 * np.abs(forces * move).sum()
         )
         checked += 1
-    assert checked > 40
+    assert checked > 15
 
 
 def test_friction_bounds_the_shear():
     generator = np.random.default_rng(4)
-    for _ in range(200):
+    for _ in range(60):
         friction = generator.uniform(0, 2)
         hand = make(tip_friction=friction)
         q, angle = generator.uniform(0.1, 0.2), generator.uniform(-0.3, 0.3)
@@ -203,4 +203,4 @@ def test_energy_without_losses_drifts_at_least_with_the_square_of_the_step(name)
 
 def test_random_commands_and_extreme_parameters_stay_sound():
     # With the steps that the plant chooses and, one time in three, steps ten times too long.
-    assert [wrong for wrong in map(abuse, range(30)) if wrong] == []
+    assert [wrong for wrong in map(abuse, range(12)) if wrong] == []

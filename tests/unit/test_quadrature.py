@@ -82,7 +82,6 @@ def test_a_constant_modulus_gives_the_closed_form() -> None:
     ),
     share=st.one_of(st.floats(0.0, 1.0), st.floats(-12.0, -0.1).map(lambda e: 1 - 10**e)),
 )
-@settings(max_examples=120)
 def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
     h = 1.0 - depth
     limit = math.atan2(h, math.sqrt(depth * (1 + h)))
@@ -105,7 +104,6 @@ def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
     scale=st.floats(5e-3, 50.0),
     modulus=st.floats(1e-5, 1e4),
 )
-@settings(max_examples=100)
 def test_scaling_evenness_and_identities(
     depth: float, share: float, scale: float, modulus: float
 ) -> None:

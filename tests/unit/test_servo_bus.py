@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import Settings
@@ -308,7 +308,6 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
 # --- anything at all -------------------------------------------------------------------------
 
 
-@settings(max_examples=150)
 @given(
     st.lists(
         st.tuples(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dynamixel_sdk as sdk
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.servos import control_table as reg
@@ -49,7 +49,6 @@ def out_of_reach(address: int, data: bytes) -> bool:
     return any(a in span for a in kept) or address >= 168
 
 
-@settings(max_examples=150)
 @given(
     st.lists(STEPS, min_size=1, max_size=12),
     st.tuples(st.floats(-9, 9), st.floats(-9, 9)),

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.gateway import bounds
@@ -102,7 +102,6 @@ class Scene:
 
 
 @given(st.lists(action, max_size=60))
-@settings(max_examples=400, deadline=None)
 def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[str, int]]) -> None:
     with (
         TemporaryDirectory() as folder,

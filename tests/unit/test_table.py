@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger import ContactTable, Fingertip, Material
@@ -169,7 +169,6 @@ def test_lookup_is_callable_from_kernels(table: ContactTable) -> None:
 
 
 @given(depth=st.floats(5e-8, 0.9999), share=st.floats(-1.0, 1.0))
-@settings(max_examples=200)
 def test_properties(table: ContactTable, depth: float, share: float) -> None:
     d = depth * TIP.radius
     theta = float(TIP.theta_limit(d)) * share
@@ -251,7 +250,6 @@ def test_outside_the_domain_is_clamped_and_flagged(table: ContactTable) -> None:
     theta=st.floats(allow_nan=True, allow_infinity=True),
     number=st.integers(0, 3),
 )
-@settings(max_examples=300)
 def test_any_numbers_are_answered(
     forms: list[ContactTable], d: float, theta: float, number: int
 ) -> None:
