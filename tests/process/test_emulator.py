@@ -128,8 +128,8 @@ def test_the_physics_stands_behind_servos_and_boards(hand, servos):
     until(lambda: all(sensor.latest().data.max() > 40 for sensor in sensors))
     pressed = [int(sensor.latest().data.sum()) for sensor in sensors]
     assert all(after > before + 500 for before, after in zip(limp, pressed, strict=True))
-    assert servos.read(1, PRESENT_POSITION, 4) > 2060
-    assert servos.read(2, PRESENT_POSITION, 4) < 2036
+    until(lambda: servos.read(1, PRESENT_POSITION, 4) > 2060)
+    until(lambda: servos.read(2, PRESENT_POSITION, 4) < 2036)
     for servo in (1, 2):
         servos.write(servo, GOAL_POSITION, 4, 2048)
     until(lambda: all(sensor.latest().data.max() < 30 for sensor in sensors))

@@ -18,16 +18,8 @@ import psutil
 import pytest
 
 from tests.harness.daemon_process import SOFTFINGER, Running
-from tests.process.test_view_browser import HEIGHT, WIDTH, Picture, missing
+from tests.process.test_view_browser import HEIGHT, PATIENT, WIDTH, Picture, missing
 
-# A hand that sits out a test machine's stalls: what is looked at is its picture.
-PATIENT = """
-servos.watchdog = 0.0
-safety.frame_age_hold = 100.0
-safety.frame_age_fault = 300.0
-loop.rate = 200.0
-task.name = "demo"
-"""
 _SOFTWARE = list(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
 
 
