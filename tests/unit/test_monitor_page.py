@@ -111,7 +111,7 @@ def test_numbers_of_any_size_keep_the_columns() -> None:
         state["object"] = {"valid": True, "angle": value, "width": value}
         give(feed, b"hand/state", state)
         lines = shown(feed).splitlines()
-        assert any(line[23:].startswith("force   ") and line[54:56] == "N " for line in lines)
+        assert any(line[23:].startswith("energy  ") and line[54:57] == "mJ " for line in lines)
 
 
 def test_long_and_wide_texts_are_cut() -> None:
