@@ -216,3 +216,16 @@ def test_an_object_that_slipped_away_is_put_back(tmp_path: Path) -> None:
         made.hand.object_pose[:] = 0.07, 0.02, 1.2
         assert made.request("place report").startswith("{")
         until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))
+
+
+def test_a_load_on_the_object_and_when_the_tips_slipped(tmp_path: Path) -> None:
+    with emulated(tmp_path) as made:
+        made.request("push=5")
+        until(lambda: made.hand.object_pose[1] > 0.082)  # off along its faces, away from the palm
+        held = made.report(made.clock.now())["object"]
+        assert held["pushed"] is not None
+        assert held["slipped"] is None, "no tip touches it"
+        made.request("place twist=0.02")
+        until(lambda: made.hand.object_pose[2] > 0.05)
+        made.request("place forget")
+        assert made.report(made.clock.now())["object"]["pushed"] is None
