@@ -7,6 +7,9 @@ frame alone.
 from __future__ import annotations
 
 import math
+from typing import Any, cast
+
+from numba.core import types
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
@@ -71,6 +74,123 @@ def _track_moments(state: EstimatorState, frame: Pointer, centres: Pointer) -> b
     return False
 
 
+# What depends on the tip: of each pair a scene compiles one, by the type of ``solid``. ``energy``
+# is as for `gauss_newton.fit`.
+
+
+@inner_kernel
+def _begin_cold(
+    solid: SolidFit | None,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray | None,
+) -> None:
+    _start(state, frame, centres)
+
+
+@inner_kernel
+def _begin_solid(
+    solid: SolidFit,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray,
+) -> None:
+    start_solid(state, solid, frame, arena, centres, address(places))
+
+
+@inner_kernel
+def _fit(
+    solid: SolidFit | None,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray | None,
+    energy: float,
+    tolerance: float,
+) -> bool:
+    return fit(state, frame, arena, places, energy, tolerance)
+
+
+@inner_kernel
+def _fit_solid(
+    solid: SolidFit,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray,
+    energy: float,
+    tolerance: float,
+) -> bool:
+    return fit_solid(state, solid, frame, arena, centres, address(places), tolerance)
+
+
+@inner_kernel
+def _presses_outside(
+    solid: SolidFit | None,
+    state: EstimatorState,
+    frame: Pointer,
+    centres: Pointer,
+    level: float,
+) -> bool:
+    return presses_outside(state, frame, centres, level)
+
+
+@inner_kernel
+def _presses_nowhere(
+    solid: SolidFit, state: EstimatorState, frame: Pointer, centres: Pointer, level: float
+) -> bool:
+    # A solid tip's footprint can't be seen, and all of its base is pressed.
+    return False
+
+
+@inner_kernel
+def _by_moments(
+    solid: SolidFit | None,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray | None,
+) -> bool:
+    done = False
+    if state.estimate.warm:
+        done = _track_moments(state, frame, centres)
+    if not done:
+        _start(state, frame, centres)
+    return _judge_moments(state, frame, arena, places)
+
+
+@inner_kernel
+def _without_moments(
+    solid: SolidFit,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    centres: Pointer,
+    places: IntArray,
+) -> bool:
+    return False
+
+
+def _is_solid(kind: Any) -> bool:
+    return not isinstance(kind, types.NoneType)
+
+
+for _springs, _rubber in (
+    (_begin_cold, _begin_solid),
+    (_fit, _fit_solid),
+    (_presses_outside, _presses_nowhere),
+    (_by_moments, _without_moments),
+):
+    cast(Any, _springs).also(_rubber, _is_solid)
+
+
 @inner_kernel
 def _likelihood(
     state: EstimatorState,
@@ -89,26 +209,20 @@ def _likelihood(
         if attempt == 0 and not estimate.warm:
             continue
         estimate.second = False
-        if attempt == 1 and solid is None:
-            _start(state, frame, centres)
-        if attempt == 1 and solid is not None:
-            start_solid(state, solid, frame, arena, centres, address(places))
+        if attempt == 1:
+            _begin_cold(solid, state, frame, arena, centres, places)
         if not options.free_gain:
             estimate.gain = options.fixed_gain
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
-        if solid is None:
-            found = fit(state, frame, arena, places, energy, tolerance)
-        else:
-            found = fit_solid(state, solid, frame, arena, centres, address(places), tolerance)
-        if found:
+        if _fit(solid, state, frame, arena, centres, places, energy, tolerance):
             misfit, scatter = _explain(state, energy)
             if estimate.explained < options.explained_min:
                 continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
-            if solid is None and misfit > 8.0 * scatter + 0.003 * energy:
+            if misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
-                estimate.second = presses_outside(state, frame, centres, level)
+                estimate.second = _presses_outside(solid, state, frame, centres, level)
             if not estimate.second:
                 return _is_this_tip(state)
     return False
@@ -214,12 +328,8 @@ def _estimate(
     """The estimate of a frame with a contact; whether it can be used."""
     estimate = state.estimate
     done = False
-    if solid is None and state.options.moments_only:
-        if estimate.warm:
-            done = _track_moments(state, frame, centres)
-        if not done:
-            _start(state, frame, centres)
-        done = _judge_moments(state, frame, arena, places)
+    if state.options.moments_only:
+        done = _by_moments(solid, state, frame, arena, centres, places)
     else:
         done = _likelihood(state, frame, arena, centres, places, solid)
     in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
