@@ -24,7 +24,7 @@ from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budge
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
-from softfinger.kinematics.estimation.solid_fit import SolidFit, solid_fit
+from softfinger.kinematics.estimation.solid_projection import SolidFit, solid_fit
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray

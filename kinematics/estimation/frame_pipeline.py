@@ -18,7 +18,8 @@ from softfinger.kinematics.estimation.detection import presses_outside
 from softfinger.kinematics.estimation.gauss_newton import fit, judge, linearise, solve
 from softfinger.kinematics.estimation.moments import refine, start_from_frame
 from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
-from softfinger.kinematics.estimation.solid_fit import SolidFit, fit_solid, presses, start_solid
+from softfinger.kinematics.estimation.solid_fit import fit_solid, start_solid
+from softfinger.kinematics.estimation.solid_projection import SolidFit, presses
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_face
 

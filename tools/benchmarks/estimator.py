@@ -27,7 +27,7 @@ from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
-from softfinger.kinematics.estimation.solid_fit import SolidFit
+from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.campaigns import accuracy_envelope

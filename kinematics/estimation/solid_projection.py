@@ -1,0 +1,253 @@
+"""A solid tip's frame, projected on the pictures that the model is made of, as kernels.
+
+Cells that don't read the pressure as it is, since it ends at a floor or is cut at 0 where the model
+pulls, are given what they would have read, by the model before.
+
+A shear force on the face adds two pictures of its own, which look much like a tilt's. It is fitted
+along, by taking out of all other pictures what they share with these two.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.layout import Pair, Record
+from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.likelihood import CLIP, CLIP_END
+from softfinger.kinematics.estimation.state import EstimatorState
+from softfinger.kinematics.sensing.footprint import FloatArray
+from softfinger.kinematics.sensing.solid_pressure import (
+    PICTURES,
+    Weights,
+    add_picture,
+    pictures_of,
+    weigh,
+    weights_of,
+)
+
+_LOST = 0.01  # squared noise floor that a picture may count to be left out
+_NEAR = 0.03  # rad round a contact for which that holds
+
+Sums = Annotated[FloatArray, PICTURES]
+Products = Annotated[FloatArray, PICTURES, PICTURES]
+Likeness = Annotated[FloatArray, PICTURES, 2]  # how much of each shear picture is in each other
+
+
+class SolidFit(Record):
+    """A solid tip's pictures over a grid's live cells, and one frame's sums over them."""
+
+    weights: Weights
+    cells: int
+    packed: int  # where in the arena the pictures of live cells start [pictures, cells]
+    readings: int  # likewise [cells]
+    model: int
+    projected: Sums  # Σ picture · reading
+    count: int  # pictures that count in the contact at work: the first ones
+    low: int  # those of m ≤ 2
+    first: float  # mean of the first picture, which any contact shows most
+    spread: float  # √Σ(first picture − mean)²
+    plain: Products  # Σ picture · picture over live cells, shear's two last
+    products: Products  # the same without what is like shear
+    used: Products  # and over the cells that count in this frame
+    whole: Likeness
+    likeness: Likeness  # in this frame
+    shear: Pair  # of the model [Pa]
+    strongest: float  # cell of shear's pictures
+    sides: Annotated[FloatArray, 4, PICTURES]  # products times columns of the Jacobian
+    d: float  # of the contact at work
+    n_x: float
+    n_y: float
+    square: float  # Σ reading², each as it is compared with the model
+    raw: float  # and as it came
+    counted: float  # cells
+    limited: bool  # the last step ended where the data do
+
+
+def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
+    """The fit's memory for the pictures of ``live`` cells, float64 [pictures, cells]."""
+    fit = SolidFit()
+    fit.weights.assign(weights_of(tip, material))
+    count, fit.cells = live.shape
+    fit.plain[:count, :count] = plain = live @ live.T
+    both = plain[-2:, -2:]
+    fit.whole[: count - 2] = likeness = plain[:-2, -2:] @ np.linalg.inv(both)
+    fit.products[: count - 2, : count - 2] = plain[:-2, :-2] - likeness @ both @ likeness.T
+    fit.strongest = np.abs(live[-2:]).max()
+    fit.first = live[0].mean()
+    fit.spread = live[0].std() * math.sqrt(fit.cells)
+    low = fit.weights.harmonics[: fit.weights.modes] <= 2
+    fit.low = pictures_of(fit.weights.harmonics[: fit.weights.modes][low])
+    return fit
+
+
+@fast_inner_kernel
+def dot(a: Pointer, b: Pointer, count: int) -> float:
+    total = 0.0
+    for k in range(count):
+        total += a[k] * b[k]
+    return total
+
+
+@inner_kernel
+def presses(
+    state: EstimatorState, solid: SolidFit, frame: Pointer, arena: Pointer, places: IntPointer
+) -> bool:
+    """Whether the frame shows the first picture, by more than ``patch_level`` deviations.
+
+    The mean over the cells is taken off both, so that a shift of all their zeros, or noise that
+    ends at 0, is no contact. Much of a solid tip's pressure is spread over its base: a weak contact
+    shows in all cells together long before it does in any neighbourhood.
+    """
+    readings = further(arena, solid.readings)
+    total = 0.0
+    for k in range(solid.cells):
+        readings[k] = frame[places[k]]
+        total += readings[k]
+    shown = dot(further(arena, solid.packed), readings, solid.cells)
+    level = state.options.patch_level * state.signal.noise * solid.spread
+    return bool(shown - solid.first * total > level)
+
+
+@inner_kernel
+def counting(state: EstimatorState, solid: SolidFit) -> int:
+    """How many pictures count at the contact, and near it: the others are well within the noise."""
+    weights = solid.weights
+    weigh(weights, solid.d, solid.n_x, solid.n_y)
+    least = _LOST * state.signal.variance / (state.fit.gain * state.fit.gain)
+    count = weights.pictures
+    while count > solid.low:
+        j = count - 1
+        near = _NEAR * max(abs(weights.by_x[j]), abs(weights.by_y[j]))
+        shown = max(abs(weights.value[j]), near)
+        if shown * shown * solid.products[j, j] > least:
+            break
+        count = j
+    return count
+
+
+@fast_inner_kernel
+def set_model(solid: SolidFit, arena: Pointer, gain: float) -> None:
+    model = further(arena, solid.model)
+    for k in range(solid.cells):
+        model[k] = 0.0
+    for j in range(solid.count):
+        picture = further(arena, solid.packed + j * solid.cells)
+        add_picture(picture, gain * solid.weights.value[j], 0, solid.cells, model)
+    for k in range(2):
+        picture = further(arena, solid.packed + (solid.weights.pictures + k) * solid.cells)
+        add_picture(picture, solid.shear[k], 0, solid.cells, model)
+
+
+@inner_kernel
+def _excess(model: float, floor: float, clip: float) -> float:
+    """How much more a cell reads on average than the model, cut at 0, with noise at ``floor``."""
+    pressure = max(model, 0.0)
+    most = max(pressure, floor) - model
+    if clip > 0.0:
+        z = abs(pressure - floor) / clip
+        if z < CLIP_END:
+            above = 1.0 - z * (1.0 / CLIP_END)
+            base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
+            most += clip * above * above * base
+    return most
+
+
+@inner_kernel
+def project(
+    state: EstimatorState,
+    solid: SolidFit,
+    frame: Pointer,
+    arena: Pointer,
+    height: Pointer,
+    places: IntPointer,
+) -> bool:
+    """Take the frame's live cells, as they would read the model without ends, and project them.
+
+    Whether any cell was changed, so that this depends on the model.
+    """
+    signal = state.signal
+    readings = further(arena, solid.readings)
+    model = further(arena, solid.model)
+    floor = max(signal.floor, 0.0)
+    clip = math.sqrt(signal.variance) if signal.clipped else 0.0
+    near = floor + CLIP_END * clip
+    count = solid.count
+    pictures = solid.weights.pictures + 2
+    solid.counted = float(solid.cells)
+    square = raw = 0.0
+    changed = False
+    for k in range(solid.cells):
+        at = places[k]
+        reading = frame[at] * signal.scale
+        pressure = model[k]
+        outlier = height[at] < 0.0
+        full = reading >= signal.saturation and pressure >= signal.saturation
+        raw += 0.0 if outlier else reading * reading
+        if full or outlier:
+            # Saturated, or an outlier: it doesn't count.
+            if solid.counted == solid.cells:
+                solid.used[:] = solid.plain
+            for i in range(pictures):
+                value = arena[solid.packed + i * solid.cells + k]
+                for j in range(pictures):
+                    solid.used[i, j] -= value * arena[solid.packed + j * solid.cells + k]
+            solid.counted -= 1.0
+            readings[k] = 0.0
+            changed = changed or full
+            continue
+        if pressure < near:
+            reading = max(reading, signal.floor) - _excess(pressure, floor, clip)
+            changed = True
+        readings[k] = reading
+        square += reading * reading
+    solid.raw = raw
+    last = further(arena, solid.packed + (pictures - 2) * solid.cells)
+    x = dot(last, readings, solid.cells)
+    y = dot(further(last, solid.cells), readings, solid.cells)
+    if solid.counted == solid.cells:
+        solid.likeness[:] = solid.whole
+        solid.square = square - _along_shear(solid.plain, pictures, (x, y), solid.shear)
+    else:
+        solid.square = square - _along_shear(solid.used, pictures, (x, y), solid.shear)
+        _take_out_shear(solid, pictures)
+    for j in range(count):
+        picture = further(arena, solid.packed + j * solid.cells)
+        shown = dot(picture, readings, solid.cells)
+        solid.projected[j] = shown - solid.likeness[j, 0] * x - solid.likeness[j, 1] * y
+    return changed
+
+
+@inner_kernel
+def _along_shear(
+    products: FloatArray, pictures: int, sums: tuple[float, float], shear: FloatArray
+) -> float:
+    """Fit shear's two pictures alone: ``shear`` by their ``sums``, and the squares they explain."""
+    k = pictures - 2
+    x, y = sums
+    p = products[k, k]
+    q = products[k, k + 1]
+    r = products[k + 1, k + 1]
+    inverse = 1.0 / (p * r - q * q)
+    shear[0] = (r * x - q * y) * inverse
+    shear[1] = (p * y - q * x) * inverse
+    explained: float = shear[0] * x + shear[1] * y
+    return explained
+
+
+@inner_kernel
+def _take_out_shear(solid: SolidFit, pictures: int) -> None:
+    """Take what is like shear out of this frame's products, where some cells don't count."""
+    count = pictures - 2
+    used = solid.used
+    likeness = solid.likeness
+    for j in range(count):
+        _along_shear(used, pictures, (used[j, count], used[j, count + 1]), likeness[j])
+    for i in range(count):
+        for j in range(count):
+            used[i, j] -= likeness[i, 0] * used[count, j] + likeness[i, 1] * used[count + 1, j]
