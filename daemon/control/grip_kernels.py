@@ -325,7 +325,7 @@ def _equal_torques(
         g.offset = lean * (1.0 - spring / g.joint_stiffness)
         fading = 1.0 - g.shaken / law.dither_time
         turn = fading * law.dither_torque * math.sin(law.dither_rate * g.shaken) - spring * lean
-        if setpoint.arrived(g.force):
+        if g.shaken > 0.0 or setpoint.arrived(g.force):
             # By the clock and not by ticks: where these come late the dither must not become slow,
             # for the fingers on the tips swing by themselves at one to two hertz.
             g.shaken += min(max(grasp.t - g.seen, 0.0), _LONGEST_PAUSE)

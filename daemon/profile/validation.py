@@ -16,6 +16,7 @@ from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.daemon.types import FINGERS
 
 _LONGEST = 60  # characters of a value that are shown
+_DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
@@ -135,6 +136,23 @@ def _wedge(settings: Settings) -> Iterator[str]:
         )
 
 
+def _dither(settings: Settings) -> Iterator[str]:
+    control, rate = settings.control, settings.loop.rate
+    if control.law != "upright":
+        return
+    most = settings.safety.current_max * control.torque_constant
+    if control.dither_torque > most:
+        yield (
+            f"control.dither_torque: found {control.dither_torque:g} N·m, expected at most "
+            f"{most:.3g} N·m, what safety.current_max gives"
+        )
+    if control.dither_frequency > rate / _DITHER_TICKS:
+        yield (
+            f"control.dither_frequency: found {control.dither_frequency:g} Hz, expected at most "
+            f"{rate / _DITHER_TICKS:g} Hz, {_DITHER_TICKS} ticks a period"
+        )
+
+
 def _cells(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
     for index, cells in enumerate(tactile.dead):
@@ -244,6 +262,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...]
     (("material",), _material),
     (("tip", "material", "estimator", "safety"), _solid_tip),
     (("simulation",), _wedge),
+    (("control", "safety", "loop"), _dither),
     (("tactile",), _cells),
     (("tactile",), _blur),
     (("scene", "tactile"), _recordings),

@@ -207,6 +207,14 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> N
         ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a number"),
         ('"\\u001b[31m" = 1', "?[31m: found an unknown key"),
         ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
+        (
+            '[control]\nlaw = "upright"\ndither_torque = 3.0',
+            "control.dither_torque: found 3 N·m, expected at most 2.14 N·m",
+        ),
+        (
+            '[control]\nlaw = "upright"\ndither_frequency = 50.0\n[loop]\nrate = 200.0',
+            "control.dither_frequency: found 50 Hz, expected at most 25 Hz",
+        ),
         ('[task]\nname = "demo"\nforce = 500.0', "task.force: found 500 N, expected above 0.5 to"),
         ("x = " + "[" * 5000, "nested too deeply"),
         (".".join(["x"] * 3000) + " = 1", "nested too deeply"),

@@ -13,7 +13,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_share, upright_spring
-from softfinger.tools.benchmarks.framework.watched import Watched
+from softfinger.tools.benchmarks.framework.watched import Watched, push_along
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make
 
 LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
@@ -115,6 +115,33 @@ def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
         assert loop.state.mode == "holding", loop.state.fault
         assert daemon.hand is not None
         assert abs(math.degrees(daemon.hand.object_pose[2])) < 0.3
+
+
+def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side() -> None:
+    with Watched({"control": {"law": "upright"}}) as hand:
+        hand.grasp(FORCE)
+        hand.run(4.5)
+        push_along(hand, 11.0, 11.0)
+        goal = hand._daemon.loop.state.goal
+        assert goal.force > 1.1 * FORCE
+        hand.plant.push(0.0, 0.0)
+        hand.run(0.1)
+        hand.command("grasp", force=FORCE)  # a second later, while it shakes, the grip comes back
+        turned = np.abs(hand.watch(3.5).angle).max()
+        assert hand.mode == "holding"
+        assert goal.force == FORCE
+        assert turned < math.radians(10.0), math.degrees(turned)
+
+
+def test_a_small_hand_brings_its_object_upright() -> None:
+    sections = load(Path("small")).model_dump(exclude_unset=True)
+    sections["control"]["law"] = "upright"
+    sections["simulation"]["object_angle"] = START
+    with Watched(sections) as hand:
+        hand.grasp(0.8)
+        hand.run(4.5)
+        assert hand.mode == "holding"
+        assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
 
 
 def test_equal_torques_alone_leave_it_askew() -> None:
