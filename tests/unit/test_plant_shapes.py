@@ -372,6 +372,10 @@ def test_a_long_wedge_whose_faces_meet_is_refused():
     assert found(object_taper=1.1) == []
     assert "object_taper" in found(object_taper=1.2)[0]
     assert "object_taper" in found(object_taper=0.5, object_height=0.3)[0]
+    with pytest.raises(
+        ValueError, match=r"found simulation\.object_width 0\.002 m, expected above"
+    ):
+        shape(object_shape="wedge", object_width=0.002)
 
 
 def test_scenes_pay_only_for_what_they_have():

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import HELD, LOST, MEANING, REFUSED, TURNED, identity
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.arguments import add_profile, profile
+from softfinger.tools.arguments import add_profile, number, profile
 from softfinger.tools.extras import require
 
 SHAPES = ("rectangle", "disc")
@@ -39,15 +39,24 @@ class Cell(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``envelope``."""
     add_profile(parser)
-    parser.add_argument("--force", type=float, default=10.0, metavar="N", help="grip (default: 10)")
+    force = _between("a force above 0 N", 0.0, 1e9)
+    parser.add_argument("--force", type=force, default=10.0, metavar="N", help="grip (default: 10)")
     parser.add_argument("--shape", choices=SHAPES, action="append", help="of these only")
-    parser.add_argument("--size", type=float, nargs="+", metavar="MM", help="of these only")
-    parser.add_argument("--friction", type=float, nargs="+", metavar="F", help="of these only")
-    parser.add_argument("--mass", type=float, nargs="+", metavar="KG", help="of these only")
+    for name, metavar, kind in (
+        ("--size", "MM", _between("a size of 0.2 to 10000 mm", 0.2, 1e4)),
+        ("--friction", "F", _between("a friction of 1e-5 to 1e5", 1e-5, 1e5)),
+        ("--mass", "KG", _between("a mass of 1e-5 to 1e5 kg", 1e-5, 1e5)),
+    ):
+        parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="of these only")
     parser.add_argument(
         "--keep", type=Path, metavar="FILE", help="write the map, as grasp reads it"
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it (extra 'plot')")
+
+
+def _between(what: str, low: float, high: float) -> Callable[[str], float]:
+    """What reads an argument within the settings' bounds, at least ``low`` if that is not 0."""
+    return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -60,9 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
         require("plot")
     shapes = tuple(arguments.shape or SHAPES)
     axes = (
-        tuple(arguments.friction or FRICTIONS),
-        tuple(arguments.mass or MASSES),
-        tuple(arguments.size or SIZES),
+        tuple(sorted(arguments.friction or FRICTIONS)),
+        tuple(sorted(arguments.mass or MASSES)),  # as the map's reader takes them
+        tuple(sorted(arguments.size or SIZES)),
     )
     print(f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in MEANING.items()))
     found: dict[str, list[list[Cell]]] = {}

@@ -64,8 +64,17 @@ def rectangle(simulation: SimulationSettings) -> Shape:
 
 
 def wedge(simulation: SimulationSettings) -> Shape:
-    """Faces that lean by half the taper each, with the settings' width at half the height."""
+    """Faces that lean by half the taper each, with the settings' width at half the height.
+
+    Raises ValueError where they meet; `profile.validation` finds that in profiles.
+    """
     leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
+    width = simulation.object_width
+    if 2.0 * abs(leaning) >= width:
+        raise ValueError(
+            f"a wedge's faces meet: found simulation.object_width {width:g} m, expected above "
+            f"{2.0 * abs(leaning):.3g} m at its object_taper and object_height"
+        )
     return _polygon(POLYGON, simulation, leaning)
 
 
