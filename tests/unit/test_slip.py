@@ -120,6 +120,10 @@ def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> No
     # Friction that turns round is none, and neither is a load that goes.
     assert watched.run(1.95 * friction, 1) == FORCE
     assert watched.run(0.0, 500) == FORCE
+    # One current that was read wrongly is none; what stays for a second tick is one.
+    assert watched.run(9.0 * friction, 1) == FORCE
+    assert watched.run(0.0, 500) == FORCE
+    assert watched.run(3.0 * friction, 1) == FORCE
     assert watched.run(3.0 * friction, 1) == FORCE + 10.0
     assert watched.grip._state.push == pytest.approx(FORCE + 10.0, rel=1e-4), "at the same tick"
 
