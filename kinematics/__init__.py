@@ -1,4 +1,5 @@
 """Contact mechanics of soft hemispherical fingertips and the planar two-fingered hand.
 
-Pure mathematics: no input or output, no clock, no thread, no settings. SI units.
+Pure mathematics: no clock, no thread, no settings, and no file but the solid tip's data and the
+kernels' cache. SI units.
 """

@@ -108,7 +108,7 @@ def _refusal(error: str) -> bytes:
 def decode(payload: bytes) -> dict[str, Any]:
     """Unpack a command, a map of plain numbers and texts with a text under ``command``.
 
-    Raises Refused for all else.
+    Raises Refused for all else, but a stop is one whatever its map holds besides.
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
@@ -118,9 +118,12 @@ def decode(payload: bytes) -> dict[str, Any]:
         raise Refused(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
         raise Refused('expected a text under "command"')
-    if not all(isinstance(key, str) for key in request):
-        raise Refused("expected texts as keys")
     # Nothing nested: requests are published as they came.
-    if not all(value is None or isinstance(value, _VALUES) for value in request.values()):
-        raise Refused("expected numbers and texts as values")
-    return request
+    plain = {
+        key: value
+        for key, value in request.items()
+        if isinstance(key, str) and (value is None or isinstance(value, _VALUES))
+    }
+    if len(plain) < len(request) and request["command"] != "stop":
+        raise Refused("expected texts as keys, and numbers and texts as values")
+    return plain

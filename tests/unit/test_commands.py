@@ -133,6 +133,13 @@ def test_any_bytes_are_decoded_or_refused(payload: bytes) -> None:
     assert request == msgpack.unpackb(payload)
 
 
+def test_a_stop_is_one_whatever_it_holds_besides() -> None:
+    more = {"client": "a", "how": ["now"], b"x": 4}
+    assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
+    with pytest.raises(Refused, match="numbers and texts as values"):
+        decode(msgpack.packb({"command": "arm", "how": ["now"]}))
+
+
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
 def test_a_second_server_on_the_same_address_is_told(
     addresses: tuple[str, str], tmp_path_factory: pytest.TempPathFactory, transport: str
