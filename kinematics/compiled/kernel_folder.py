@@ -1,9 +1,9 @@
 """Where compiled kernels are kept between runs: one folder for one state of sources and compiler.
 
 The folder's name is a digest of every source that a kernel of this package may depend on, of
-Python, Numba and llvmlite, and of the processor, so nothing compiled from something else is ever
-loaded. Numba unpickles what it finds there, and so runs it: the folder is the user's own, or it is
-not used.
+Python, Numba, llvmlite and NumPy, and of the processor, so nothing compiled from something else is
+ever loaded. Numba unpickles what it finds there, and so runs it: the folder is the user's own, or
+it is not used.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pathlib import Path
 import llvmlite
 import llvmlite.binding
 import numba
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
 _PACKAGES = ("kinematics", "daemon")
@@ -112,9 +113,10 @@ def _prune(base: Path, current: Path) -> None:
 
 @cache
 def digest() -> str:
-    """A name for this state of sources, Python, Numba, llvmlite and processor."""
+    """A name for this state of sources, Python, Numba, llvmlite, NumPy and processor."""
     state = hashlib.sha256()
-    versions = (sys.version, numba.__version__, llvmlite.__version__, platform.machine())
+    packages = (numba.__version__, llvmlite.__version__, np.__version__)
+    versions = (sys.version, *packages, platform.machine())
     cpu = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
     features = os.environ.get("NUMBA_CPU_FEATURES")
     if features is None:
