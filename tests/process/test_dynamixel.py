@@ -359,7 +359,7 @@ def test_torque_off_counts_once_every_servo_says_so(bus: RunningBus, connect: Co
     assert not backend.torque_off(Reading())
     assert not bus.servo(0).torque_on
     bus.fault("answer=2")
-    assert backend.torque_off(Reading())
+    until(lambda: backend.torque_off(Reading()))  # a busy machine's servo may answer too late
     assert not bus.servo(1).torque_on
 
 

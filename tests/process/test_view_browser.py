@@ -110,7 +110,7 @@ def test_every_panel_shows_the_hand(
         assert found is not None
         browser = Browser(path, tmp_path / "profile", WIDTH, HEIGHT)
         browser.open(found[0])
-        deadline = time.monotonic() + 120.0
+        deadline = time.monotonic() + 300.0
         absent = missing(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8))  # not seen so far
         while True:
             picture = browser.picture()
