@@ -154,7 +154,7 @@ def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFa
     tables = [
         json.dumps(
             {
-                "form": model.table.form.name,
+                "form": model.table.form,
                 "tolerance": model.table.tolerance,
                 "certificate": model.table.certificate._asdict(),
             }

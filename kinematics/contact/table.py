@@ -21,7 +21,6 @@ from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import (
     FORMS,
     VERSION,
-    Form,
     TableError,
     aligned,
     header_of,
@@ -150,9 +149,9 @@ class ContactTable:
         return Certificate(self.max_error, self.header.worst_d, self.header.worst_theta)
 
     @property
-    def form(self) -> Form:
-        """Its representation."""
-        return FORMS[int(self.header.form)]
+    def form(self) -> str:
+        """Its representation: the name of one of FORMS, or "solid"."""
+        return "solid" if self.is_solid else FORMS[int(self.header.form)].name
 
     @property
     def tip(self) -> Fingertip:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
+from softfinger.daemon.loop.build import facts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.material import MaterialError
@@ -202,6 +204,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
             assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
             assert contact.force == pytest.approx(hand.force[finger], rel=0.03)
     assert state.fault == ""
+    assert json.loads(facts(daemon.settings, daemon.models).table_left)["form"] == "solid"
     command(daemon, "release")
     daemon.loop.advance(1.5)
     assert state.mode == "armed"

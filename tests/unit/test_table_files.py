@@ -79,7 +79,7 @@ def test_a_damaged_or_foreign_file_is_replaced(
     file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]) if content is None else content)
     with pytest.raises(TableError, match=rf"{file.name}: it (is damaged|holds no)"):
         load_table(file, TIP, CONSTANT, 1e-9)
-    assert kept(tmp_path, said).form.name == "closed"
+    assert kept(tmp_path, said).form == "closed"
     assert len(said) == 1
     assert "built again" in said[0]
     assert str(file) in said[0]
@@ -99,7 +99,7 @@ def test_a_table_of_another_tip_under_this_name_is_replaced(
 def test_without_a_place_the_table_is_built_all_the_same(tmp_path: Path, said: list[str]) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    assert kept(blocked / "cache", said).form.name == "closed"
+    assert kept(blocked / "cache", said).form == "closed"
     assert "can't be kept" in said[-1]
 
 
