@@ -15,7 +15,7 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.benchmarks.framework.watched import Watched
+from softfinger.tools.watched import Watched
 
 PAPER: dict[str, dict[str, Any]] = {
     "material": {"law": "constant"},

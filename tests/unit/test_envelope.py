@@ -9,8 +9,8 @@ import pytest
 
 from softfinger.daemon.control.envelope import Envelope
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.benchmarks.framework.watched import Watched
 from softfinger.tools.cli import main
+from softfinger.tools.watched import Watched
 
 
 def settings(width: float = 0.040, **control: Any) -> Settings:

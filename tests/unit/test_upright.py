@@ -13,7 +13,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_share, upright_spring
-from softfinger.tools.benchmarks.framework.watched import Watched, push_along
+from softfinger.tools.watched import Watched, push_along
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make
 
 LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius

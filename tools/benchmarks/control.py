@@ -14,7 +14,7 @@ import numpy as np
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.benchmarks.framework.report import Report, Row, figure
-from softfinger.tools.benchmarks.framework.watched import Watched, push_along
+from softfinger.tools.watched import Watched, push_along
 
 Sections = dict[str, dict[str, Any]]
 Samples = defaultdict[str, list[float]]

@@ -110,7 +110,7 @@ def grasped(
     The settings say what it is: its width or diameter ``size`` [m], friction and weight. Not its
     shape: to the daemon all are blocks.
     """
-    from softfinger.tools.benchmarks.framework.watched import Watched
+    from softfinger.tools.watched import Watched
 
     weight = mass * _GRAVITY
     told: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)

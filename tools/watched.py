@@ -1,4 +1,4 @@
-"""A daemon on virtual time whose hand's truth is recorded: for bench and tests."""
+"""A daemon on virtual time whose hand's truth is recorded: for envelope, bench and tests."""
 
 from __future__ import annotations
 
