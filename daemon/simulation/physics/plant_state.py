@@ -65,7 +65,7 @@ class Felt(Record):
     on_other_tip: Flags
 
 
-class SampleRow(Record):
+class Sample(Record):
     """What the tips felt at a frame's instant; fields as in :class:`Felt`."""
 
     number: int  # -1: none

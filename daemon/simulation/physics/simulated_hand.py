@@ -7,7 +7,6 @@ on when which command came, so that two runs are the same to the bit.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,9 +18,8 @@ from softfinger.daemon.simulation.physics.plant_state import (
     CURRENT_BASED_POSITION_MODE,
     CURRENT_MODE,
     POSITION_MODE,
-    FloatArray,
     Plant,
-    SampleRow,
+    Sample,
 )
 from softfinger.kinematics.contact.table import ContactTable
 
@@ -29,17 +27,6 @@ SPARE_SAMPLES = 8
 LONGEST_ADVANCE = 10.0  # s of simulated time in one kernel call
 
 _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
-
-
-class Sample(NamedTuple):
-    """What the tips felt at a frame's instant ``t`` [s] since the start; arrays are (2,)."""
-
-    t: float
-    d: FloatArray  # m
-    theta: FloatArray  # rad
-    gain: FloatArray  # of the force over that on a plane at d and θ
-    bend: FloatArray  # curvature of what is touched, across the hand's plane [1/m]
-    tangential: FloatArray  # force along the face [N]
 
 
 class SimulatedHand:
@@ -85,10 +72,9 @@ class SimulatedHand:
         # As many as may be on their way to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         kept = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
-        self._ring = np.zeros(kept, SampleRow.dtype)
-        self._numbers = self._ring["number"]
-        self._numbers[:] = -1
-        self._samples = tuple(self._ring[name] for name in Sample._fields)
+        self._ring = np.zeros(kept, Sample.dtype)
+        self._ring["number"] = -1
+        self._rows = [Sample(self._ring[k : k + 1]) for k in range(kept)]
         self._done = 0
         self._torque_until = math.inf
         self._per_step = 1.0 / self.step
@@ -169,14 +155,17 @@ class SimulatedHand:
     @property
     def kept_samples(self) -> int:
         """How many of the newest samples are kept."""
-        return len(self._ring)
+        return len(self._rows)
 
     def sample(self, number: int) -> Sample:
-        """Sample ``number``. Raises LookupError for one that is not taken yet or is overwritten."""
-        place = number % len(self._ring)
-        if self._numbers[place] != number:
+        """Sample ``number``, as long as no newer one takes its place.
+
+        Raises LookupError for one that is not taken yet or is overwritten.
+        """
+        row = self._rows[number % len(self._rows)]
+        if row.number != number:
             raise LookupError(f"sample {number} is not kept; {self.samples} were taken")
-        return Sample(*[values[place] for values in self._samples])
+        return row
 
     def energy(self) -> float:
         """Kinetic, elastic and gravitational energy of joints, tips and object [J]."""

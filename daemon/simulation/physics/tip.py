@@ -24,10 +24,22 @@ rendered from those springs (`sensor.curved_face`), so its sum differs by as muc
 force goes with d^(3/2) and by √κ, as Hertz's does between a sphere and a cylinder in the limit of
 small d; its frame is the plane's with that share.
 
-Friction is Coulomb's: d_t stays within the two shears at which |T| = μN; `shear` has what else a
-tip may do. Where the model's own ratio |T|/N can't reach μ (with a constant E and s = 1 it can't
-exceed 1 at θ = 0), the tip slips at its largest ratio. Losses are viscous, each proportional to the
-soft part's stiffness, so they grow with the contact.
+Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
+ratio |T|/N can't reach μ (with a constant E and s = 1 it can't exceed 1 at θ = 0), the tip slips at
+its largest ratio. Losses are viscous, each proportional to the soft part's stiffness, so they grow
+with the contact.
+
+A stuck tip's shear may relax, by creep and by micro-slip; both are off by default: a tip then
+sticks or slips as a whole, and forgets nothing. Micro-slip is what the tip's own springs do when
+each has Coulomb friction of its own. A spring of length ℓ(r) = √(a² − r²) is pressed in by
+w = ℓ − h with the pressure Ew/ℓ, and bears a shear traction Eu/ℓ when the face has moved by u: it
+slips where u > μw. All layers w = 0 … d are equally stiff, since r dr = −ℓ dℓ, so that from rest
+
+    T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
+
+and the whole tip slips at u = μd: an Iwan model with evenly spread limits. Its layers are scaled
+with the footprint as that grows; their mean is the tip's d_t, and their variance adds to d_t² in
+the tip's energy.
 """
 
 from __future__ import annotations
@@ -39,6 +51,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_D,
     ALONG_SHEAR,
     ALONG_THETA,
+    LAYERS,
     Motion,
     Parameters,
     Plant,
@@ -357,3 +370,36 @@ def touch_object(
     tip.forces[1] = along_d * mx - along_theta * theta_x - along_t * t_x
     tip.forces[2] = along_d * my - along_theta * theta_y - along_t * t_y
     tip.forces[3] = along_d * turn_m - along_theta * theta_turn - along_t * t_turn
+
+
+@inner_kernel
+def relax_shears(plant: Plant) -> None:
+    """Relax the shears that a sub-step has led to; the contacts are those of where it began."""
+    p, state = plant.parameters, plant.state
+    for finger in range(2):
+        tip, layers = plant.stages[0].on_object[finger], plant.layers[finger]
+        stiffness = tip.stiffness[ALONG_SHEAR]
+        if stiffness <= 0.0:
+            for k in range(LAYERS):
+                layers[k] = 0.0
+            plant.spread[finger] = 0.0
+            continue
+        neutral = tip.shear - tip.tangential / stiffness
+        shear = state.shear[finger]
+        shear += p.creep * (neutral - shear)
+        if p.micro_slip:
+            limit = 2.0 * p.friction * max(tip.normal, 0.0) / stiffness
+            mean = 0.0
+            for k in range(LAYERS):
+                mean += layers[k] / LAYERS
+            brought = shear - mean
+            shear = 0.0
+            for k in range(LAYERS):
+                most = limit * (k + 0.5) / LAYERS
+                layers[k] = neutral + min(max(layers[k] + brought - neutral, -most), most)
+                shear += layers[k] / LAYERS
+            square = 0.0
+            for k in range(LAYERS):
+                square += (layers[k] - shear) ** 2
+            plant.spread[finger] = square / LAYERS
+        state.shear[finger] = shear
