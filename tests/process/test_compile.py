@@ -62,7 +62,8 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
     )
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
-    assert 0.8 * table.kernels <= len(kernels) <= 1.2 * table.kernels
+    # Counted for the newest Numba: the lowest one tells of a third fewer.
+    assert 0.6 * table.kernels <= len(kernels) <= 1.2 * table.kernels
     rest = compiled(tmp_path)
     assert rest.returncode == 0
     first, part, last = rest.stderr.splitlines()

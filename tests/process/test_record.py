@@ -63,8 +63,8 @@ def interrupted(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 def is_filled(path: Path) -> bool:
-    """More than a recording's head is in the file."""
-    return path.exists() and path.stat().st_size > 3000
+    """A whole chunk of messages is in the file."""
+    return path.exists() and path.stat().st_size > 3000 and Recording(path).total > 0
 
 
 def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
