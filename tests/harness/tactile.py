@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import Clock, RealClock, VirtualClock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.emulator.fault_spec import parse_faults
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
+from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import Frame

@@ -23,7 +23,7 @@ from softfinger.daemon.simulation.emulator.emulator import (
     EmulatorError,
     with_board,
 )
-from softfinger.daemon.simulation.emulator.link_folder import LINKS, FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, LinkFolder
 from softfinger.tools.cli import main
 from tests.conftest import until
 from tests.harness.emulated import HIL, READY_WITHIN, SdkServos, board, emulated

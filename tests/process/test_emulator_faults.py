@@ -15,7 +15,7 @@ from softfinger.daemon.errors import TactileError
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.simulation.emulator.link_folder import LINKS
+from softfinger.daemon.simulation.emulator.folder import LINKS
 from softfinger.daemon.tactile.flexitac import FlexiTac
 from tests.conftest import until
 from tests.harness.emulated import SdkServos, board, emulated, send

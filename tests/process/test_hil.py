@@ -12,7 +12,7 @@ import msgpack
 import pytest
 import zmq
 
-from softfinger.daemon.simulation.emulator.control_port import send_words
+from softfinger.daemon.simulation.emulator.folder import send_words
 from tests.conftest import own_addresses, until
 from tests.harness.daemon_process import PATIENT, SOFTFINGER, Running, ask, softfinger
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.simulation.emulator.control_port import send_words
+from softfinger.daemon.simulation.emulator.folder import send_words
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger
 

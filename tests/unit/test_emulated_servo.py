@@ -12,7 +12,7 @@ from softfinger.daemon.servos.control_table import MODELS, by_name
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
-from softfinger.daemon.simulation.servo_model.servo_health import OVERLOAD_TIME
+from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME
 from tests.harness.servos import RADIAN, BusClient, make_bus, put_fault
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from softfinger.daemon.simulation.emulator.fault_spec import FaultError, parse_faults
+from softfinger.daemon.simulation.faults import FaultError, parse_faults
 
 
 def test_faults_in_words() -> None:

@@ -11,7 +11,7 @@ import pytest
 from softfinger.daemon import own_files
 from softfinger.daemon.own_files import require_own, runtime_folder, write_bytes, write_text
 from softfinger.daemon.profile.factory import save_table
-from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.folder import FolderError, LinkFolder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable

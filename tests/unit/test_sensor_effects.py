@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.simulation.sensor import sensor_effects
+from softfinger.daemon.simulation.sensor import sensor_model
 from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -87,12 +87,12 @@ def test_hysteresis_is_the_prandtl_ishlinskii_sum_of_plays():
     rng = np.random.default_rng(1)
     path = np.abs(np.cumsum(rng.normal(0.0, 1.0, (60, 3, 4)), axis=0)) * 1e4
     excess = 0.1
-    plays = np.zeros((sensor_effects.PLAYS, 3, 4))
+    plays = np.zeros((sensor_model.PLAYS, 3, 4))
     twin = np.zeros_like(plays)
-    shares = 2 * excess * (np.arange(sensor_effects.PLAYS) + 0.5) / sensor_effects.PLAYS
+    shares = 2 * excess * (np.arange(sensor_model.PLAYS) + 0.5) / sensor_model.PLAYS
     for p in path:
         out = p.copy()
-        sensor_effects.hysteresis(out, excess, plays)
+        sensor_model.hysteresis(out, excess, plays)
         high = (1 + shares)[:, None, None] * p
         twin = np.maximum(p, np.minimum(high, twin))
         np.testing.assert_allclose(out, twin.mean(axis=0), rtol=1e-12)
@@ -132,7 +132,7 @@ def test_creep_is_the_exact_response_to_straight_pieces():
             p = values[k - 1] + (values[k] - values[k - 1]) * (m + 0.5) / steps
             z += elapsed / steps * (p - z) / (time + 0.5 * elapsed / steps)
         out = values[k] * shape
-        sensor_effects.creep(out, share, time, elapsed, before, crept)
+        sensor_model.creep(out, share, time, elapsed, before, crept)
         np.testing.assert_allclose(out, (values[k] + share * z) * shape, rtol=1e-6, atol=1e-6)
 
 
@@ -155,14 +155,14 @@ def test_a_lasting_contact_creeps_up_and_its_mark_fades():
 def test_zeros_drift_to_their_deviation_and_forget_in_their_time():
     offset = np.zeros((60, 60))
     rng = np.random.default_rng(2)
-    sensor_effects.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
+    sensor_model.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
     # A random walk at first: deviation · √(2 t / time).
     assert offset.std() == pytest.approx(50.0 * math.sqrt(2 * 0.01 / 60.0), rel=0.05)
     for _ in range(40):
-        sensor_effects.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))
+        sensor_model.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))
     assert offset.std() == pytest.approx(50.0, rel=0.05)
     earlier = offset.copy()
-    sensor_effects.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
+    sensor_model.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
     assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.06)
 
 
@@ -181,7 +181,7 @@ def test_counting_rounds_clips_and_leaves_out_what_is_small_or_dead(least):
     rows, cols = rng.normal(0.0, 1.0, 5), rng.normal(0.0, 1.0, 7)
     live = (rng.random((5, 7)) > 0.2).astype(float)
     out = np.zeros((5, 7), np.uint16)
-    sensor_effects.count(signal, offset, (rows, cols), live, 0.7, normals, (least, 9), out)
+    sensor_model.count(signal, offset, (rows, cols), live, 0.7, normals, (least, 9), out)
     value = signal + offset + rows[:, None] + cols + 0.7 * normals
     expected = np.clip(np.floor(value + 0.5), 0, 9)
     expected[(expected < least) | (live == 0.0)] = 0

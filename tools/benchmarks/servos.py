@@ -20,7 +20,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.simulation.emulator.control_port import send_words
+from softfinger.daemon.simulation.emulator.folder import send_words
 from softfinger.daemon.types import Goal, Reading
 from softfinger.tools.benchmarks.framework.interleaved import timed
 from softfinger.tools.benchmarks.framework.report import Report, Row, figure

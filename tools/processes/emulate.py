@@ -188,7 +188,7 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
 
 
 def _send(folder: Path, words: str) -> int:
-    from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
+    from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
 
     try:
         reply = send_words(folder, words)

@@ -23,20 +23,19 @@ from typing import Any
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.simulation.emulator.control_port import ControlPort
-from softfinger.daemon.simulation.emulator.fault_spec import (
+from softfinger.daemon.simulation.emulator.folder import ControlPort, FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
+from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
+from softfinger.daemon.simulation.faults import (
     OBJECT,
     SERVOS,
     FaultError,
     FaultEvent,
+    LineFaults,
     parse_faults,
 )
-from softfinger.daemon.simulation.emulator.link_folder import FolderError, LinkFolder
-from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
-from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
-from softfinger.daemon.simulation.servo_model.bus_faults import LineFaults
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 

@@ -34,6 +34,17 @@ PASSAGE = 15e-6
 _SCHEDSTAT = Path("/proc/thread-self/schedstat")  # ns run, ns waited for a processor, times run
 
 
+def open_pty() -> tuple[int, int, str]:
+    """A new pty: its non-blocking end, the clients' one, which is raw, and that one's path.
+
+    The clients' end stays open here, so that they may come and go without an error.
+    """
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    return master, slave, os.ttyname(slave)
+
+
 class PtyServoBus:
     """``bus`` on a new pseudo-terminal at ``path``.
 
@@ -80,11 +91,7 @@ class PtyServoBus:
 
     def plug(self) -> None:
         """Make the terminal (again), at a new ``path``."""
-        self._master, self._slave = pty.openpty()
-        # The slave stays open here and raw, so that a client may come and go without an error.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        self._master, self._slave, self.path = open_pty()
 
     def unplug(self) -> None:
         """Take the terminal away, as when an adapter is pulled; the servos go on."""

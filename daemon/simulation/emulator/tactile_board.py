@@ -12,7 +12,6 @@ import fcntl
 import math
 import os
 import termios
-import tty
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.simulation.emulator.pty_bus import open_pty
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
@@ -45,11 +45,7 @@ class FrameWriter:
     """
 
     def __init__(self) -> None:
-        self._master, self._slave = os.openpty()
-        # The slave stays open here: else the next client to open it would meet a hung-up line.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        self._master, self._slave, self.path = open_pty()
         self.dropped = 0  # frames
         self._rest = b""  # of a frame that the pty took only a part of
         self._unread = array.array("i", [0])

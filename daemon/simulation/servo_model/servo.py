@@ -19,8 +19,12 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.registers import ControlTable, Item
-from softfinger.daemon.simulation.servo_model.servo_health import SENSE, ServoHealth
-from softfinger.daemon.simulation.servo_model.servo_joint import STEP, ServoJoint
+from softfinger.daemon.simulation.servo_model.servo_joint import (
+    SENSE,
+    STEP,
+    ServoHealth,
+    ServoJoint,
+)
 
 REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps

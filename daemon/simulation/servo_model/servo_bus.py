@@ -19,12 +19,12 @@ from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.servos.joint import JointScale
-from softfinger.daemon.simulation.servo_model import framing
-from softfinger.daemon.simulation.servo_model.bus_faults import (
+from softfinger.daemon.simulation.faults import (
     LINE_FAULTS,
     SERVO_FAULTS,
     FaultSource,
 )
+from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared

@@ -20,7 +20,7 @@ import zmq
 
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.simulation.emulator.control_port import NoEmulator, send_words
+from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
 from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.framework.campaign import RigError
 from softfinger.tools.benchmarks.framework.rigs import HIL
