@@ -31,8 +31,8 @@ class LineFaults:
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
-SERVO_FAULTS = ("silent", "answer", "reboot", "overheat", "overload", "undervoltage")
-SERVO_FAULTS += ("stuck", "jump", "frozen", "refuse", "recover")
+_AILMENTS = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
+SERVO_FAULTS = ("silent", "answer", "reboot", *_AILMENTS, "recover")
 BOARD_FAULTS = {  # kind → probability if none is given
     "torn": 0.1,
     "noisy": 0.1,
