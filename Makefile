@@ -1,5 +1,6 @@
 # make run: the simulated hand with its live page.  make test: the tests, on every processor.
 # make test ARGS=tests/unit: some of them, or options of pytest; ARGS=-n0: in one process.
+# make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
 # Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
 
 PYTHON ?= python3
@@ -9,13 +10,16 @@ INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint
 WORKERS := $(shell expr $$(nproc) + 1) # one waits for something while the others compute
 # Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
+LOWEST_PIP := build/lowest/bin/python -m pip --disable-pip-version-check --quiet install
+SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
+LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py packer.py schema.py)
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
 
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test lint format clean
+.PHONY: run test lowest lint format clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -24,6 +28,15 @@ run: $(TO_RUN)
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(COVERAGE) $(ARGS)
+
+lowest:
+	$(PYTHON) -m venv build/lowest
+	@grep -o '^    "[a-z-]*>=[0-9.]*' pyproject.toml | sed 's/ *"//; s/>=/==/; s/$$/.*/' \
+		| sort -u > build/lowest/constraints.txt
+	$(LOWEST_PIP) --constraint build/lowest/constraints.txt . pytest pytest-timeout hypothesis
+	build/lowest/bin/python -m pytest $(SERVO_TESTS) $(LOWEST_TESTS)
+	$(LOWEST_PIP) dynamixel-sdk==3.8.4
+	build/lowest/bin/python -m pytest $(SERVO_TESTS)
 
 lint: $(TO_TEST)
 	$(BIN)/ruff check .

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import sys
+from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
 
 _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
-    "view": ("the viewer needs rerun-sdk", ("rerun", "rerun_cli")),
+    "view": ("the viewer needs rerun-sdk from 0.32 on", ("rerun", "rerun_cli")),
     "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
 }
 
@@ -24,5 +27,16 @@ def require(extra: str) -> None:
     try:
         for module in modules:
             importlib.import_module(module)
+        if extra == "view":
+            importlib.import_module("rerun.archetypes.state_change")  # what older ones lack
     except ImportError:
-        raise MissingExtra(f"{needs}: pip install 'softfinger[{extra}]'") from None
+        raise MissingExtra(f"{needs}: {_install()} 'softfinger[{extra}]'") from None
+
+
+def _install() -> str:
+    """The command that installs packages beside this one, however it was installed."""
+    if (Path(sys.prefix) / "pipx_metadata.json").exists():
+        return "pipx runpip softfinger install"
+    if importlib.util.find_spec("pip") is None:  # an environment of uv's
+        return f"uv pip install --python {sys.executable}"
+    return f"{sys.executable} -m pip install"

@@ -1,7 +1,7 @@
 """The client's side of Protocol 2.0: the SDK's packet handler, group exchanges, single servos.
 
-What the SDK (4.1.0) does otherwise than the daemon needs, with its consequence; each is overridden
-here or in :mod:`servos.port`, and everything else of the SDK is used as it is:
+What the SDK (3.7.31 to 4.1.0) does otherwise than the daemon needs, with its consequence; each is
+overridden here or in :mod:`servos.port`, and everything else of the SDK is used as it is:
 
 - ``txPacket`` drops the stuffed packet: FF FF FD within goals is sent unstuffed and misread.
 - ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD: 3-8 % of group reads were seen to fail.
@@ -34,7 +34,6 @@ from dynamixel_sdk.robotis_def import (
     COMM_SUCCESS,
     COMM_TX_ERROR,
     COMM_TX_FAIL,
-    INST_FAST_SYNC_READ,
     INST_PING,
     INST_READ,
     INST_STATUS,
@@ -52,6 +51,7 @@ _PREFIX = _HEADER + b"\x00"
 _STUFFED = _HEADER + b"\xfd"
 _MAX_PACKET = 1024
 _STATUS_SIZE = 11  # bytes of a status packet without data
+_FAST_SYNC_READ = 0x8A  # which dynamixel-sdk 3 has no name for
 _ERROR = 0x7F  # of a servo's error byte; the bit above is the alert
 
 
@@ -115,7 +115,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
             if packet[8] & _ERROR:
                 return [0] * length, result, packet[8]
 
-    def rxPacket(self, port: SerialPort, fast_option: bool) -> tuple[Any, int]:
+    def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
         """The next status packet, unstuffed, and the result code.
 
         A fast reply is not stuffed and comes from the broadcast ID. A damaged packet ends the
@@ -210,7 +210,7 @@ class GroupRead:
 class FastGroupRead(GroupRead):
     """The same as a fast sync read: one reply of all, whose last CRC covers every byte of it."""
 
-    instruction = INST_FAST_SYNC_READ
+    instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
         """Ask, and wait at most ``until`` [s, time.monotonic()]; a result code of the SDK."""

@@ -55,8 +55,9 @@ class Session:
         self._looked = -math.inf
         self._resident = math.inf  # MB, the least since something is shown
         self._recording = rr.RecordingStream("softfinger")
-        self._recording.set_log_tick_enabled(False)
-        self._recording.set_log_time_enabled(False)
+        if hasattr(self._recording, "set_log_tick_enabled"):  # since Rerun 0.34
+            self._recording.set_log_tick_enabled(False)
+            self._recording.set_log_time_enabled(False)
         self._bridge = Bridge(self._recording, self._say)
 
     def show(self) -> None:

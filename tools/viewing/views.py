@@ -114,7 +114,7 @@ def blueprint(hand: ShownHand) -> rrb.Blueprint:
                         shown["tick"].view(),
                         rrb.TextDocumentView(origin="statistics", name="Tick statistics"),
                     ),
-                    rrb.StateTimelineView(origin="mode", name="Mode", time_ranges=_past(SECONDS)),
+                    rrb.StateTimelineView(origin="mode", name="Mode", **_MODE_RANGE),
                     rrb.TextLogView(origin="events", name="Events", columns=_event_columns()),
                     row_shares=[1.3, 0.8, 1.2],
                 ),
@@ -155,7 +155,7 @@ def _hand_view(hand: ShownHand) -> rrb.Spatial2DView:
 def _event_columns() -> rrb.TextLogColumns:
     """Level and text; the time of day is in the text, where it is not cut off."""
     return rrb.TextLogColumns(
-        timeline_columns=[rrb.encodings.TimelineColumn(TIME, visible=False)],
+        timeline_columns=[_ENCODINGS.TimelineColumn(TIME, visible=False)],
         text_log_columns=["LogLevel", "Body"],
     )
 
@@ -166,6 +166,11 @@ def _past(seconds: float) -> Any:
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-seconds),
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
+
+
+# Rerun before 0.38 calls encodings datatypes, and shows all of the modes.
+_ENCODINGS: Any = getattr(rrb, "encodings", None) or getattr(rrb, "datatypes")  # noqa: B009
+_MODE_RANGE: dict[str, Any] = {"time_ranges": _past(SECONDS)} if hasattr(rrb, "encodings") else {}
 
 
 def _pale(colour: tuple[int, int, int]) -> tuple[int, int, int]:
