@@ -220,20 +220,20 @@ class Converter:
         shape = (sensor.rows, sensor.cols)
         tare, gain, curve = calibration.tare, calibration.equilibrate, calibration.curve
         self.zero: FloatArray = np.array(tare.zero) if tare else np.zeros(shape)
-        self._gain: FloatArray = np.array(gain.gain) if gain else np.ones(shape)
+        self.gain: FloatArray = np.array(gain.gain) if gain else np.ones(shape)
         self._curve = np.array(curve.coefficients if curve else (1.0, pascal_per_count, 0.0, 0.0))
         self._out = np.zeros(shape)
         self._full = sensor.full_count
-        self._table, self._per_step = self._tabulated(float(self._gain.max()) * sensor.full_count)
-        self.live: NDArray[np.bool_] = self._gain > 0.0
+        self._table, self._per_step = self._tabulated(float(self.gain.max()) * sensor.full_count)
+        self.live: NDArray[np.bool_] = self.gain > 0.0
         self(np.zeros(shape, np.uint16))  # compiled here, not in the loop
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
         """Pressure [Pa] of counts [rows, cols]; the array is valid until the next call."""
         if self._table is None:
-            to_pressure(counts, self.zero, self._gain, self._curve, self._out)
+            to_pressure(counts, self.zero, self.gain, self._curve, self._out)
         else:
-            look_up_pressure(counts, self.zero, self._gain, self._table, self._per_step, self._out)
+            look_up_pressure(counts, self.zero, self.gain, self._table, self._per_step, self._out)
         return self._out
 
     def _tabulated(self, largest: float) -> tuple[FloatArray | None, float]:
@@ -254,7 +254,13 @@ class Converter:
 
     def readings(self, counts: FloatArray) -> FloatArray:
         """x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
-        return np.asarray(np.maximum(counts - self.zero, 0.0) * self._gain)
+        return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
+
+    def pressure(self, readings: FloatArray) -> FloatArray:
+        """Pressure [Pa] of readings that noise may take below 0, where the curve goes on."""
+        exponent, c1, c2, c3 = self._curve.tolist()
+        x = np.abs(readings)
+        return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
     def at(self, count: int) -> FloatArray:
         """Pressure [Pa] of each cell when it reads ``count``, a new array."""

@@ -39,6 +39,7 @@ _LEAST_TILT = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
 _LAGS = 8  # cells over which noise may be correlated
 _SEEN = 4.0  # standard errors
+_ENDED = 4.0  # of noise: a zero below it is touched by the end at 0
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -240,6 +241,29 @@ def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
+
+
+def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
+    """Mean counts of many frames as they would be if noise didn't end at 0, over such a zero.
+
+    ``zero`` and ``noise`` are a tare's mean counts and their standard deviation. Of max(x + n, 0)
+    with Gaussian n both rise with x, and so does their ratio, which tells what n is.
+    """
+    z = np.linspace(-3.0, 6.0, 1801)
+    above = 0.5 * (1.0 + np.array([math.erf(each) for each in z / math.sqrt(2.0)]))
+    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    ended = z * above + density
+    spread = np.sqrt((z * z + 1.0) * above + z * density - ended * ended)
+    rest = float(np.median(zero))
+    if not 0.0 < rest < _ENDED * noise:
+        return means - zero
+    sigma = rest / float(np.interp(rest / noise, ended / spread, ended))
+
+    def whole(counts: FloatArray) -> FloatArray:
+        near = np.minimum(counts / sigma, z[-1])
+        return np.where(counts < z[-1] * sigma, sigma * np.interp(near, ended, z), counts)
+
+    return whole(means) - whole(zero)
 
 
 @dataclass(frozen=True)

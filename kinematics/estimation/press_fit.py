@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +43,12 @@ class Presses:
     noise: float
     used: NDArray[np.bool_]
 
-    def of(self, tip: Fingertip, grid: SensorGrid, d: FloatArray) -> FloatArray:
+    def of(
+        self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT
+    ) -> FloatArray:
         """The frames of such presses by the model, for a modulus of 1, [cells that are used]."""
         made = [
-            grid.pressure(tip, _UNIT, float(depth), float(tilt))
+            grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
         ]
         return np.asarray(np.stack(made)[self.used])
@@ -55,10 +58,11 @@ class Presses:
 class TipFit:
     """How well one kind of tip explains the presses.
 
-    ``modulus`` [Pa] and the run's zero of d ``offset`` [m] are fitted, and a solid tip's ν;
-    ``chi2`` is the squared misfit a cell over the noise's. What is left when the estimator takes
-    this tip: rms errors of d [m], θ [rad] and, relative, of the force against the sensor's sum;
-    ``valid`` is the share of frames whose estimate can be used, and they are over those.
+    ``law`` is that of its material for a modulus of 1 at no strain. ``modulus`` [Pa] and the run's
+    zero of d ``offset`` [m] are fitted, and a solid tip's ν; ``chi2`` is the squared misfit a cell
+    over the noise's. What is left when the estimator takes this tip: rms errors of d [m], θ [rad]
+    and, relative, of the force against the sensor's sum; ``valid`` is the share of frames whose
+    estimate can be used, and they are over those.
     """
 
     tip: Fingertip
@@ -69,15 +73,25 @@ class TipFit:
     theta_error: float = math.nan
     force_error: float = math.nan
     valid: float = 0.0
+    law: Material = _UNIT
+
+    @property
+    def material(self) -> Material:
+        """The tip's."""
+        return _scaled(self.law, self.modulus)
 
 
-def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
+def _scaled(law: Material, factor: float) -> Material:
+    return Material(tuple(each * Fraction(factor) for each in law.coefficients), name=law.name)
+
+
+def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT) -> TipFit:
     """Modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
-        shape = presses.of(tip, grid, presses.d - offset)
-        slope = (presses.of(tip, grid, presses.d - offset + _STEP) - shape) / _STEP
+        shape = presses.of(tip, grid, presses.d - offset, law)
+        slope = (presses.of(tip, grid, presses.d - offset + _STEP, law) - shape) / _STEP
         columns = np.stack([shape, -slope], axis=1)
         modulus, moved = np.linalg.lstsq(columns, readings, rcond=None)[0]
         step = float(np.clip(moved / modulus, -5e-4, 5e-4))
@@ -87,14 +101,24 @@ def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     misfit = readings - columns @ np.array([modulus, moved])
     freedom = max(len(readings) - 2, 1)
     chi2 = float(misfit @ misfit) / (presses.noise**2 * freedom)
-    return TipFit(tip, float(modulus), offset, chi2)
+    return TipFit(tip, float(modulus), offset, chi2, law=law)
 
 
 def compare_tips(
-    presses: Presses, radius: float, grid: SensorGrid, live: NDArray[np.bool_]
+    presses: Presses,
+    radius: float,
+    grid: SensorGrid,
+    live: NDArray[np.bool_],
+    material: Material = _UNIT,
 ) -> list[TipFit]:
-    """Springs, and solid rubber on either base at its best ν: the best explanation first."""
+    """Springs, and solid rubber on either base at its best ν: the best explanation first.
+
+    Springs of a constant modulus, and of the ``material``'s law where that is another one.
+    """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
+    if not material.is_linear:
+        law = _scaled(material, 1.0 / material.reference_modulus)
+        fits.append(fit_tip(presses, Fingertip(radius), grid, law))
     for base in ("bonded", "lying"):
         fits.append(_best_poisson(presses, radius, base, grid))
     return sorted((_judged(presses, each, grid, live) for each in fits), key=lambda fit: fit.chi2)
@@ -119,9 +143,8 @@ def _best_poisson(presses: Presses, radius: float, base: Base, grid: SensorGrid)
 
 def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bool_]) -> TipFit:
     """The fit with what the estimator leaves."""
-    material = Material.constant(fit.modulus)
-    table = ContactTable.build(fit.tip, material)
-    estimator = ContactEstimator(fit.tip, material, grid, presses.noise, live=live)
+    table = ContactTable.build(fit.tip, fit.material)
+    estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, live=live)
     area = math.prod(grid.pitches)
     errors = []
     for frame, used, d, theta in zip(

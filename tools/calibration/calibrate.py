@@ -23,6 +23,8 @@ steps, in this order; each is written into FILE, which keeps the others:
 Frames come live from the sensor of the profile, load by load, or from recordings: one for each
 load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
 A live modulus may come from one press at a known speed (--speed): its zero of d is fitted.
+Without a stage, try the steps on `softfinger emulate`:
+  --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
 Each step draws its result and residuals beside FILE, where matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus: they depend on it.
 """
@@ -71,6 +73,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_speed,
         metavar="X",
         help="modulus, live: speed of one press [mm/s], instead of --d",
+    )
+    parser.add_argument(
+        "--move",
+        metavar="COMMAND",
+        help="live: a program that brings each load on and ends when it is there, as of a stage, "
+        "instead of Enter; {force}, {d} and {theta} stand for the load's",
     )
     parser.add_argument(
         "--plot", type=Path, metavar="PICTURE", help="the picture's file (default: FILE.STEP.png)"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import shlex
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -97,17 +99,32 @@ def _live(
     with _opened(settings, clock, finger) as backend:
         for k in range(count):
             if count > 1 or truths:
-                words = [f"{name} {values[k] / _UNITS[name]:g}" for name, values in truths.items()]
-                _say(
-                    f"load {k + 1} of {count}: {', '.join(words) or 'uniform pressure'}; "
-                    "then press Enter"
-                )
-                if not sys.stdin.readline():
+                load = {name: values[k] / _UNITS[name] for name, values in truths.items()}
+                words = ", ".join(f"{name} {value:g}" for name, value in load.items())
+                ask = "" if arguments.move else "; then press Enter"
+                _say(f"load {k + 1} of {count}: {words or 'uniform pressure'}{ask}")
+                if arguments.move:
+                    _move(arguments.move, {"load": k + 1, **load})
+                elif not sys.stdin.readline():
                     raise CalibrationError("ended before all loads were on")
             # A frame scanned before this moment may still show the last load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
+
+
+def _move(command: str, load: dict[str, float]) -> None:
+    """Run the stage's program for one load, until it ends. Raises CalibrationError."""
+    try:
+        words = [
+            word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})
+            for word in shlex.split(command)
+        ]
+        done = subprocess.run(words, stdin=subprocess.DEVNULL, timeout=_WAIT).returncode
+    except (LookupError, ValueError, OSError, subprocess.TimeoutExpired) as error:
+        raise CalibrationError(f"--move: {command}: {error}") from None
+    if done != 0:
+        raise CalibrationError(f"--move: {command}: it ended with {done}")
 
 
 def _live_run(

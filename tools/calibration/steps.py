@@ -44,6 +44,7 @@ from softfinger.kinematics.estimation.calibration import (
     fit_law,
     fit_modulus,
     tare,
+    without_end,
 )
 from softfinger.kinematics.estimation.press_fit import Presses, TipFit, compare_tips
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -87,13 +88,22 @@ class Step:
         return self.loads.truths.get("theta", np.zeros(len(self.loads.frames)))
 
     @cached_property
+    def over(self) -> list[FloatArray]:
+        """Each load's mean counts over the zero times the gains, as if no noise ended at 0."""
+        tare, zero, gain = self.calibration.tare, self.converter.zero, self.converter.gain
+        means = [frames.mean(axis=0) for frames in self.loads.frames]
+        if tare is None or self.settings.tactile.threshold:
+            return [(each - zero) * gain for each in means]
+        return [without_end(each, zero, tare.noise) * gain for each in means]
+
+    @cached_property
     def readings(self) -> list[FloatArray]:
         """Each load's mean reading, cleared of noise far from the contact."""
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
         spread = np.full(self.converter.zero.shape, noise)
         return [
-            cleared(self.converter.readings(frames.mean(axis=0)), spread, len(frames))
-            for frames in self.loads.frames
+            cleared(np.maximum(each, 0.0), spread, len(frames))
+            for each, frames in zip(self.over, self.loads.frames, strict=True)
         ]
 
     @cached_property
@@ -292,13 +302,21 @@ def _law(step: Step) -> Done:
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
     noise = settings.tactile.noise / math.sqrt(min(map(len, step.loads.frames)))
     live = step.converter.live
-    presses = Presses(step.pressures, d, theta, noise, live & ~full)
-    fits = compare_tips(presses, settings.tip.radius, grid, live)
+    signed = np.stack([step.converter.pressure(each) for each in step.over])
+    presses = Presses(signed, d, theta, noise, live & ~full)
+    material = make_material(settings.material)
+    fits = compare_tips(presses, settings.tip.radius, grid, live, material)
     best = fits[0]
     if best.valid == 0.0:
         raise CalibrationError(f"law: none explains these presses; the best: {_told(best)}")
+    strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
     result = ModulusStep(
-        date=now(), modulus=best.modulus, offset=best.offset, residual=best.force_error
+        date=now(),
+        modulus=best.modulus,
+        strain=strain,
+        stress=[float(best.material.stress(each)) for each in strain],
+        offset=best.offset,
+        residual=best.force_error,
     )
     line = "\n  ".join(map(_told, fits))
     wanted = f'tip.physics = "{best.tip.physics}"'
@@ -309,7 +327,7 @@ def _law(step: Step) -> Done:
 
 
 def _told(fit: TipFit) -> str:
-    name = "springs"
+    name = "springs" if fit.law.is_linear else f"springs, law {fit.law.name}"
     if fit.tip.physics == "solid":
         name = f"solid, {fit.tip.base}, ν {fit.tip.poisson:.3f}"
     words = (

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+import time
 from pathlib import Path
 
 from softfinger.daemon.errors import SettingsError
@@ -11,6 +13,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 from softfinger.tools.ending import Interrupted, Signals
 
+_CYCLE = "depth=4mm speed=4mm/s hold=1s"  # of a bare --press: what `calibrate modulus` asks for
+_LOOK = 0.1  # s between two looks at a plate's way
 _FAULTS = """\
 faults, each KIND[=VALUE][@SECONDS], given as often as needed:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
@@ -26,6 +30,17 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
   @SECONDS         when it starts; at once without
 
 softfinger emulate --send "drop=0.01 left:frozen@2" changes a running one, by DIR/control.
+
+a plate on a stage, which presses a tip instead of the object, so that `calibrate` can be tried:
+  --press [PRESSES], or --send "press PRESSES" while it runs, which returns when the plate is there
+  PRESSES are separated by commas, each some of these words:
+    depth=4mm      or force=5N; or pressure=10kPa on all cells, as by a bladder; depth=0mm lifts off
+    tilt=10deg     of the plate (0)
+    speed=2mm/s    of the way there (5)
+    hold=1s        then it lifts off; a last press without it stays, others rest for 1 s. Where the
+                   last one ends, all begin anew
+    tip=left       or right (both)
+  The log says what a tip feels where a plate has come to rest. The joints don't feel it.
 
 the object, where it slipped away: --send place puts it back, at rest and without a load.
 
@@ -97,6 +112,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "report; then end",
     )
     parser.add_argument(
+        "--press",
+        nargs="?",
+        const=_CYCLE,
+        metavar="PRESSES",
+        help="a plate presses the tips, round after round; see below",
+    )
+    parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
     )
 
@@ -161,12 +183,18 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
             faults=arguments.fault,
             table_cache=table_cache(),
             undisturbed=signals.held,
+            tell=lambda line: print(line, file=sys.stderr, flush=True),
         )
     except (EmulatorError, SettingsError) as error:
         print(f"softfinger: {error}", file=sys.stderr)
         return 1
     try:
         signals.hand_over(emulator)
+        if arguments.press is not None:
+            problem = emulator.press(arguments.press)
+            if problem.startswith("error: "):
+                print(f"softfinger: {problem.removeprefix('error: ')}", file=sys.stderr)
+                return 1
         with RealTime(_unhurried(settings, arguments.baud > 0)):
             emulator.run(lambda: print("ready", flush=True))
     finally:
@@ -192,6 +220,13 @@ def _send(folder: Path, words: str) -> int:
 
     try:
         reply = send_words(folder, words)
+        # The way takes the emulated hand's time, which stands still while that is held up.
+        while words.startswith("press") and reply.startswith("{"):
+            left = json.loads(reply)["wait"]
+            if left == 0.0:
+                return 0
+            time.sleep(min(left, _LOOK))
+            reply = send_words(folder, "press")
     except NoEmulator as error:
         reply = f"error: {error}"
     if reply.startswith("error: "):

@@ -24,6 +24,7 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.simulation.emulator.folder import ControlPort, FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
 from softfinger.daemon.simulation.faults import (
@@ -112,12 +113,13 @@ class Emulator:
         faults: Iterable[str] = (),
         table_cache: Path | None = None,
         undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+        tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
         ``faults``: see :func:`parse_faults`. ``table_cache``: a folder where the contact table is
         kept. ``undisturbed``: a context without exceptions of signal handlers, for making what has
-        to be removed again.
+        to be removed again. ``tell`` takes the log's lines: where a plate has come to rest.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
@@ -128,7 +130,9 @@ class Emulator:
         self._watched: list[int | TactileBoard | socket.socket] | None = None
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
-        self._sources: list[SimulatedTactile] = []
+        self._sources: dict[str, SimulatedTactile] = {}
+        self._plates: dict[str, Plate] = {}
+        self._tell = tell
         self._advance_due = 0.0
         self._pushed: float | None = None  # when a load on the object last changed
         self._slipped: float | None = None  # when both tips last stuck before one slipped
@@ -183,7 +187,7 @@ class Emulator:
             simulation.tactile_delay,
             seed=simulation.seed + finger,
         )
-        self._sources.append(source)
+        self._sources[FINGERS[finger]] = source
         self._boards[FINGERS[finger]] = board
         self._closers.append(board.close)
         with self._undisturbed():
@@ -194,7 +198,7 @@ class Emulator:
         ready = False
         while not self._stopping:
             self._turn()
-            if not ready and all(source.latest() is not None for source in self._sources):
+            if not ready and all(source.latest() is not None for source in self._sources.values()):
                 ready = True
                 on_ready()
 
@@ -262,6 +266,9 @@ class Emulator:
         else:
             self.hand.advance(t)
         self._advance_due = t + _STEP
+        for finger, plate in self._plates.items():
+            if press := plate.reached(t):
+                self._tell(f"plate: {finger} {press}")
         if self._slipped is None:
             most = _SLIPS * self._simulation.tip_friction
             tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
@@ -277,9 +284,11 @@ class Emulator:
         A time behind a word counts from now. With ``report`` among them the answer is
         :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
         ``forget`` begins the record anew; ``place`` puts the object back where it was at the
-        start, at rest and with no load on it.
+        start, at rest and with no load on it. ``press …`` is for :meth:`press`.
         """
         words = text.split()
+        if words[:1] == ["press"]:
+            return self.press(text.partition("press")[2])
         try:
             faults = [word for word in words if word not in _REQUESTS]
             fresh = parse_faults(faults, self._ids)
@@ -299,6 +308,27 @@ class Emulator:
         self._events.sort(key=lambda event: event.after)
         self._advance_due = now  # so that what starts now does
         return reply
+
+    def press(self, text: str) -> str:
+        """Let plates do the presses of ``text``; without any, tell how far the last ones are.
+
+        ``error: `` and why not, or JSON: ``wait``, the time until the last press is reached [s], 0
+        then.
+        """
+        now = self.clock.now()
+        if text.strip():
+            try:
+                presses = parse_presses(text, self.hand.table, self._simulation.modulus_scale)
+            except PlateError as error:
+                return f"error: {error}"
+            if missing := presses.keys() - self._sources.keys():
+                return f"error: press: no sensor under the {missing.pop()} tip"
+            for finger, sequence in presses.items():
+                plate = self._plates.setdefault(finger, Plate())
+                plate.go(sequence, now)
+                self._sources[finger].stage = plate
+        ends = [plate.arrives - now for plate in self._plates.values()]
+        return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
 
     def _answer(self, text: str) -> str:
         """:meth:`request`, with what starts now in force before the reply goes out."""

@@ -222,6 +222,10 @@ class SensorModel:
             deviation = flaws.drift / self._per_count
             drift(self._offset, deviation, flaws.drift_time, elapsed, self._normals)
 
+    def press_evenly(self, pressure: float) -> None:
+        """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""
+        self._pressure[:] = pressure
+
     def read(self, out: NDArray[np.uint16]) -> None:
         """Write the counts of what the cells feel into ``out``."""
         flaws = self._flaws

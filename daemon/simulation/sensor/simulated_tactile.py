@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +32,22 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
     )
 
 
+class StageTouch(NamedTuple):
+    """What something else than the hand's object does to a tip at an instant."""
+
+    d: float  # m
+    theta: float  # rad
+    pressure: float  # on all cells instead [Pa]
+
+
 class SimulatedTactile:
     """Frames of one fingertip of a :class:`SimulatedHand`.
 
     A frame is due at every k / ``tactile.rate`` since the hand's start, shows the contact of that
     instant and arrives ``simulation.tactile_delay`` later, or later still, or never (see
     :class:`Arrivals`). Only the newest that has arrived is read, and only when it is asked for;
-    ``seq`` counts the others too.
+    ``seq`` counts the others too. ``stage``, where there is one, presses the tip instead of the
+    hand's object: it takes the time since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
@@ -57,6 +68,7 @@ class SimulatedTactile:
         self._model = make_sensor_model(settings, finger)
         self._radius = settings.tip.radius
         self._solid = settings.tip.physics == "solid"
+        self.stage: Callable[[float], StageTouch] | None = None
         self._pressed = -1  # number of the newest sample that the cells have felt
         self._frame: Frame | None = None
         self._lost = 0
@@ -115,6 +127,12 @@ class SimulatedTactile:
 
     def _press(self, number: int) -> bool:
         """Let the cells feel sample ``number``; False when the plant no longer has it."""
+        if self.stage is not None:
+            touch = self.stage(number * self._period)
+            self._model.press(touch.d, touch.theta, 0.0, number * self._period)
+            if touch.pressure > 0.0:
+                self._model.press_evenly(touch.pressure)
+            return True
         if number < self._hand.samples - self._hand.kept_samples:
             return False
         sample = self._hand.sample(number)

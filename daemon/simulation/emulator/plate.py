@@ -1,0 +1,186 @@
+"""A plate on a stage that presses a tip of the emulated hand: so deep, so tilted, so fast.
+
+For trying calibration without metal: the sensor feels the plate instead of the object, and what it
+feels is known. The plate has no friction; the finger's joint doesn't feel it, as in a clamp.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
+from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.table import ContactTable
+
+_CLEAR = 1e-3  # m over the tip, where the plate tilts and waits
+_LIFT = 0.02  # m/s
+_FILL = 0.1  # s that a bladder takes
+_BETWEEN = 1.0  # s clear of the tip between two presses
+
+_UNITS = {
+    "depth": {"mm": 1e-3, "m": 1.0},
+    "force": {"N": 1.0},
+    "pressure": {"kPa": 1e3, "Pa": 1.0},
+    "tilt": {"deg": math.pi / 180.0, "°": math.pi / 180.0, "rad": 1.0},
+    "speed": {"mm/s": 1e-3, "m/s": 1.0},
+    "hold": {"s": 1.0, "ms": 1e-3},
+}
+_LOADS = ("depth", "force", "pressure")
+_NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
+
+
+class PlateError(SoftfingerError, ValueError):
+    """Presses that can't be understood or done. The message says what is expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlatePress:
+    """To ``d`` [m] at ``theta`` [rad], or a uniform ``pressure`` [Pa] on all cells instead.
+
+    ``force`` [N] is what the tip's base then feels; ``hold`` [s], inf: until told otherwise.
+    """
+
+    d: float
+    theta: float
+    pressure: float
+    force: float
+    speed: float
+    hold: float
+
+    def __str__(self) -> str:
+        if self.pressure > 0.0:
+            return f"{self.pressure / 1e3:g} kPa on all cells"
+        if self.d <= 0.0:
+            return "clear of the tip"
+        return f"{self.d * 1e3:.3f} mm at {math.degrees(self.theta):.2f}°, {self.force:.3f} N"
+
+
+def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
+    """The presses of each finger's tip: ``[tip=left] depth=4mm [tilt=10deg] …, …``.
+
+    Each has one of depth (0 lifts off), force and pressure (uniform, as by a bladder), and may have
+    tilt, speed, hold, tip (left, right or both, the default). Without ``hold`` the last one stays,
+    others rest for a second. Forces are ``scale`` times the ``table``'s. Raises PlateError.
+    """
+    made: dict[str, list[PlatePress]] = {}
+    each = [part.split() for part in text.split(",")]
+    for k, words in enumerate(each):
+        values = {"tilt": 0.0, "speed": 0.005, "hold": 1.0 if k < len(each) - 1 else math.inf}
+        tip = "both"
+        for word in words:
+            name, _, value = word.partition("=")
+            if name == "tip" and value in (*FINGERS, "both"):
+                tip = value
+            else:
+                values[name] = _value(name, value)
+        load = [name for name in _LOADS if name in values]
+        if len(load) != 1:
+            raise PlateError(f"press {' '.join(words)!r}: expected one of {', '.join(_LOADS)}")
+        press = _press(values, table, scale)
+        for finger in FINGERS if tip == "both" else (tip,):
+            made.setdefault(finger, []).append(press)
+    return made
+
+
+def _value(name: str, text: str) -> float:
+    units = _UNITS.get(name)
+    if units is None:
+        raise PlateError(f"press: found {name!r}, expected {', '.join(_UNITS)} or tip=left|right")
+    match = _NUMBER.fullmatch(text)
+    number, unit = match.groups() if match else ("nan", "")
+    try:
+        value = float(number) * units[unit]
+    except (ValueError, KeyError):
+        value = math.nan
+    if not math.isfinite(value) or (name != "tilt" and value < 0.0):
+        raise PlateError(f"press: {name}={text}: expected a number with {' or '.join(units)}")
+    if name == "speed" and value == 0.0:
+        raise PlateError("press: speed: expected above 0")
+    return value
+
+
+def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
+    d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
+    # As far as the tip's law goes at that tilt; by the lookup that the plant has compiled, too.
+    most = table.tip.radius * (1.0 - abs(math.sin(theta)))
+    known = [(float(x), table(float(x), theta)) for x in np.linspace(0.0, 0.75 * most, 1001)]
+    depths = [x for x, contact in known if contact.inside]
+    forces = [scale * float(contact.force) for _, contact in known if contact.inside]
+    if "force" in values:
+        d = float(np.interp(values["force"], forces, depths, right=math.inf))
+    if d > depths[-1]:
+        raise PlateError(
+            f"press: at {math.degrees(theta):g}° this tip takes {depths[-1] * 1e3:.2f} mm or "
+            f"{forces[-1]:.1f} N at most"
+        )
+    force = scale * float(table(d, theta).force)
+    return PlatePress(d, theta, pressure, force, values["speed"], values["hold"])
+
+
+class Plate:
+    """The plate over one tip. Its way is a line through knots; times are the hand's [s]."""
+
+    def __init__(self) -> None:
+        self._t = [0.0]
+        self._d = [-_CLEAR]
+        self._doing: list[tuple[PlatePress | None, bool]] = [
+            (None, False)
+        ]  # from a knot on; if at rest
+        self._round = math.inf, 1.0  # where rounds begin, and their length
+        self._told = -1
+        self.arrives = 0.0  # when a sequence's last press is reached for the first time
+
+    def go(self, presses: Sequence[PlatePress], t: float) -> None:
+        """Lift off and do ``presses`` from ``t`` on: round after round if the last one ends."""
+        d, (press, _) = max(self(t).d, -_CLEAR), self._doing[self._leg(t)]
+        self._t, self._d, self._doing, self._told = [t], [d], [], -1
+        self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
+        begin = self._t[-1]
+        for press in presses:
+            d = press.d if press.d > 0.0 else -_CLEAR
+            travel = (d + _CLEAR) / press.speed + (_FILL if press.pressure > 0.0 else 0.0)
+            self._add(travel, d, press)
+            self.arrives = self._t[-1]
+            if press.hold < math.inf:
+                self._add(press.hold, d, press, rests=True)
+                self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
+                self._add(_BETWEEN, -_CLEAR, None)
+        self._doing.append((presses[-1], True))
+        ends = presses[-1].hold < math.inf
+        self._round = (begin, self._t[-1] - begin) if ends else (math.inf, 1.0)
+
+    def _add(
+        self, duration: float, d: float, press: PlatePress | None, rests: bool = False
+    ) -> None:
+        self._t.append(self._t[-1] + duration)
+        self._d.append(d)
+        self._doing.append((press, rests))
+
+    def __call__(self, t: float) -> StageTouch:
+        """What the tip feels at ``t``."""
+        press, rests = self._doing[self._leg(t)]
+        d = float(np.interp(self._within(t), self._t, self._d))
+        if press is None:
+            return StageTouch(d, 0.0, 0.0)
+        return StageTouch(d, press.theta, press.pressure if rests else 0.0)
+
+    def reached(self, t: float) -> PlatePress | None:
+        """The press that has come to rest since the last call; None: none has."""
+        leg = self._leg(t)
+        press, rests = self._doing[leg]
+        fresh = rests and leg != self._told
+        self._told = leg if rests else -1
+        return press if fresh else None
+
+    def _within(self, t: float) -> float:
+        begin, length = self._round
+        return t if t < begin else begin + (t - begin) % length
+
+    def _leg(self, t: float) -> int:
+        return max(int(np.searchsorted(self._t, self._within(t), side="right")) - 1, 0)

@@ -1,0 +1,78 @@
+"""Calibration without metal: `emulate --press` and `calibrate` on a tip of solid rubber."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+
+import pytest
+
+from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.simulation.emulator.folder import send_words
+from softfinger.tools.cli import main
+from tests.harness.emulated import HIL, emulated
+
+LINEAR = ["--set", "material.law=constant", "--set", "material.modulus=0.3e6"]
+RUBBER = ["tip.physics=solid", "tip.poisson=0.48", "safety.d_max=0.008", *LINEAR[1::2]]
+
+
+class Stage:
+    """A person at the stage: reads what is wanted, presses so, then Enter."""
+
+    def __init__(self, folder, presses):
+        self._folder, self._presses = folder, list(presses)
+
+    def readline(self):
+        reply = send_words(self._folder, f"press {self._presses.pop(0)} speed=100mm/s")
+        while json.loads(reply)["wait"] > 0.0:
+            threading.Event().wait(0.01)
+            reply = send_words(self._folder, "press")
+        return "\n"
+
+
+@pytest.fixture(scope="module")
+def rubber(tmp_path_factory):
+    """A hand with tips of solid rubber, its log, and a tared calibration file."""
+    folder = tmp_path_factory.mktemp("hand")
+    log = []
+    with emulated(folder, settings=load(HIL, folder, RUBBER), tell=log.append):
+        yield folder, log
+
+
+def calibrate(folder, step, *words):
+    arguments = ["calibrate", step, str(folder / "left.json"), "--config", "hil", *LINEAR]
+    return main([*arguments, "--dir", str(folder), "--no-plot", "--frames", "40", *words])
+
+
+def test_a_tip_of_rubber_is_told_from_springs(rubber, monkeypatch, capsys):
+    folder, log = rubber
+    assert calibrate(folder, "tare") == 0
+    presses = [(1, 0), (2, 0), (3, -10), (4, 20)]
+    stage = Stage(folder, [f"tip=left depth={d}mm tilt={theta}deg" for d, theta in presses])
+    monkeypatch.setattr(sys, "stdin", stage)
+    known = ["--d", "1", "2", "3", "4", "--theta", "0", "0", "-10", "20"]
+    assert calibrate(folder, "law", *known) == 0
+    told = capsys.readouterr().out
+    assert 'for the profile: tip.physics = "solid", tip.base = "bonded"' in told
+    found = load_calibration(folder / "left.json").modulus
+    assert found.modulus == pytest.approx(0.3e6, rel=0.1)
+    assert found.offset == pytest.approx(0.0, abs=1e-4)
+    assert log[-1].startswith("plate: left 4.000 mm at 20.00°, ")
+
+
+def test_a_stage_moved_by_a_program_and_a_press_at_known_speed(rubber, capsys):
+    folder, _ = rubber
+    stage = f"{sys.executable} -m softfinger emulate --dir {folder} --send"
+    move = ["--move", f"{stage} 'press force={{force}}N speed=100mm/s'"]
+    assert calibrate(folder, "curve", "--force", "5", "15", *move) == 0
+    assert "forces within" in capsys.readouterr().out
+    assert calibrate(folder, "curve", "--force", "1e4", *move) == 1
+    assert "it ended with 1" in capsys.readouterr().err
+    # Round after round, without a word from here.
+    assert main(["emulate", "--dir", str(folder), "--send", "press depth=3mm hold=200ms"]) == 0
+    solid = ["--set", "tip.physics=solid", "--set", "safety.d_max=0.008"]
+    assert calibrate(folder, "modulus", "--speed", "5", *solid) == 0
+    found = load_calibration(folder / "left.json").modulus
+    assert found.modulus == pytest.approx(0.3e6, rel=0.15)

@@ -1,0 +1,86 @@
+"""The plate that presses an emulated tip: its words, its way, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from softfinger import ContactTable, Fingertip, Material
+from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
+from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
+
+TABLE = ContactTable.build(Fingertip(0.020), Material.constant(0.3e6))
+FORCE = math.pi * 0.3e6 * 0.004**2  # N at 4 mm
+
+
+def test_presses_in_words() -> None:
+    words = (
+        "tip=left depth=4mm tilt=10deg speed=2mm/s hold=500ms, force=5N, tip=right pressure=2kPa"
+    )
+    both = parse_presses(words, TABLE, 1.0)
+    first, second = both["left"]
+    assert (first.d, first.speed, first.hold) == pytest.approx((0.004, 0.002, 0.5))
+    assert first.theta == pytest.approx(math.radians(10.0))
+    assert first.force == pytest.approx(FORCE / math.cos(first.theta))
+    assert (second.force, second.hold) == pytest.approx((5.0, 1.0), rel=1e-4)
+    assert second.d == pytest.approx(math.sqrt(5.0 / (math.pi * 0.3e6)), rel=1e-4)
+    assert [each.pressure for each in both["right"]] == [0.0, 2e3]
+    assert both["right"][-1].hold == math.inf
+    stiffer = parse_presses("depth=4mm", TABLE, 1.3)["left"][0]
+    assert stiffer.force == pytest.approx(1.3 * FORCE)
+    assert str(stiffer) == "4.000 mm at 0.00°, 19.604 N"
+
+
+def test_a_plate_goes_down_holds_lifts_off_and_begins_anew() -> None:
+    plate = Plate()
+    assert plate(5.0) == (-0.001, 0.0, 0.0)
+    plate.go(parse_presses("depth=4mm tilt=-10deg speed=5mm/s hold=1s", TABLE, 1.0)["left"], 10.0)
+    assert plate.arrives == pytest.approx(11.0)  # from 1 mm over the tip
+    tilt = -math.radians(10.0)
+    assert plate(10.5) == pytest.approx((0.0015, tilt, 0.0))
+    assert plate.reached(10.99) is None
+    assert plate(11.5) == pytest.approx((0.004, tilt, 0.0))
+    reached = plate.reached(11.5)
+    assert reached is not None
+    assert reached.d == 0.004
+    assert plate.reached(11.9) is None  # the same
+    assert plate(12.125) == pytest.approx((0.0015, tilt, 0.0))
+    assert plate(12.5).d == -0.001
+    again = 13.25  # 1 s clear, then the next round
+    assert plate(again + 0.5) == pytest.approx((0.0015, tilt, 0.0))
+    assert plate.reached(again + 0.5) is None
+    assert plate.reached(again + 1.1) is not None
+
+
+def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays() -> None:
+    plate = Plate()
+    plate.go(parse_presses("depth=4mm", TABLE, 1.0)["left"], 0.0)
+    assert plate(1e4) == (0.004, 0.0, 0.0)
+    plate.go(parse_presses("depth=2mm tilt=20deg speed=3mm/s", TABLE, 1.0)["left"], 20.0)
+    assert plate(20.1) == pytest.approx((0.002, 0.0, 0.0))
+    assert plate(20.26).d < 0.0
+    assert plate(21.25) == pytest.approx((0.002, math.radians(20.0), 0.0))
+    plate.go(parse_presses("pressure=3kPa", TABLE, 1.0)["left"], 30.0)
+    assert plate(plate.arrives + 1.0) == StageTouch(-0.001, 0.0, 3e3)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("depth=4", "expected a number with mm or m"),
+        ("depth=4deg", "expected a number with mm or m"),
+        ("depth=-1mm", "expected a number with mm or m"),
+        ("tilt=10deg", "expected one of depth, force, pressure"),
+        ("depth=1mm force=2N", "expected one of depth, force, pressure"),
+        ("depht=4mm", "found 'depht'"),
+        ("tip=thumb depth=1mm", "found 'tip'"),
+        ("depth=40mm", "this tip takes 15.00 mm or 212.1 N at most"),
+        ("force=1e5N", "this tip takes"),
+        ("depth=1mm tilt=90deg", "at 90° this tip takes 0.00 mm"),
+        ("depth=1mm speed=0mm/s", "expected above 0"),
+    ],
+)
+def test_what_no_plate_can_do(words: str, told: str) -> None:
+    with pytest.raises(PlateError, match=told):
+        parse_presses(words, TABLE, 1.0)
