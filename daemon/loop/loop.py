@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from softfinger.daemon.clock import LoopClock
-from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.control.modes import GRIPPING, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskOver
 from softfinger.daemon.errors import Refused, ServoError
@@ -240,12 +240,15 @@ class Loop:
         if self._task is not None:
             self._follow(self._task)
         state.mode = control.mode
-        self._judge()
-        if self._safety.must_hold(state):
+        breach = self._safety.judge(state)
+        if breach is not None or self._safety.warnings or self._after_opening is not None:
+            self._react(breach)
+        if self._safety.must_hold and state.mode in GRIPPING:
             control.coast(state.goal)
         else:
             control.step(self.period, state.goal)
-        self._emit_events()
+        if control.events or self.perception.events or self._reports:
+            self._emit_events()
         state.mode = control.mode
 
     def _emit_events(self) -> None:
@@ -256,9 +259,9 @@ class Loop:
         while self._reports:
             self.emit(*self._reports.popleft())
 
-    def _judge(self) -> None:
+    def _react(self, breach: Breach | None) -> None:
+        """Report new warnings, and open the hand or turn torque off for a fault."""
         state, control, safety = self.state, self._control, self._safety
-        breach = safety.judge(state)
         for warning in safety.warnings:
             self.emit("warning", *warning)
         safety.warnings.clear()

@@ -68,6 +68,7 @@ class FingerPerception:
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frames = 0  # that came
+        self.changed = 0.0  # when one that differs from the last arrived [s]
         self.estimate = ContactEstimate()  # of the last valid frame
         live = getattr(sensor, "live", None)  # of a recording that lacks cells
         self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
@@ -97,9 +98,11 @@ class FingerPerception:
 
     def update(self) -> Frame | None:
         """The newest frame, estimated, where it is a new one; None where it is not."""
-        frame = self.sensor.latest()
-        if frame is None or frame is self.frame:
+        frame, last = self.sensor.latest(), self.frame
+        if frame is None or frame is last:
             return None
+        if last is None or frame.data.tobytes() != last.data.tobytes():
+            self.changed = frame.t_arrival
         self.frame = frame
         self.frames += 1
         counts = frame.data

@@ -12,12 +12,11 @@ stands in `safety.safety`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
@@ -25,7 +24,7 @@ from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
-from softfinger.daemon.types import FINGERS, Contact, Frame, Reading, State
+from softfinger.daemon.types import FINGERS, State
 
 _PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
 _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
@@ -57,8 +56,6 @@ class View:
         self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
         self.bad_goal = False  # a goal was not finite since the last judgement
         self.grip_width = math.nan  # of the object when it was gripped [m]
-        self.seen: list[Frame | None] = [None, None]
-        self.changed = [0.0, 0.0]  # when a frame last differed from the one before it [s]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
             model = by_name(settings.servos.model)
@@ -83,10 +80,11 @@ Text = Callable[[View, State, int, float], str]  # the finger, 0 if of the hand;
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One row. Without ``holds`` and ``check`` it is met elsewhere: in `Safety.bound`, on the bus.
+    """One row. Without ``holds`` and ``check`` it is met elsewhere: in `Safety.write`, on the bus.
 
-    ``holds`` is an expression of `holding`'s names, in which numbers of the settings are filled in:
-    `safety.safety` joins those of every tick to one. What takes more to compute is a ``check``.
+    ``holds`` is an expression of `checking`'s names, with numbers of the settings filled in:
+    `safety.safety` joins those of every tick to one check. What takes more to compute is a
+    ``check``.
     """
 
     name: str
@@ -103,27 +101,24 @@ class Limit:
     in_turn: bool = False  # one such ``holds`` or ``check`` is judged a tick; the others at each
     gripping: bool = False  # stands only while the hand grips
 
-    def terms(self, view: View, share: str) -> list[tuple[int, str]]:
-        """``holds`` for each finger it is about, in Python, with ``share`` of the bound."""
+    def terms(self, view: View, share: str) -> dict[str, int]:
+        """``holds`` of each finger it is about, in Python, with ``share`` of the bound."""
         settings = view.settings
         fingers = view.fingers if "{i}" in self.holds else [0] * bool(self.holds)
         sections = {name: getattr(settings, name) for name in type(settings).model_fields}
-        return [
-            (
-                i,
-                self.holds.format(
-                    **sections,
-                    i=i,
-                    share=share,
-                    low=settings.hand.q_min[i] - _PAST_STOP,
-                    high=settings.hand.q_max[i] + _PAST_STOP,
-                    all=_ALL,
-                    friction=_usable(settings),
-                    frame_age=settings.safety.frame_age_fault / settings.tactile.rate,
-                ),
-            )
+        return {
+            self.holds.format(
+                **sections,
+                i=i,
+                share=share,
+                low=settings.hand.q_min[i] - _PAST_STOP,
+                high=settings.hand.q_max[i] + _PAST_STOP,
+                all=_ALL,
+                friction=_usable(settings),
+                frame_age=settings.safety.frame_age_fault / settings.tactile.rate,
+            ): i
             for i in fingers
-        ]
+        }
 
 
 def _usable(settings: Settings) -> float:
@@ -131,10 +126,21 @@ def _usable(settings: Settings) -> float:
     return settings.control.tip_friction * (1.0 - settings.control.slip_margin)
 
 
-def holding(expression: str) -> Callable[[State, Reading, list[Contact], View, float], bool]:
-    """The function of an expression of ``state, reading, contacts, view, share``."""
-    source = f"lambda state, reading, contacts, view, share: {expression}"
-    return cast(Callable[..., bool], eval(source, {"sin": math.sin, "GRIPPING": GRIPPING}))
+def checking(terms: Mapping[str, int], text: Text | None) -> Check:
+    """A check by expressions of ``state, reading, contacts, view, share``, each of a finger.
+
+    It reports the first that does not hold.
+    """
+    source = [
+        "def check(view, state, share):",
+        " reading, contacts = state.reading, state.contacts",
+    ]
+    source += [
+        f" if not ({term}): return text(view, state, {i}, share)" for term, i in terms.items()
+    ]
+    names: dict[str, Any] = {"sin": math.sin, "GRIPPING": GRIPPING, "text": text}
+    exec("\n".join([*source, ' return ""']), names)
+    return cast(Check, names["check"])
 
 
 # --- texts of the limits that are judged at every tick --------------------------------------------
@@ -283,28 +289,12 @@ def _hand_torque(view: View, state: State, share: float) -> str:
     return ""
 
 
-def _remember_frames(view: View, _: State) -> None:
-    for sensor in view.sensors:
-        finger, frame, seen = sensor.finger, sensor.frame, view.seen[sensor.finger]
-        if frame is not None and frame is not seen:
-            if seen is None or not _same(frame.data, seen.data):
-                view.changed[finger] = frame.t_arrival
-            view.seen[finger] = frame
-
-
-def _same(data: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
-    """Equal in every cell. Live frames differ in their middle row already, which is quick."""
-    middle = len(data) // 2
-    if data.shape == other.shape and data[middle].tobytes() != other[middle].tobytes():
-        return False
-    return np.array_equal(data, other)
-
-
 def _frozen(view: View, state: State, _: float) -> str:
-    for finger, frame in enumerate(view.seen):
-        same = 0.0 if frame is None else frame.t_arrival - view.changed[finger]
-        if same > view.limits.frozen_after > 0.0 and state.contacts[finger].contact:
-            return f"tactile: {FINGERS[finger]} sensor frozen, the same frame for {same:.2f} s"
+    for sensor in view.sensors:
+        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed
+        if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
+            side = FINGERS[sensor.finger]
+            return f"tactile: {side} sensor frozen, the same frame for {same:.2f} s"
     return ""
 
 
@@ -414,7 +404,7 @@ LIMITS: tuple[Limit, ...] = (
         ("safety.frame_age_fault", "safety.frame_age_action"), _T,
         "state.t - contacts[{i}].t_sound <= {frame_age}", _tactile_silent, gripping=True),
     Limit("tactile.frozen", "frames that are the same again and again while something touches",
-        "fault", ("safety.frozen_after",), _T, check=_frozen, remember=_remember_frames),
+        "fault", ("safety.frozen_after",), _T, check=_frozen),
     Limit("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), _T,
         check=_saturated, lasts=0.1),
     Limit("tactile.misfit", "frames that fit no contact of the model", "warn", ("tactile.noise",),

@@ -16,7 +16,7 @@ from softfinger.daemon.control.modes import GRIPPING, Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.limits import LIMITS, Limit, View, holding
+from softfinger.daemon.safety.limits import LIMITS, Limit, View, checking
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
@@ -39,39 +39,37 @@ class _Watch:
 
     def __init__(self, limit: Limit, view: View) -> None:
         self.limit = limit
-        self._view = view
-        self._terms = [(i, holding(term)) for i, term in limit.terms(view, "share")]
+        self.check = limit.check or checking(limit.terms(view, "share"), limit.text)
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
         self.since = math.inf  # broken since then, inf: it is not
-        self._ended = -math.inf
         self.reported = False
+        self._ended = -math.inf
 
-    def find(self, state: State, share: float) -> str:
-        """What breaks this share of the limit in this state, or an empty text."""
-        view, limit = self._view, self.limit
-        if limit.check is not None:
-            return limit.check(view, state, share)
-        for i, holds in self._terms:
-            if not holds(state, state.reading, state.contacts, view, share):
-                assert limit.text is not None
-                return limit.text(view, state, i, share)
-        return ""
-
-    def look(self, state: State) -> str:
-        """What stands at this tick and has for long enough; keeps count of how long."""
-        if self.limit.remember is not None:
-            self.limit.remember(self._view, state)
-        found = self.find(state, self.limit.share * (_EASE if self.reported else 1.0))
+    def look(
+        self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
+    ) -> None:
+        """Enter what stands at this tick and has for long enough; keeps count of how long."""
+        limit = self.limit
+        if limit.remember is not None:
+            limit.remember(view, state)
+        found = self.check(view, state, limit.share * (_EASE if self.reported else 1.0))
         if not found:
             if self.since < math.inf:
                 self.since = math.inf
                 self._ended = state.t
+                faults.pop(self, None)
             if self.reported and state.t - self._ended > _AGAIN:
                 self.reported = False
-            return ""
+            return
         self.since = min(self.since, state.t)
-        return found if state.t - self.since >= self.lasts else ""
+        if state.t - self.since < self.lasts:
+            return
+        if limit.level == "fault":
+            faults[self] = found
+        elif not self.reported:
+            self.reported = True
+            warnings.append(Breach(limit.name, found))
 
 
 class Safety:
@@ -97,19 +95,20 @@ class Safety:
         self._in_turn = [each for each in watches if each not in self._each_tick]
         # In the table's order: the first one that stands is the fault's name.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
-        # While this one expression holds, none of each tick's limits is broken. A fault whose
+        # While this one check finds nothing, none of each tick's limits is broken. A fault whose
         # warning comes before it is broken only where that is.
         share = {watch.limit.holds: watch.limit.share for watch in reversed(self._each_tick)}
-        terms = [
-            f"({term})"
+        terms = {
+            term: 0
             for watch in self._each_tick
             if watch.limit.share == share[watch.limit.holds]
-            for _, term in watch.limit.terms(view, str(watch.limit.share))
-        ]
-        self._holds = holding(" and ".join(terms))
+            for term in watch.limit.terms(view, str(watch.limit.share))
+        }
+        self._any = checking(terms, lambda *_: "one of them")
         self._turn = 0
         self._busy = False  # a limit of each tick is broken, or was a moment ago
         self._found: dict[_Watch, str] = {}  # faults that stand
+        self.must_hold = False  # frames are late in a grip: nothing is moved on
         self.warnings: list[Breach] = []  # to be reported; the loop empties it
         self.limited: Counter[str] = Counter()  # ticks in which a goal was changed, by limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
@@ -130,36 +129,32 @@ class Safety:
 
         Warnings that are new are added to ``warnings``.
         """
-        view = self._view
+        view, found = self._view, self._found
         if self._has_servos:
             view.motion.follow(state.t, state.reading)
-        if self._busy or not self._holds(state, state.reading, state.contacts, view, 1.0):
+        if self._busy or self._any(view, state, 1.0):
             self._busy = False
             for watch in self._each_tick:
-                self._look(watch, state)
+                watch.look(view, state, found, self.warnings)
                 self._busy = self._busy or watch.reported or watch.since < math.inf
             view.bad_goal = False
         if self._in_turn:
             self._turn = (self._turn + 1) % len(self._in_turn)
-            self._look(self._in_turn[self._turn], state)
-        if not self._found:
-            return None
+            self._in_turn[self._turn].look(view, state, found, self.warnings)
         gripping = state.mode in GRIPPING
-        for watch in self._faults:
-            if watch in self._found and (gripping or not watch.limit.gripping):
-                return Breach(watch.limit.name, self._found[watch])
+        self.must_hold = False
+        if gripping and self._has_sensors:
+            oldest, contacts = state.t - self._hold_age, state.contacts
+            for i in view.fingers:
+                if contacts[i].t_sound < oldest:
+                    self.must_hold = True
+            if self.must_hold:
+                self._count("tactile.late")
+        if found:
+            for watch in self._faults:
+                if watch in found and (gripping or not watch.limit.gripping):
+                    return Breach(watch.limit.name, found[watch])
         return None
-
-    def _look(self, watch: _Watch, state: State) -> None:
-        found = watch.look(state)
-        if watch.limit.level == "fault":
-            if found:
-                self._found[watch] = found
-            else:
-                self._found.pop(watch, None)
-        elif found and not watch.reported:
-            watch.reported = True
-            self.warnings.append(Breach(watch.limit.name, found))
 
     def cause(self, state: State, gripping: bool = False) -> str:
         """The first fault that stands in this state, or an empty text: what refuses a command.
@@ -167,26 +162,15 @@ class Safety:
         With ``gripping`` the limits of a grip are judged, whatever the mode. Nothing is changed.
         """
         gripping = gripping or state.mode in GRIPPING
-        kept = self._holds(state, state.reading, state.contacts, self._view, 1.0)
+        view = self._view
+        kept = not self._any(view, state, 1.0)
         for watch in self._faults:
             if (kept and watch in self._each_tick) or (watch.limit.gripping and not gripping):
                 continue
             lasted = state.t - min(watch.since, state.t) >= watch.lasts
-            if lasted and (found := watch.find(state, watch.limit.share)):
+            if lasted and (found := watch.check(view, state, watch.limit.share)):
                 return found
         return ""
-
-    def must_hold(self, state: State) -> bool:
-        """Frames are late: nothing is moved on until one comes or a fault latches."""
-        if not self._has_sensors:
-            return False
-        oldest = state.t - self._hold_age
-        contacts = state.contacts
-        for i in self._view.fingers:
-            if contacts[i].t_sound < oldest and state.mode in GRIPPING:
-                self.limited["tactile.late"] += 1
-                return True
-        return False
 
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
         """The hand shall open before this fault takes its torque."""
@@ -196,16 +180,10 @@ class Safety:
     # Goals
 
     def write(self, servos: Servos, state: State) -> None:
-        """Bound the state's goal and send it; a non-finite goal is not sent.
+        """Bound the state's goal in place and send it; a non-finite one is invalid, and not sent.
 
         Raises ServoError as `Servos.write` does.
         """
-        self.bound(state)
-        if state.goal.valid:
-            servos.write(state.goal)
-
-    def bound(self, state: State) -> None:
-        """Bound the goal in place; a non-finite goal becomes invalid."""
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
@@ -226,6 +204,8 @@ class Safety:
                     return
             self._sent_q[i] = q[i]
             sent[i] = current[i]
+        if goal.valid:
+            servos.write(goal)
 
     def _bound_one(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
         q, current = goal.q[i], goal.current[i]

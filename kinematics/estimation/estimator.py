@@ -48,6 +48,8 @@ class ContactEstimate:
     share and averaging does not lessen; a fixed gain has a zero row, and without contact all is
     zero. ``chi2`` is the misfit's square a cell over the noise's, ``explained`` the share of the
     frame's squared pressure that the model accounts for; both are 0 where nothing was fitted.
+    ``misfit``: χ² is beyond what the noise makes once in 3.5 million frames, so that the model does
+    not describe the contact well, or the noise is larger than given.
     """
 
     contact: bool = False
@@ -63,21 +65,12 @@ class ContactEstimate:
     iterations: int = 0
     rejected: int = 0  # outliers left out
     second: bool = False  # something else presses too, off the footprint
+    misfit: bool = False
     shear_x: float = 0.0  # force along the face [N], which a solid tip's base feels
     shear_y: float = 0.0
     sharing: float = 1.0  # cells for each whose noise is independent
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
-
-    @property
-    def misfit(self) -> bool:
-        """χ² is beyond what the noise makes once in 3.5 million frames (Wilson-Hilferty, 5 σ).
-
-        The contact is then none that this model describes well, or the noise is larger than given;
-        the covariance is widened by that.
-        """
-        spread = 2.0 / (9.0 * max(self.cells / self.sharing - 4, 1))
-        return self.chi2 > (1.0 - spread + 5.0 * math.sqrt(spread)) ** 3
 
     @property
     def d_std(self) -> float:
@@ -171,6 +164,7 @@ class ContactEstimator:
             raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
         readings = readings or Readings()
         self.grid = grid
+        self._full = math.nan  # of the last frame's type
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
@@ -225,7 +219,7 @@ class ContactEstimator:
     def saturation(self, reading: float | None) -> None:
         if reading is not None and not reading > 0.0:
             raise ValueError(f"saturation must be positive, got {reading}")
-        self._saturation = reading
+        self._saturation, self._full = reading, math.nan
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """Estimate from this frame alone: a new result, whatever frames came before.
@@ -264,9 +258,11 @@ class ContactEstimator:
             raise ValueError(f"a frame must have shape {self._frame.shape}, got {frame.shape}")
         if not 0.0 < pascal_per_count < math.inf:
             raise ValueError(f"pascal_per_count must be positive, got {pascal_per_count}")
-        self._options.saturation = full if self._saturation is None else self._saturation
+        if full != self._full:
+            self._full = full
+            self._options.saturation = full if self._saturation is None else self._saturation
         # One copy makes every type, layout and read-only frame the same to the compiled entry.
-        np.copyto(self._frame, frame)
+        self._frame[...] = frame
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
             self._state.array,
@@ -298,6 +294,9 @@ class ContactEstimator:
             result.shear_y,
             *_,
         ) = self._estimate.item()
+        # By Wilson-Hilferty, 5 σ.
+        spread = 2.0 / (9.0 * max(result.cells / result.sharing - 4, 1))
+        result.misfit = result.chi2 > (1.0 - spread + 5.0 * math.sqrt(spread)) ** 3
         self._seq = seq
         return result
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS
 from softfinger.daemon.safety.safety import Safety
+from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Contact, Frame, Goal, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
@@ -24,11 +25,13 @@ class Sensor:
     def __init__(self, finger: int) -> None:
         self.finger = finger
         self.frame: Frame | None = None
+        self.changed = 0.0
         self.estimate = ContactEstimate()
 
     def give(self, t: float, data: Any) -> None:
-        seq = 1 if self.frame is None else self.frame.seq + 1
-        self.frame = Frame(seq, t, t, True, np.array(data, np.uint16))
+        last, self.frame = self.frame, Frame(0, t, t, True, np.array(data, np.uint16))
+        if last is None or not np.array_equal(last.data, self.frame.data):
+            self.changed = t
 
 
 def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> Safety:
@@ -61,6 +64,18 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
     state.object.width = 0.04
     state.goal = goal((0.0, 0.0), (0.3, 0.3))
     return state
+
+
+class Deaf:
+    """Servos that take any goal, and do nothing."""
+
+    def write(self, _: Goal) -> None:
+        pass
+
+
+def bounded(judge: Safety, state: State) -> None:
+    """Bound the state's goal as on its way to the servos."""
+    judge.write(cast(Servos, Deaf()), state)
 
 
 def goal(q: tuple[float, float], current: tuple[float, float]) -> Goal:

@@ -197,11 +197,13 @@ def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
     state = sound()
     state.contacts[0].t_sound = 5.0 - 4.0 / SETTINGS.tactile.rate
     judge = safety()
-    assert judge.must_hold(state)
+    assert judge.judge(state) is None
+    assert judge.must_hold
     assert judge.limited["tactile.late"] == 1
     assert judge.cause(state) == ""
     state.mode = Mode.ARMED
-    assert not judge.must_hold(state)
+    assert judge.judge(state) is None
+    assert not judge.must_hold
 
 
 def test_overruns_in_a_row_are_a_cause() -> None:
@@ -389,10 +391,10 @@ def test_the_quick_look_never_passes_over_what_a_row_finds() -> None:
         state = sound()
         for push, finger, share in (first, second):
             push(state, finger, share)
-        if judge._holds(state, state.reading, state.contacts, judge._view, 1.0):
+        if not judge._any(judge._view, state, 1.0):
             quiet += 1
             for watch in judge._each_tick:
-                assert watch.find(state, watch.limit.share) == "", watch.limit.name
+                assert watch.check(judge._view, state, watch.limit.share) == "", watch.limit.name
         else:
             loud += 1
     assert quiet > 0.2 * (quiet + loud), "or nothing was compared"

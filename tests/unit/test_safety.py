@@ -15,6 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.types import Goal, State
 from tests.harness.safety import SETTINGS, goal, judged, levers, safety, sound
+from tests.harness.safety import bounded as write_bounded
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,7 +35,7 @@ def test_a_sound_state_has_no_cause_and_no_warning() -> None:
 def bounded(judge: Safety, state: State, wanted: Goal) -> Goal:
     state.goal = wanted
     state.seq += 1
-    judge.bound(state)
+    write_bounded(judge, state)
     return state.goal
 
 

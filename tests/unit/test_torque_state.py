@@ -16,6 +16,7 @@ from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.gateway import Served
 from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
+from tests.harness.safety import bounded
 
 
 def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
@@ -25,7 +26,7 @@ def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
     command(daemon, "arm")
     daemon.loop.advance(0.1)
     daemon.loop.state.goal.q[0] = math.nan
-    daemon.loop._safety.bound(daemon.loop.state)
+    bounded(daemon.loop._safety, daemon.loop.state)
     assert "a non-finite goal" in refusal(daemon, "grasp")
     daemon.loop.advance(daemon.loop.period)
     assert daemon.loop.state.fault_name == "goal.number"
