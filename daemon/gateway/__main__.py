@@ -51,12 +51,13 @@ def _serve(end: socket.socket, config: Config) -> int:
             server.step()
             if server.now - lived > _STEPS:
                 lived = server.now
-                signal.setitimer(
-                    signal.ITIMER_REAL, bounds.STALLED
-                )  # SIGALRM is not handled: it ends
+                # Neither SIGPROF nor SIGALRM is handled: each ends it.
+                signal.setitimer(signal.ITIMER_PROF, bounds.STALLED)
+                signal.setitimer(signal.ITIMER_REAL, bounds.BLOCKED)
     except StartAnew as reason:
         end.send(loop_link.NOTICE + str(reason).encode())
         return loop_link.ANEW
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     server.close()
     return 0

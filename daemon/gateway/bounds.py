@@ -15,7 +15,8 @@ from softfinger.daemon.wire.loop_link import Topics
 MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
 DESCRIPTORS = 64  # that are not clients'
 CLIENTS = 1024  # of the commands; a quarter as many of the stream
-STALLED = 3.0  # s without a step after which the process is ended
+STALLED = 3.0  # s of processor time within one step after which the process is ended, …
+BLOCKED = 30.0  # … and of any time; a machine that is busy or stops it takes only such time
 
 # A connection without keys
 HANDSHAKE = 2.0  # s in which a client has to have finished its handshake

@@ -17,7 +17,7 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire import loop_link
 
 _ROOT = Path(__file__).parents[3]  # where the package is found
-_PATIENCE = 20.0  # s for a gateway to bind its sockets
+_PATIENCE = 60.0  # s for a gateway to bind its sockets; one that ended is not waited for
 _LASTED = 10.0  # s after which a death counts as the first
 _AGAIN = 0.1, 2.0  # s between a death and the next start, at first and after many
 

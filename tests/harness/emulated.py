@@ -92,7 +92,7 @@ class SdkServos:
         self.port.closePort()
 
 
-def board(folder: Path, finger: int, timeout: float = 2.0, **changes: object) -> FlexiTac:
+def board(folder: Path, finger: int, timeout: float = 60.0, **changes: object) -> FlexiTac:
     """The daemon's own backend on one of the stand-in hand's boards."""
     tactile = load(HIL, folder).tactile
     tactile = tactile.model_copy(update={"open_timeout": timeout, **changes})

@@ -166,7 +166,7 @@ class FakeDaemon:
 
     def close(self) -> None:
         self._over.set()
-        self._thread.join(5.0)
+        self._thread.join()
         self._context.destroy(linger=0)
 
     def __enter__(self) -> FakeDaemon:

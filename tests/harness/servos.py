@@ -219,7 +219,7 @@ class RunningBus:
     def close(self) -> None:
         self._running = False
         os.write(self._wake_write, b"!")
-        self._thread.join(timeout=10)
+        self._thread.join()
         self.port.unplug()
         os.close(self._wake_read)
         os.close(self._wake_write)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import Clock, RealClock, VirtualClock
+from softfinger.daemon.errors import TactileError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.simulation.faults import parse_faults
@@ -46,6 +47,16 @@ class _Images:
         return Frame(self.number, self.number / RATE, 0.0, True, self.sent[self.number])
 
 
+def why_not_open(sensor: TactileSensor) -> str:
+    """What it says when it can't be opened; empty when it can."""
+    try:
+        sensor.open()
+    except TactileError as error:
+        return str(error)
+    sensor.close()
+    return ""
+
+
 class Rig:
     """One backend with what it needs around it. Use as a context."""
 
@@ -59,7 +70,7 @@ class Rig:
             "rows": rows,
             "cols": COLS,
             "rate": RATE,
-            "open_timeout": 0.5 if fault or rows != ROWS else 10.0,
+            "open_timeout": 0.5 if rows != ROWS else 60.0,
         }
         self.clock: Clock = RealClock() if backend in SERIAL else VirtualClock()
         hand = None

@@ -36,7 +36,7 @@ class RawClient:
 
     def send(self, data: bytes) -> None:
         """Bytes, all of them. Raises OSError when it was hung up on, or there is no room."""
-        self.socket.settimeout(5.0)
+        self.socket.settimeout(60.0)
         self.socket.sendall(data)
         self.socket.setblocking(False)
 

@@ -115,8 +115,8 @@ def test_a_fault_ends_the_waiting(fake: FakeDaemon, hand: Hand) -> None:
     hand.state()
     fake.changes = {"mode": "fault", "fault": "servo 1: overload"}
     with pytest.raises(HandFault, match="servo 1: overload"):
-        hand.wait_for(lambda state: state.mode == "holding" and not state.fault)
-    assert hand.wait_for(lambda state: state.mode == "fault").fault == "servo 1: overload"
+        hand.wait_for(lambda state: state.mode == "holding" and not state.fault, 60.0)
+    assert hand.wait_for(lambda state: state.mode == "fault", 60.0).fault == "servo 1: overload"
 
 
 def test_waiting_ends_in_time(hand: Hand) -> None:

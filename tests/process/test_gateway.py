@@ -140,15 +140,53 @@ def test_the_gateway_leaves_with_its_daemon(
     assert reader.hung_up()
 
 
-def test_a_gateway_that_hangs_ends_itself(addresses: tuple[str, str]) -> None:
-    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
-    try:
-        first = gateway.process
-        os.kill(first, signal.SIGALRM)  # as its own alarm does, which it puts off while it works
-        until(lambda: gateway.process != first)
-        assert "signal 14" in gateway.link.notices[0]
-    finally:
-        gateway.close()
+HANGING = """
+import select, sys
+from softfinger.daemon.gateway import __main__ as gateway, bounds
+from softfinger.daemon.gateway.server import Server
+
+bounds.{bound} = 0.1
+step = Server.step
+
+def first(server):
+    step(server)
+    Server.step = second
+
+def second(server):
+    {does}
+    server.over = True
+
+Server.step = first
+sys.exit(gateway.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("bound", "does", "status"),
+    [
+        ("STALLED", "while True: pass", -signal.SIGPROF),
+        ("BLOCKED", "select.select([], [], [])", -signal.SIGALRM),
+        ("STALLED", "select.select([], [], [], 0.5)", 0),  # as if it were stopped or starved
+    ],
+)
+def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(
+    bound: str, does: str, status: int
+) -> None:
+    ours, theirs = loop_link.pair()
+    with ours, theirs:
+        config = Config("", "", GATEWAY_TOPICS, 100).to_json()
+        ended = subprocess.run(
+            [
+                sys.executable,
+                "-c",
+                HANGING.format(bound=bound, does=does),
+                str(theirs.fileno()),
+                config,
+            ],
+            pass_fds=(theirs.fileno(),),
+            timeout=300.0,
+        )
+    assert ended.returncode == status
 
 
 @pytest.mark.parametrize(("queue", "guarded", "most"), [(100, False, 1344), (2000, True, 210)])
@@ -209,7 +247,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
             assert ticking.loop.state.mode == "disarmed"
 
             async def stop() -> bool:
-                async with AsyncHand(*addresses) as other:
+                async with AsyncHand(*addresses, timeout=60.0) as other:
                     return bool(await other.command("stop"))
 
             assert asyncio.run(stop())
@@ -217,7 +255,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
                 send(addresses[1], {"command": "status"}, timeout=0.2)
         finally:
             os.kill(gateway_of(ticking).process, signal.SIGCONT)
-        assert hand.wait_for(lambda state: not state.torque).mode == "disarmed"
+        assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
         insist(hand.arm)  # what comes after its answer is heard
         hand.stop()

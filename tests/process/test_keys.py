@@ -307,7 +307,7 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
     running = start(
         "--config", str(profile(f'access.keys = "{folder}"\nsafety.overruns_fault = 100000\n'))
     )
-    with Hand(*addresses, keys=folder / "alice") as alice:
+    with Hand(*addresses, keys=folder / "alice", timeout=60.0) as alice:
         assert alice.state().mode == "disarmed"
         (folder / "server" / "clients" / "alice.key").unlink()
 
@@ -319,7 +319,10 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
             return False
 
         until(shut_out)
-        with Hand(*addresses, keys=folder) as local, local.events(timeout=20.0) as told:
+        with (
+            Hand(*addresses, keys=folder, timeout=60.0) as local,
+            local.events(timeout=60.0) as told,
+        ):
             assert any("shut out: alice" in event.text for event in told)
         with pytest.raises(NoAnswer):
             send(addresses[1], {"command": "arm"}, 0.5, load_client(folder / "alice"))
@@ -332,7 +335,7 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
             return False
 
     until(bob_is_let_in)
-    with Hand(*addresses, keys=folder) as local:
+    with Hand(*addresses, keys=folder, timeout=60.0) as local:
         assert local.state().mode == "disarmed"
     assert running.end() == 0
 

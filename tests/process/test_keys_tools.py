@@ -141,7 +141,10 @@ def test_a_recording_is_replayed_to_holders_of_keys(
         text=True,
     )
     try:
-        with Hand(*addresses, keys=folder / "alice") as hand, Hand(*addresses) as stranger:
+        with (
+            Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand,
+            Hand(*addresses, timeout=60.0) as stranger,
+        ):
             assert hand.stream(60.0).next(60.0).mode == sample(schema.STATE)["mode"]
             with pytest.raises(NoStream):
                 stranger.state(0.3)
@@ -171,10 +174,10 @@ def test_late_subscribers_of_a_replay_are_told_settings_and_events_again(
 ) -> None:
     told = {"schema": 1, "seq": 1, "again": False, "timestamp": 1.0, "mono_ns": 5, "settings": "{}"}
     event = {"schema": 1, "seq": 7, "again": False, "timestamp": 2.0, "text": "b"}
-    with Wire(addresses[0]) as wire, Hand(*addresses) as late:
+    with Wire(addresses[0]) as wire, Hand(*addresses, timeout=60.0) as late:
         wire.send(b"hand/settings", told)
         wire.send(b"hand/event", event)
         with late.events() as events:
             until(lambda: wire.subscribed(0.01))
-            again = events.next(10.0)
+            again = events.next(60.0)
     assert (again.seq, again.again, again.text) == (7, True, "b")

@@ -34,7 +34,7 @@ class Wire:
 
     def send(self, data: bytes) -> None:
         self.client.write(data)
-        assert select.select([self.port], [], [], 5)[0]
+        assert select.select([self.port], [], [], 60)[0]
         self.port.service(self.t)
 
     def received(self) -> bytes:
@@ -137,9 +137,9 @@ def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires: list[Wire
         end = os.open(wire.port.path, os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(end)[tty.LFLAG] & (termios.ECHO | termios.ICANON)
         os.write(end, PING)
-        assert select.select([wire.port], [], [], 5)[0]
+        assert select.select([wire.port], [], [], 60)[0]
         wire.port.service(wire.t)
-        assert select.select([end], [], [], 5)[0]
+        assert select.select([end], [], [], 60)[0]
         assert len(os.read(end, 100)) == PONG
         os.close(end)
 

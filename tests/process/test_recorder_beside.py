@@ -59,7 +59,7 @@ def test_a_recorder_that_ends_is_told_at_once_and_by_the_exit_status(
     daemon = start("--config", str(profile("")), "--record", str(path))
     recorder = recorder_of(daemon)
     until(lambda: path.stat().st_size > 10_000)
-    with Hand(*addresses) as hand, hand.events(timeout=20.0) as events:
+    with Hand(*addresses, timeout=60.0) as hand, hand.events(timeout=60.0) as events:
         hand.state()
         end(recorder, path)
         event = next(event for event in events if event.kind == "record")

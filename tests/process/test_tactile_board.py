@@ -55,7 +55,7 @@ class Client:
         """Wait for ``size`` bytes: the kernel hands them on in its own time."""
         got = b""
         while len(got) < size:
-            assert select.select([self.fd], [], [], 5.0)[0], f"only {len(got)} of {size} bytes"
+            assert select.select([self.fd], [], [], 60.0)[0], f"only {len(got)} of {size} bytes"
             got += os.read(self.fd, size - len(got))
         return got
 

@@ -452,7 +452,7 @@ def page() -> Iterator[WebPage]:
     page.close()
     source.shutdown()
     source.server_close()
-    thread.join(5.0)
+    thread.join()
 
 
 def got(page: WebPage, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, str], bytes]:

@@ -131,7 +131,7 @@ def test_every_panel_shows_the_hand(
         if browser is not None:
             browser.close()
         view.terminate()
-        _, error = view.communicate(timeout=30)
+        _, error = view.communicate(timeout=120)
     assert view.returncode == 0, error
     assert "states shown" in error
     assert daemon.end() == 0

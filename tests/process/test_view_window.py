@@ -46,7 +46,7 @@ class Display:
 
     def close(self) -> None:
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(60)
 
 
 @pytest.fixture
@@ -94,10 +94,10 @@ def test_the_window_shows_the_hand_and_reaches_no_other_machine(
         assert not absent, f"{absent} not in {tmp_path / 'seen.png'}"
         assert not foreign
         view.send_signal(signal.SIGTERM)
-        assert view.wait(30) == 0
+        assert view.wait(120) == 0
         assert re.search(r"\d+ states shown", view.stderr.read())
     finally:
         view.kill()
-        view.wait(10)
+        view.wait(60)
         view.stderr.close()
     assert daemon.end() == 0
