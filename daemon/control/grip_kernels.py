@@ -123,11 +123,10 @@ def squeeze(
     grasp = grasps[0]
     if g.law.watched:
         g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
+        if g.slip.reflex and g.force.target > g.force.value:
+            setpoint.reset(g.force, force_windows, g.force.target)
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
     g.push = wanted + _correction(g, wanted, _felt(grasp))
-    if g.slip.reflex:
-        g.push += max(g.force.target - wanted, 0.0)
-        g.slip.reflex = not setpoint.arrived(g.force)
     if g.law.blind and not g.steering:
         torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
         return torque1, torque2, g.force.target, g.slip.turned
@@ -323,8 +322,10 @@ def _equal_torques(
         spring = min(upright_spring(mean, depth, wanted, grasp.turning, lengths), g.joint_stiffness)
         # What then holds the fingers begins with the torque that the spring has come to.
         g.offset = lean * (1.0 - spring / g.joint_stiffness)
-        fading = 1.0 - g.shaken / law.dither_time
-        turn = fading * law.dither_torque * math.sin(law.dither_rate * g.shaken) - spring * lean
+        # Within its first period it grows, from then on it fades.
+        phase = law.dither_rate * g.shaken
+        size = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.shaken / law.dither_time)
+        turn = size * law.dither_torque * math.sin(phase) - spring * lean
         if g.shaken > 0.0 or setpoint.arrived(g.force):
             # By the clock and not by ticks: where these come late the dither must not become slow,
             # for the fingers on the tips swing by themselves at one to two hertz.

@@ -19,10 +19,12 @@ What these sensors show, and what they don't:
   ``control.tip_friction`` must not be more than the real friction.
 - While the grip is built up or the object turns, currents also move the joints: the last load is
   kept. A load that grows by more than about 10 N a second is too fast for that.
-- One that comes at once, by more than twice the joints' friction, moves the joints, and their
-  damping shows it at the same tick; it is believed at the next. Noise of some 15 mA on the currents
-  may pass for one in a light grip. How much is to come is not known: the grip is raised by all of
-  ``control.grip_raise_max``, as fast as ``safety.current_rate`` lets it.
+- One that comes at once moves the joints, and their damping shows it before the sensors do: where
+  both joints' torques are off by more than twice their friction and three standard deviations of
+  what they flicker by, it is believed at the same tick. How much is to come is not known: the grip
+  is raised by all of ``control.grip_raise_max``, as fast as ``safety.current_rate`` lets it. Of a
+  load towards the palm the torques show less the greater it is, and at no load more than
+  lever²/4 bow (0.07 N·m at 10 N): a sudden one is seen from 14 N of grip on.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
+from softfinger.kinematics.hand.external_load import load_of
 
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
 _SUDDEN = 0.5  # of what friction bears with its margin: a load that comes at once, and may go on
@@ -40,10 +43,10 @@ _LEARN = 1.0  # s in which the friction at rest is learnt
 _SCALE_ERROR = 0.1  # share by which the torque constant may be off
 _KEPT = 1.0  # s that a raised grip is kept after the need for it has gone
 _BACK = 2.0  # s in which it then comes back by all of `grip_raise_max`
-_TURNED_MORE = 0.25  # share that the grip is raised by when the object turns in it
+_TURNED_MORE = 0.5  # share that the grip is raised by when the object turns in it
 _WELL = 1.5  # times what the tips' shear explains: the object turns in the grip
 _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth, creep
-_SIGNS = 3.0  # standard deviations of the angle, more than that
+_SIGNS = 3.0  # standard deviations, of the angle and of the torques, more than that
 _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
 _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
@@ -67,13 +70,13 @@ class SlipState(Record):
     law: SlipLaw
     load: float  # that each tip may bear along its face, hidden part included [N]
     turned: bool  # the object has turned in the grip, at this tick
-    reflex: bool  # until the setpoint is there, the grip pushes with all that is needed
-    friction: float  # what a joint's friction looks like, as a load [N]
-    known: bool  # what stood when holding began:
-    still: float  # what of it does not grow with the grip [N]
-    share: float  # and what does, as a share of the normal force
-    smooth: float  # the load, averaged [N]
-    last: float  # the load at the last tick, not averaged [N]
+    reflex: bool  # it has, or a load came at once: the grip is to be raised at once
+    known: bool  # what stood of the joints' torques when holding began:
+    still: float  # what of it does not grow with the grip [N·m]
+    share: float  # and what does, over the normal force [m]
+    smooth: Pair  # what nothing else explains of them, averaged [N·m]
+    last: Pair  # it at the last tick [N·m]
+    variance: float  # of it from tick to tick [N²·m²]
     age: float  # since holding began, up to `_LEARN` [s]
     stray: float  # sum of unexplained turning that has been looked at [rad]
     away: float  # unexplained turning that is not forgotten yet [rad]
@@ -97,27 +100,26 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 def forget(s: SlipState) -> None:
     """Nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
-    s.load = s.still = s.share = s.smooth = s.last = s.age = 0.0
+    s.load = s.still = s.share = s.variance = s.age = 0.0
+    s.smooth[0] = s.smooth[1] = s.last[0] = s.last[1] = 0.0
     s.stray = s.away = s.needed = s.most = s.idle = 0.0
 
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
     """Holding begins, or begins again after a command: learn what is no load."""
-    # Where the faces lean towards each other, the object going out takes part of the turning.
-    lean = math.tan(0.5 * grasp.taper)
-    lever = s.law.width * _mean(grasp.turn) - lean * _mean(grasp.arm)
-    s.known = lever > 0.0
+    s.known = grasp.load_lever > 0.0
     if not s.known:
         return
     normal = _mean(grasp.normal)
-    scale = _SCALE_ERROR * normal * _mean(grasp.arm) / lever
-    s.friction = s.law.joint_friction / lever
-    found = s.smooth + s.share * normal
-    s.still = min(max(found, -s.friction), s.friction)
+    friction, scale = s.law.joint_friction, _SCALE_ERROR * normal * _mean(grasp.arm)
+    before = s.share * normal
+    found = _mean(s.smooth) + before
+    s.still = min(max(found, -friction), friction)
     taken = min(max(found - s.still, -scale), scale)
     s.share = taken / normal if normal > 0.0 else 0.0
-    s.smooth = found - taken
+    s.smooth[0] += before - taken
+    s.smooth[1] += before - taken
     s.stray = grasp.stray
     s.away = 0.0
     s.age = _SMOOTH
@@ -133,31 +135,24 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
     law = s.law
     s.turned = False
     s.most = max(min(asked + law.raise_max, law.force_max), asked)
-    found = grasp.load - closing * s.friction - s.share * _mean(grasp.normal)
-    judged = holding and s.known
-    # So much more, at two ticks on end, is no flicker, no friction that turns round, and no
-    # current that was read wrongly once.
-    off, before = found - s.still, s.last - s.still
-    lasting = min(abs(off), abs(before)) if off * before > 0.0 else 0.0
-    sudden = judged and lasting > abs(s.smooth - s.still) + 2.0 * s.friction
-    s.last = found
-    s.smooth += (found - s.smooth) * (1.0 if sudden else law.dt / _SMOOTH)
+    judged = holding and s.known and grasp.load_lever > 0.0
+    sudden = _average(s, grasp, closing, judged)
     if judged:
-        _weigh(s, grasp.load_lever)
+        _weigh(s, grasp)
         _watch_turning(s, grasp)
     else:
         s.stray = grasp.stray
     # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
     spare = law.friction * (1.0 - law.margin) - grasp.shear
     # A grip that bears less than the joints' friction hides is not judged by their torques.
-    seen = s.load if law.friction * asked > s.friction else 0.0
+    seen = s.load if law.friction * asked * grasp.load_lever > law.joint_friction else 0.0
     load = max(seen, 0.5 * law.object_load)
     needed = 0.0
     if load > 0.0:
         needed = load / max(spare, _LEAST_SPARE * law.friction)
     if s.turned:
         needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, s.needed))
-    s.reflex = s.reflex or s.turned
+    s.reflex = s.turned
     if sudden and load > _SUDDEN * max(spare, 0.0) * _mean(grasp.normal):
         needed = s.most  # how much more is to come is not known
         s.reflex = True
@@ -172,21 +167,51 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
 
 
 @inner_kernel
-def _weigh(s: SlipState, load_lever: float) -> None:
+def _average(s: SlipState, grasp: GraspState, closing: float, judged: bool) -> bool:
+    """Take in both joints' torques; whether a load has come at once.
+
+    So much more, in both joints, is no flicker, no friction that turns round, no current that was
+    read wrongly, and no joint that is dead.
+    """
+    friction = s.law.joint_friction
+    known = closing * friction + s.share * _mean(grasp.normal)
+    found1 = grasp.unexplained[0] - known
+    found2 = grasp.unexplained[1] - known
+    off1 = found1 - s.smooth[0]
+    off2 = found2 - s.smooth[1]
+    before = _mean(s.smooth) - s.still
+    more = abs(before + 0.5 * (off1 + off2)) - abs(before)
+    both = min(abs(off1), abs(off2), more) if off1 * off2 > 0.0 else 0.0
+    sudden = judged and both > 2.0 * friction + _SIGNS * math.sqrt(s.variance)
+    # Half of the mean square of a difference, of two joints.
+    change = 0.25 * ((found1 - s.last[0]) ** 2 + (found2 - s.last[1]) ** 2)
+    s.variance += (change - s.variance) * s.law.dt / _LEARN
+    s.last[0] = found1
+    s.last[1] = found2
+    weight = 1.0 if sudden else s.law.dt / _SMOOTH
+    s.smooth[0] += off1 * weight
+    s.smooth[1] += off2 * weight
+    return sudden
+
+
+@inner_kernel
+def _weigh(s: SlipState, grasp: GraspState) -> None:
     """Tell the load from the joints' friction."""
-    dt = s.law.dt
-    seen = abs(s.smooth - s.still)
-    s.age = min(s.age + dt, _LEARN)
-    if seen < s.friction:
+    law = s.law
+    off = _mean(s.smooth) - s.still
+    load, slope = load_of(off, grasp.load_lever, grasp.load_bow)
+    load = abs(load)
+    friction = law.joint_friction / grasp.load_lever
+    s.age = min(s.age + law.dt, _LEARN)
+    if load < friction:
         # So little may as well be friction that gives way; what comes slower stays hidden.
-        still = s.still + (s.smooth - s.still) * dt / s.age
-        s.still = min(max(still, -s.friction), s.friction)
+        still = s.still + off * law.dt / s.age
+        s.still = min(max(still, -law.joint_friction), law.joint_friction)
     # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
     # as much may be hidden.
-    sure = seen - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * s.friction
-    lever = max(load_lever, _LEAST_LEVER * s.law.width)
-    hidden = max(s.law.joint_friction / lever, s.friction)
-    s.load = min(max(4.0 * sure, 0.0), seen + hidden)
+    sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
+    hidden = law.joint_friction / max(slope, _LEAST_LEVER * law.width)
+    s.load = min(max(4.0 * sure, 0.0), load + hidden)
 
 
 @inner_kernel

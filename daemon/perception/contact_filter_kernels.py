@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.external_load import load_by_torques
+from softfinger.kinematics.hand.external_load import load_torques
 from softfinger.kinematics.hand.grasp_state import (
     Motion,
     Two,
@@ -81,8 +81,9 @@ class GraspState(Record):
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
     shear: float  # shear over normal force, by the object's balance, unloaded
-    load: float  # what each tip bears along its face, by the joints' torques [N]
-    load_lever: float  # of that load about the pivots [m]
+    unexplained: Pair  # of the joints' torques, without a load along the faces [N·m]
+    load_lever: float  # a load L makes them lever L + bow L²; 0: it shows nothing [m]
+    load_bow: float  # [m/N]
 
 
 class Past(Record):
@@ -468,8 +469,10 @@ def write_grasp(
     if left.gain > 0.0 and right.gain > 0.0:
         rolled = (shear - out_of_grip, shear + out_of_grip)
         torques = left.torque / left.gain, right.torque / right.gain
-        load, grasp.load_lever = load_by_torques(
+        left1, left2, grasp.load_lever, bow = load_torques(
             table1, table2, d, theta, taper, motion, rolled, torques
         )
-        grasp.load = 0.5 * (left.gain + right.gain) * load
+        grasp.unexplained[0] = left.gain * left1
+        grasp.unexplained[1] = right.gain * left2
+        grasp.load_bow = 2.0 * bow / (left.gain + right.gain)
     return seen1, seen2, angle, width

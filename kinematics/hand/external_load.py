@@ -16,8 +16,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import Motion, Two, sheared_gradient
 
-_STEPS = 4  # of Newton's method; the equation is a parabola, all but a line
-_LEAST_SLOPE = 0.2  # of what it is where no tip is tilted
+_LEAST_SLOPE = 0.1  # of what it is without a load
 
 
 @inner_kernel
@@ -30,8 +29,8 @@ def _unexplained(
     torque: float,
     arm: float,
     lever: float,
-) -> tuple[float, float]:
-    """side (τ − N arm) − ∂U/∂θ − T lever of one tip [N·m], and how fast it falls with T [m]."""
+) -> tuple[float, float, float]:
+    """What of side τ [N·m] one tip's N, ∂U/∂θ and T leave, and how fast it falls with T and T²."""
     contact = lookup(data, d, theta)
     force, _, force_d, force_theta, _, _, _ = contact
     by_d, by_theta = sheared_gradient(contact, d, theta, shear)
@@ -41,14 +40,17 @@ def _unexplained(
     bend = 0.5 * (shear / force - sine) / cosine
     bend_t = 0.5 / (force * cosine)
     stretch_t = d * bend_t * (sine + 2.0 * cosine * bend)
+    stretch_tt = d * bend_t * cosine * bend_t
     normal_t = force_d * stretch_t - 2.0 * force * cosine * bend * bend_t - tangent
+    normal_tt = force_d * stretch_tt - force * cosine * bend_t * bend_t
     theta_t = force_theta * stretch_t + force * d * bend_t * (cosine - 2.0 * sine * bend)
+    theta_tt = force_theta * stretch_tt - force * d * bend_t * sine * bend_t
     left = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * lever
-    return left, side * arm * normal_t + theta_t + lever
+    return left, side * arm * normal_t + theta_t + lever, side * arm * normal_tt + theta_tt
 
 
 @inner_kernel
-def load_by_torques(
+def load_torques(
     data1: NDArray[float64],
     data2: NDArray[float64],
     d: Two,
@@ -57,10 +59,10 @@ def load_by_torques(
     motion: Motion,
     rolled: Two,
     torques: Two,
-) -> tuple[float, float]:
-    """(L, lever): the share L [N] that each tip bears of a load 2 L along the object's t.
+) -> tuple[float, float, float, float]:
+    """(δ1, δ2, lever, bow): what of both torques [N·m] nothing but a load along t explains.
 
-    Solves for L, in the least squares of both joints' torques, that
+    Where each tip bears a share L [N] of a load 2 L along the object's t, both torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
@@ -68,14 +70,15 @@ def load_by_torques(
     with n_i, t_i of each tip's face, ``rolled`` [N] the shears that rolling, the turning moments
     and the ``taper`` [rad] cause without a load (:func:`hand.grasp_state.holding_levers`), and N
     and ∂U/∂θ as the shears bend them. Between parallel faces ±v_i·n is arm_i and lever_i is W
-    turn_i; ``motion`` is what :func:`hand.grasp_state.held_motion` gives. An error of both torques
-    by e makes one of e/lever in L [m]. Zeros without two contacts.
+    turn_i; ``motion`` is what :func:`hand.grasp_state.held_motion` gives. δ_i is what is left of
+    τ_i at L = 0; a load makes (δ1 + δ2)/2 = lever L + bow L², exactly. Zeros without two contacts,
+    or where no load would show.
     """
     d1, d2 = d
     theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
-        return 0.0, 0.0
-    arm1, arm2, turn1, turn2, _, width, across = motion
+        return 0.0, 0.0, 0.0, 0.0
+    arm1, arm2, turn1, turn2, _, _, across = motion
     # What rolls the object out along its bisector is no lever of each force: taken back here.
     lean = math.tan(0.5 * taper)
     share = 1.0 / (1.0 + lean * lean)
@@ -83,20 +86,20 @@ def load_by_torques(
     lever2 = share * (across * turn2 - lean * arm2)
     arm1 = share * (arm1 + lean * across * turn1)
     arm2 = share * (arm2 + lean * across * turn2)
-    least = _LEAST_SLOPE * (lever1 * lever1 + lever2 * lever2)
-    if least <= 0.0:
-        return 0.0, 0.0
-    # A tip can't bear more shear than it is pressed with.
-    most = 0.5 * (lookup(data1, d1, theta1)[0] + lookup(data2, d2, theta2)[0])
-    load = slope = 0.0
-    for _ in range(_STEPS):
-        left1, slope1 = _unexplained(
-            data1, d1, theta1, 1.0, rolled[0] + load, torques[0], arm1, lever1
-        )
-        left2, slope2 = _unexplained(
-            data2, d2, theta2, -1.0, rolled[1] - load, torques[1], arm2, lever2
-        )
-        over = lever1 * left1 - lever2 * left2
-        slope = max(lever1 * slope1 + lever2 * slope2, least)
-        load = min(max(load + over / slope, -most), most)
-    return load, slope / max(abs(lever1) + abs(lever2), 1e-3 * width)
+    left1, slope1, bow1 = _unexplained(data1, d1, theta1, 1.0, rolled[0], torques[0], arm1, lever1)
+    left2, slope2, bow2 = _unexplained(data2, d2, theta2, -1.0, rolled[1], torques[1], arm2, lever2)
+    lever = 0.5 * (slope1 + slope2)
+    if lever <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    return left1, -left2, lever, 0.5 * (bow1 - bow2)
+
+
+@inner_kernel
+def load_of(torque: float, lever: float, bow: float) -> tuple[float, float]:
+    """(L, slope): the load [N] of a torque = lever L + bow L² [N·m], and the torque's slope [m].
+
+    Beyond the parabola's end, to which no load leads, L goes on with the least slope.
+    """
+    least = _LEAST_SLOPE * lever
+    slope = math.sqrt(max(lever * lever + 4.0 * bow * torque, least * least))
+    return 2.0 * torque / (lever + slope), slope

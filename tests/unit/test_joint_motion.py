@@ -138,7 +138,7 @@ class Stuck:
 
 @pytest.mark.parametrize(
     ("how", "name", "within"),
-    [(jumped, "joint.jump", 0.01), (Stuck(), "joint.dead", 0.2)],
+    [(jumped, "joint.jump", 0.01), (Stuck(), "joint.dead", 0.12)],
     ids=["jumped", "stuck"],
 )
 def test_a_grip_ends_when_a_joint_can_not_be_believed(
