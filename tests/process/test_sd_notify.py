@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -146,12 +147,16 @@ def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
         assert process.stderr is not None
         assert process.stderr.read() == "", "all of it went into the file"
     records = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    assert all(set(record) == {"timestamp", "level", "kind", "text"} for record in records)
+    assert all({"timestamp", "level", "kind", "text"} <= set(record) for record in records)
     texts = [record["text"] for record in records]
     assert "running, disarmed" in texts
     assert "ended, torque off" in texts
     times = [record["timestamp"] for record in records]
     assert times == sorted(times)
+    running = next(record for record in records if record["text"] == "running, disarmed")
+    assert (running["mode"], running["force"]) == ("disarmed", [0.0, 0.0])
+    assert records[-1]["ticks"] > 0
+    assert set(records[-1]["wake_s"]) == {"p50", "p99", "p999", "max"}
 
 
 # --- the unit and the rules -------------------------------------------------------------------
@@ -191,7 +196,8 @@ def test_the_unit_says_what_a_control_daemon_needs(tmp_path: Path) -> None:
     assert "/dev/cpu_dma_latency rw" in service["DeviceAllow"]
     words = shlex.split(service["ExecStart"][0].replace("%%", "%"))
     assert words[0] == sys.executable
-    assert words[-4:] == ["run", "--no-task", "--config", str(config)], "comes back disarmed"
+    assert words[4:6] == ["run", "--no-task"], "comes back disarmed"
+    assert words[6:] == ["--log", "json", "--config", str(config)]
     # What it starts is there: the same words show the help.
     shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=60, check=False)
     assert shown.returncode == 0
@@ -268,8 +274,11 @@ def test_plain_lines_and_json_lines_say_the_same(tmp_path: Path) -> None:
         log.close()
         logging.getLogger().removeHandler(handler)
     plain = (tmp_path / "plain").read_text(encoding="utf-8").splitlines()
-    assert plain[0] == 'warning servos.temperature left "servo"'
-    assert plain[2:] == ["softfinger: ended", "error   dynamixel port x is gone"]
+    day, clock, said = plain[0].split(" ", 2)
+    assert abs((datetime.now() - datetime.fromisoformat(f"{day} {clock}")).days) <= 1
+    assert said == 'warning servos.temperature left "servo"'
+    assert plain[2] == "softfinger: ended"
+    assert plain[3].endswith("error   dynamixel port x is gone")
     lines = (tmp_path / "json").read_text(encoding="utf-8").splitlines()
     told = [json.loads(line) for line in lines]
     assert [(each["level"], each["kind"], each["text"]) for each in told] == [
@@ -277,6 +286,28 @@ def test_plain_lines_and_json_lines_say_the_same(tmp_path: Path) -> None:
         ("error", "", "softfinger: ended"),
         ("error", "dynamixel", "port x is gone"),
     ]
+
+
+@pytest.mark.parametrize("form", ["plain", "json"])
+def test_in_the_journal_each_line_has_its_priority(
+    form: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status = os.fstat(sys.stderr.fileno())
+    monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+    log = EventLog(form)
+    log.line("warning", "bus", "slow\nand late", late_s=0.25)
+    log.plain("softfinger: ended with a fault", "error")
+    log.close()
+    lines = capfd.readouterr().err.splitlines()
+    if form == "plain":
+        assert lines == [
+            "<4>warning bus      slow",
+            "<4>and late",
+            "<3>softfinger: ended with a fault",
+        ]
+        return
+    assert [line[:3] for line in lines] == ["<4>", "<3>"]
+    assert json.loads(lines[0][3:])["late_s"] == 0.25
 
 
 def test_a_log_file_that_can_not_be_opened_is_told(profile: Callable[..., Path]) -> None:

@@ -5,23 +5,25 @@ lines that can't be written are dropped.
 
 Plain lines are for people. With ``form="json"`` each line is an object: ``timestamp`` (Unix s, when
 it was handed over), ``level`` (``info``, ``warning``, ``error``), ``kind`` and ``text``, as in
-``hand/event``.
+``hand/event``, and numbers as fields of their own. In systemd's journal each line has its priority.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
 _KEPT = 1000  # lines that wait for a slow reader; older ones are dropped
+_PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
 
@@ -37,20 +39,22 @@ class EventLog:
         self._file: TextIO | None = None
         if file is not None:
             self._file = write_text(file, append=True)
-        self._lines: deque[tuple[float, str, str, str]] = deque(maxlen=_KEPT)
+        self._journal = file is None and _is_journal()
+        self._lines: deque[tuple[float, str, str, str, dict[str, Any]]] = deque(maxlen=_KEPT)
         self._news = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._write, name="event log", daemon=True)
         self._thread.start()
 
-    def line(self, level: str, kind: str, text: str) -> None:
+    def line(self, level: str, kind: str, text: str, **fields: Any) -> None:
+        """Hand over one line; ``fields`` are shown in JSON alone."""
         if not self.quiet or self._file is not None:
-            self._lines.append((time.time(), level, kind, text))
+            self._lines.append((time.time(), level, kind, text, fields))
             self._news.set()
 
     def plain(self, text: str, level: str = "") -> None:
         """Hand over one line as it is; in JSON it is of ``level``, or ``info``, and no kind."""
-        self._lines.append((time.time(), level, "", text))
+        self._lines.append((time.time(), level, "", text, {}))
         self._news.set()
 
     def take_over_logging(self) -> None:
@@ -78,11 +82,33 @@ class EventLog:
             if self._closing:
                 return
 
-    def _shown(self, timestamp: float, level: str, kind: str, text: str) -> str:
+    def _shown(
+        self, timestamp: float, level: str, kind: str, text: str, fields: dict[str, Any]
+    ) -> str:
         if self._json:
             record = {"timestamp": timestamp, "level": level or "info", "kind": kind, "text": text}
-            return json.dumps(record, ensure_ascii=False)
-        return f"{level:7} {kind:8} {text}" if kind else text
+            shown = json.dumps(record | fields, ensure_ascii=False)
+        elif not kind:
+            shown = text
+        else:
+            shown = f"{level:7} {kind:8} {text}"
+            if not self._journal:  # which has the time of each line by itself
+                date = "%H:%M:%S" if self._file is None else "%Y-%m-%d %H:%M:%S"
+                clock = time.strftime(date, time.localtime(timestamp))
+                shown = f"{clock}.{int(timestamp % 1.0 * 1e3):03} {shown}"
+        if self._journal:
+            priority = _PRIORITIES[level]
+            shown = priority + shown.replace("\n", f"\n{priority}")
+        return shown
+
+
+def _is_journal() -> bool:
+    """Whether standard error goes to systemd's journal."""
+    try:
+        status = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError, AttributeError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
 class _LogHandler(logging.Handler):

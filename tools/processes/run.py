@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 import time
@@ -14,6 +15,7 @@ from typing import Any
 from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.loop.sd_notify import Service
 from softfinger.daemon.profile.settings import Settings, TaskSettings
+from softfinger.daemon.types import State
 from softfinger.tools.arguments import add_profile, profile, seconds
 from softfinger.tools.ending import Interrupted, Signals
 from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
@@ -81,10 +83,15 @@ def _serve(
     from softfinger.daemon.loop.publishing import plan
     from softfinger.tools.processes.kernel_build import build_kernels, table_cache
 
-    log.line("info", "start", f"softfinger: {_scene(settings)}")
+    log.line("info", "start", f"softfinger: {_scene(settings)}", rate_hz=settings.loop.rate)
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
+    daemon = None
+
+    def told(level: str, kind: str, text: str) -> None:
+        log.line(level, kind, text, **({} if daemon is None else _numbers(daemon.loop.state)))
+
     try:
-        daemon = Daemon(settings, on_event=log.line, table_cache=table_cache())
+        daemon = Daemon(settings, on_event=told, table_cache=table_cache())
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
         return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again
@@ -95,7 +102,13 @@ def _serve(
         for event in measures.events():
             loop.emit(*event)
         loop.emit("info", "schedule", plan(settings))
-        log.line("info", "start", _ready(settings, daemon))
+        seconds = time.monotonic() - _STARTED
+        within = max(table.max_error for table in daemon.tables)
+        ready = (
+            f"ready after {seconds:.2f} s; state on {settings.stream.address}, commands on "
+            f"{settings.commands.address}; contact table within {within:.1e}"
+        )
+        log.line("info", "start", ready, start_s=seconds, table_error=within)
         recording: Any = nullcontext()
         if arguments.record is not None:
             try:
@@ -106,6 +119,7 @@ def _serve(
         log.quiet = arguments.monitor  # from here on the page owns the terminal
         with _page(settings, loop) if arguments.monitor else nullcontext():
             loop.run(arguments.duration)
+        log.quiet = False
     if arguments.record is not None:
         for line in recording.close().splitlines():
             log.plain(line)
@@ -113,9 +127,12 @@ def _serve(
             log.plain(f"softfinger: {arguments.record} does not hold all of this run", "error")
     state, statistics = daemon.loop.state, daemon.loop.statistics
     if statistics.ticks:
-        log.plain(f"{statistics.ticks} ticks, {state.timing.overruns} overruns")
-        for line in statistics.table():
-            log.plain(line)
+        counts = {"ticks": statistics.ticks, "overruns": state.timing.overruns}
+        spreads = {f"{name}_s": each._asdict() for name, each in statistics.spreads().items()}
+        text = ", ".join(f"{count} {name}" for name, count in counts.items())
+        log.line("info", "end", text, **counts, **spreads)
+        if arguments.log == "plain":
+            log.plain("\n".join(statistics.table()))
     if state.fault:
         log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
@@ -171,9 +188,11 @@ def _scene(settings: Settings) -> str:
     )
 
 
-def _ready(settings: Settings, daemon: Any) -> str:
-    return (
-        f"ready after {time.monotonic() - _STARTED:.2f} s; "
-        f"state on {settings.stream.address}, commands on {settings.commands.address}; "
-        f"contact table within {max(table.max_error for table in daemon.tables):.1e}"
-    )
+def _numbers(state: State) -> dict[str, Any]:
+    """What the log has of the hand at an event; its ``seq`` finds it in a recording."""
+    numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
+    real = {
+        name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN
+        for name, pair in numbers.items()
+    }
+    return {"seq": state.seq, "mode": state.mode, **real}

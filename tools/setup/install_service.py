@@ -41,6 +41,10 @@ NotifyAccess=main
 ExecStart={command}
 {user}SupplementaryGroups=dialout
 UMask=0077
+# Each line of the log has its priority; one without is a traceback, or a report on settings:
+# journalctl -u softfinger -p warning; -o cat gives the JSON objects alone.
+SyslogIdentifier=softfinger
+SyslogLevel=err
 KillSignal=SIGTERM
 # The first start compiles the kernels.
 TimeoutStartSec=300
@@ -134,7 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def unit(config: Path | None, user: str) -> str:
     """The unit's text. Raises ValueError for a user or profile that is not there."""
-    words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task"]
+    words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task", "--log", "json"]
     if config is not None:
         if not find(config).is_file():
             raise ValueError(f"{config}: no such profile")
