@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softfinger.tools.paper import run_pages
+from softfinger.tools.paper import run_pages, solid_pages
 from softfinger.tools.paper.model_pages import DEPTHS, TILTS
 from softfinger.tools.paper.sheets import Sheet
 
@@ -79,3 +79,21 @@ def test_the_rotation_is_estimated_by_the_daemon(path: tuple[Sheet, ...]) -> Non
     off = rotation["theta estimated"][deep] - rotation["theta"][deep]
     assert np.sqrt(np.mean(off**2)) < 0.15
     np.testing.assert_allclose(rotation["F estimated"][deep], rotation["F"][deep], rtol=0.05)
+
+
+def test_what_a_solid_tip_explains_of_the_papers_measurements() -> None:
+    _, free, stuck, *runs, rolled, _, least = solid_pages.solid_runs()
+    # One offset at every tilt to 20° where the face sticks; without friction it changes its sign.
+    assert stuck["modulus"] == pytest.approx(0.179, abs=0.001)
+    assert stuck["mean offset"][:5] == pytest.approx(1.67, abs=0.07)
+    assert (stuck["its deviation over d"][:4] < 0.25).all()
+    assert free["modulus"] == pytest.approx(0.215, abs=0.001)
+    assert free["mean offset"][[0, -1]] == pytest.approx([3.6, -4.2], abs=0.1)
+    for run in runs:
+        deep = run["F"] > 5.0
+        np.testing.assert_allclose(run["F estimated"][deep], run["F"][deep], rtol=0.03)
+    # Without friction F is largest at 0°; a sticking face has a minimum by its way there.
+    assert rolled["theta"][np.argmax(rolled["F"])] == pytest.approx(0.0, abs=0.2)
+    found = least["angle of the least F"]
+    assert found[:4] == pytest.approx([-0.4, -0.3, -7.6, -6.1], abs=0.1)
+    assert np.isnan(found[4:]).all()

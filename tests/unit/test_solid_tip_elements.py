@@ -18,6 +18,7 @@ def test_a_coarse_mesh_presses_as_the_data_file_says() -> None:
     from softfinger.tools.solid_tip.contact import TiltedPlane
     from softfinger.tools.solid_tip.fit import RING_EDGES, Samples
     from softfinger.tools.solid_tip.green import green
+    from softfinger.tools.solid_tip.ways import StickingPlane, straight
 
     surface = green(rings=12, poisson=0.48, bonded=True, base_harmonics=9)
     press = TiltedPlane(surface, THETA, D).press(D)
@@ -30,6 +31,9 @@ def test_a_coarse_mesh_presses_as_the_data_file_says() -> None:
         assert force == pytest.approx(balance, rel=1e-9)
     assert 1.05 < stuck.push / press.push < 1.15
     assert -0.1 < stuck.shear / stuck.push < -0.05
+    *_, (_, same) = straight(StickingPlane(surface, 0.6), THETA, D)
+    assert same[:2] == pytest.approx((stuck.push, stuck.shear), rel=0.02)
+    assert same[2:] == pytest.approx((force, stuck.energy), rel=0.005)
     with np.load(FILE) as data:
         tip = SolidTip(data, "bonded", 0.48)
     push, energy, pressure = tip.press(D, THETA)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
-    *("fig7", "fig7_run", "fig10", "fig10_run", "fig11"),
+    *("fig7", "fig7_run", "fig10", "fig10_run", "fig11", "solid_run"),
 )
 BY_NAME = ("basin",)  # the long ones, drawn only when they are named
 
@@ -36,9 +36,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, FigurePage]:
     """All figures by name."""
-    from softfinger.tools.paper import appendix, basin, experiment_pages, model_pages, run_pages
+    from softfinger.tools.paper import (
+        appendix,
+        basin,
+        experiment_pages,
+        model_pages,
+        run_pages,
+        solid_pages,
+    )
 
-    modules = (model_pages, experiment_pages, run_pages, appendix, basin)
+    modules = (model_pages, experiment_pages, run_pages, appendix, solid_pages, basin)
     found = {name: page for each in modules for name, page in each.PAGES.items()}
     return {name: found[name] for name in (*NAMES, *BY_NAME)}
 

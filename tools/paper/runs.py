@@ -54,8 +54,22 @@ class SimulatedRun:
     energy_found: FloatArray
 
 
-def compression(tilt: float) -> SimulatedRun:
-    """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
+def solid(modulus: float) -> Sections:
+    """Settings of a bonded solid tip of ``modulus`` [Pa] whose face is frictionless."""
+    return {
+        "tip": {"physics": "solid", "poisson": 0.49, "base": "bonded"},
+        "material": {"modulus": modulus},
+        "estimator": {"free_gain": False},
+        "safety": {"d_max": _DEEPEST},
+        "simulation": {"tip_friction": 0.0},
+    }
+
+
+def compression(tilt: float, tip: Sections | None = None) -> SimulatedRun:
+    """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm.
+
+    ``tip`` are settings of another tip than the paper's springs.
+    """
     x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
     sections: Sections = {
         "servos": {"backend": "none"},
@@ -66,7 +80,7 @@ def compression(tilt: float) -> SimulatedRun:
         },
     }
     seconds = (_DEEPEST + _GAP) / math.cos(tilt) / _SPEED
-    with _daemon(sections) as daemon:
+    with _daemon(sections, tip) as daemon:
         return _collect(_frames(daemon, round(seconds / SCAN)), daemon)
 
 
@@ -102,8 +116,11 @@ def rotation() -> SimulatedRun:
         return _collect(iter(rows), daemon)
 
 
-def rolling(d: float) -> SimulatedRun:
-    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held."""
+def rolling(d: float, tip: Sections | None = None) -> SimulatedRun:
+    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held.
+
+    ``tip`` as for :func:`compression`.
+    """
     sections: Sections = {
         "servos": {"backend": "none"},
         "hand": {"open_angle": (TILTED, 0.0)},
@@ -113,21 +130,26 @@ def rolling(d: float) -> SimulatedRun:
     def place(hand: SimulatedHand, share: float) -> None:
         _roll(hand, d, -ROLLED * share)
 
-    with _daemon(sections) as daemon:
+    with _daemon(sections, tip) as daemon:
         return _collect(_frames(daemon, _ROLL_STEPS, place), daemon)
 
 
-def _daemon(sections: Sections) -> Daemon:
-    simulation = {"tactile_delay": SCAN, "tactile_noise": 0.005 * MODULUS, "object_height": 0.2}
-    merged = {
+def _daemon(*more: Sections | None) -> Daemon:
+    merged: Sections = {
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
         "tactile": {"rate": 1.0 / SCAN, "noise": 0.005 * MODULUS},
         "loop": {"clock": "virtual"},
-        **sections,
-        "simulation": simulation | sections["simulation"],
+        "simulation": {
+            "tactile_delay": SCAN,
+            "tactile_noise": 0.005 * MODULUS,
+            "object_height": 0.2,
+        },
     }
+    for sections in more:
+        for name, values in (sections or {}).items():
+            merged[name] = merged.get(name, {}) | values
     return Daemon(Settings.model_validate(merged), wire=False)
 
 

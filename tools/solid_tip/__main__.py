@@ -19,14 +19,20 @@ from softfinger.tools.solid_tip.green import green, shear_response
 Arrays = dict[str, NDArray[Any]]
 
 BASES = ("bonded", "lying")
+STICKING = "-sticking"
+BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
 HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are not fitted
 
-NOTES = """Hemisphere of linear elastic rubber pressed by a rigid plane without friction, by finite
-elements: python -m softfinger.tools.solid_tip, {rings} elements along the arc, {nodes} values of ν.
+NOTES = """Hemisphere of linear elastic rubber pressed by a rigid plane, by finite elements:
+python -m softfinger.tools.solid_tip, {rings} elements along the arc ({sticking} where the face
+sticks), {nodes} values of ν. The plane is without friction, or (…-sticking) holds each point where
+it touched, coming straight along its normal from first touch on: T = N sin θ cos θ P[coef_0] is
+the force along (cos θ, 0, −sin θ) against the tip; so it is held back.
 Lengths in a, stresses in E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = √(d/a), P a product of
 Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1, and ν on nu_range:
-N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]), F = N cos θ;
-p = N (cos θ B_0(r) + Σ P[coef_k] sin^m_k θ B_k(r) cos m_k φ); basis: means of B_k over rings.
+N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]);
+p = F B_0(r) + N Σ P[coef_k] sin^m_k θ B_k(r) cos m_k φ; basis: means of B_k over rings;
+F = N cos θ (1 − sin² θ P[coef_0]), with coef_0 = 0 unless the face sticks.
 A shear force T on the face adds T B_T(r) cos(φ − φ_T); shear holds B_T's means over the rings
 (for a force at the pole), as Chebyshev coefficients in ν.
 Base bonded: u = 0. Lying: u_z = 0 (held down: it may pull), free to slide but for a uniform shear
@@ -36,15 +42,16 @@ frame from a file of a coarser mesh. Largest and rms differences between file an
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
-    """Presses of one base, mesh and ν over the whole domain; kept in ``folder``."""
-    base, rings, poisson = which
-    file = folder / f"{base}-{rings}-{poisson:.6f}.npz"
+    """Presses of one block, mesh and ν over the whole domain; kept in ``folder``."""
+    block, rings, poisson = which
+    base, sticking = block.removesuffix(STICKING), block.endswith(STICKING)
+    file = folder / f"{block}-{rings}-{poisson:.6f}.npz"
     if not file.exists():
         surface = green(rings, poisson, base == "bonded", fit.HARMONICS)
         depths = fit.chebyshev_nodes(0, fit.S_MAX, 24) ** 2
         found = []
         for sine2 in fit.chebyshev_nodes(0, np.sin(fit.THETA_MAX) ** 2, 9):
-            plane = TiltedPlane(surface, np.arcsin(np.sqrt(sine2)), fit.D_MAX)
+            plane = TiltedPlane(surface, np.arcsin(np.sqrt(sine2)), fit.D_MAX, sticking)
             found += [plane.press(d) for d in depths if d > 0.003]
         np.savez(file, **fit.Samples.of(found, surface.base_radius)._asdict())
     with np.load(file) as data:
@@ -55,7 +62,7 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
     """N, U and p of the file against presses, over three ranges of depth."""
     areas = np.sqrt(np.diff(tip.edges**2))
     rows = []
-    for d, theta, push, energy, base in zip(*samples, strict=True):
+    for d, theta, push, energy, _, base in zip(*samples, strict=True):
         found = tip.press(d, theta)
         pressure = rms_difference(found[2] * areas, base[: len(found[2])] * areas)
         rows.append((found[0] / push - 1, found[1] / energy - 1, pressure))
@@ -67,11 +74,11 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
     return "; ".join(text)
 
 
-def mesh_errors(arrays: Arrays, other: Arrays, base: str) -> tuple[float, float]:
+def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
     """Largest relative difference of two files in N, and in the frame of a sensor's cells."""
     force, pressure = [], []
     for poisson in (*fit.NU, 0.49):
-        tip, second = SolidTip(arrays, base, poisson), SolidTip(other, base, poisson)
+        tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)
         for d in (0.005, 0.025, 0.1, 0.25, fit.D_MAX):
             for theta in (0.0, 0.3, fit.THETA_MAX):
                 (push, _, one), (its_push, _, two) = tip.press(d, theta), second.press(d, theta)
@@ -88,6 +95,7 @@ def main() -> None:
     )
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=64, help="elements along the arc")
+    parser.add_argument("--sticking", type=int, default=48, help="the same where the face sticks")
     parser.add_argument("--coarser", type=int, default=32, help="elements to tell the mesh's error")
     parser.add_argument("--held-out", type=int, default=32, help="elements of presses not fitted")
     parser.add_argument("--nodes", type=int, default=4, help="values of ν")
@@ -97,44 +105,55 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     nodes = fit.chebyshev_nodes(*fit.NU, arguments.nodes)
+    finest = {each: arguments.sticking if STICKING in each else arguments.rings for each in BLOCKS}
     work = [
-        *product(BASES, sorted({arguments.coarser, arguments.rings}), nodes),
-        *product(BASES, [arguments.held_out], HELD_OUT),
-    ]
+        *((block, rings, nu) for block in BLOCKS for rings in (arguments.coarser, finest[block])
+          for nu in nodes),
+        *product(BLOCKS, [arguments.held_out], HELD_OUT),
+    ]  # fmt: skip
     with ProcessPoolExecutor(arguments.processes) as pool:
         samples = dict(
             zip(work, pool.map(presses, work, [arguments.folder] * len(work)), strict=True)
         )
+
+    def fitted(block: str, rings: int) -> Arrays:
+        part = [samples[block, rings, poisson] for poisson in nodes]
+        found = fit.fit(part, nodes, np.pi / 2 / rings, arguments.tolerance)
+        bonded, shear = block.startswith("bonded"), []
+        for poisson in nodes:
+            radius, pressure = shear_response(rings, poisson, bonded)
+            shear.append(fit.ring_means(radius) @ pressure)
+        found["shear"] = fit.over_nu(np.array(shear)).astype(np.float32)
+        return shared | {f"{block}.{name}": value for name, value in found.items()}
+
     shared = {
         "s_max": np.array(fit.S_MAX),
         "theta_max": np.array(fit.THETA_MAX),
         "nu_range": np.array(fit.NU),
         "ring_edges": fit.RING_EDGES,
     }
-    files = {}
-    for rings in (arguments.coarser, arguments.rings):
-        files[rings] = dict(shared)
-        for base in BASES:
-            part = [samples[base, rings, poisson] for poisson in nodes]
-            found = fit.fit(part, nodes, np.pi / 2 / rings, arguments.tolerance)
-            shear = []
-            for poisson in nodes:
-                radius, pressure = shear_response(rings, poisson, base == "bonded")
-                shear.append(fit.ring_means(radius) @ pressure)
-            found["shear"] = fit.over_nu(np.array(shear)).astype(np.float32)
-            files[rings] |= {f"{base}.{name}": value for name, value in found.items()}
-    arrays = files[arguments.rings]
-    for base in BASES:
-        errors = mesh_errors(arrays, files[arguments.coarser], base)
+    arrays: Arrays = {}
+    rows = []
+    for block in BLOCKS:
+        one, other = (fitted(block, rings) for rings in (finest[block], arguments.coarser))
+        arrays |= one
+        errors = mesh_errors(one, other, block)
         for name, value in zip(("force_error", "pressure_error"), errors, strict=True):
-            arrays[f"{base}.{name}"] = np.array(value)
-    arrays["error"] = np.array(max(arrays[f"{base}.force_error"] for base in BASES))
-    rows = [
-        f"{base}, {rings} elements, ν {poisson:.4f}{'' if poisson in nodes else ' (not fitted)'}: "
-        + differences(SolidTip(files[rings], base, poisson), each)
-        for (base, rings, poisson), each in samples.items()
-    ]
-    notes = NOTES.format(rings=arguments.rings, nodes=arguments.nodes, errors="\n".join(rows))
+            arrays[f"{block}.{name}"] = np.array(value)
+        for (its, rings, poisson), each in samples.items():
+            if its == block:
+                told = "" if poisson in nodes else " (not fitted)"
+                tip = SolidTip(one if rings == finest[block] else other, block, poisson)
+                rows.append(
+                    f"{block}, {rings} elements, ν {poisson:.4f}{told}: {differences(tip, each)}"
+                )
+    arrays["error"] = np.array(max(arrays[f"{block}.force_error"] for block in BLOCKS))
+    notes = NOTES.format(
+        rings=arguments.rings,
+        sticking=arguments.sticking,
+        nodes=arguments.nodes,
+        errors="\n".join(rows),
+    )
     arrays["notes"] = np.array(notes)
     np.savez_compressed(arguments.out, **arrays)  # type: ignore[arg-type]
     print(notes)

@@ -3,7 +3,9 @@
 Without friction a cell's unknown is its push q ≥ 0 along the plane's normal n = (sin θ, 0, cos θ),
 both mirror images y and −y together. With the compliance C the cells move by C q; the plane
 overlaps them by δ = X·n − (a − d); so q ≥ 0, C q − δ ≥ 0, q·(C q − δ) = 0. Sticking adds two
-forces along the plane to each cell, which keep it where it was when it came to touch.
+forces along the plane to each cell, which keep it where it was when it came to touch. Then the
+way counts: here the plane comes straight along n, so that the held points never move along it, the
+forces along it do no work, and N = ∂U/∂d holds as without friction.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ class TiltedPlane:
         axes = np.array([[sine, 0.0, cosine], [cosine, 0.0, -sine], [0.0, 1.0, 0.0]])
         self.axes = axes = axes if sticking else axes[:1]
         m = np.arange(len(green.rings))[:, None, None]
-        rings, reach = [], []
+        rings, places = [], []
         self.parts = []  # of each ring: slice of forces, loads (3, M, n), shares (M, 1)
         count = 0
         for ring, (cells, (r, z)) in enumerate(zip(green.cells, green.place, strict=True)):
@@ -60,9 +62,11 @@ class TiltedPlane:
             where = slice(count, count + load.shape[2])
             self.parts.append((where, load / green.weight[ring], share[:, 0]))
             rings.append(np.full(phi.size, ring))
-            reach.append(height[near])
+            places.append(np.hstack([0 * phi + z, r * np.cos(phi), r * np.sin(phi)]))
             count += load.shape[2]
-        self.ring, self.reach = np.concatenate(rings), np.concatenate(reach)
+        self.ring = np.concatenate(rings)
+        self.places = np.concatenate(places)  # (z, x, y) of each cell
+        self.reach = self.places @ (cosine, sine, 0.0)
         self.compliance = np.zeros((count, count))
         used = np.unique(self.ring)
         for i in used:
@@ -78,16 +82,19 @@ class TiltedPlane:
                 self.compliance[at_j, at_i] = block.T
         self.touching = np.zeros(self.reach.size, dtype=np.bool_)
         self.moved = np.zeros(count)
+        self.depth = 0.0
 
     def press(self, d: float) -> Press:
         """Solve at depth ``d``, beginning with the cells that touched at the last press.
 
-        Sticking depends on the way: press deeper in small steps. Raises RuntimeError where the
-        active sets do not settle.
+        Sticking depends on the way: press deeper in small steps. A cell that comes to touch within
+        one sticks where it was in between. Raises RuntimeError where the active sets do not settle.
         """
         overlap, step = self.reach - (1 - d), len(self.axes)
+        before = self.moved
+        room = before[::step] - overlap + (d - self.depth)
         touching = self.touching if self.touching.any() else overlap > 0.4 * d
-        wanted = self.moved.copy()
+        wanted = before.copy()
         wanted[::step] = overlap
         for _ in range(60):
             active = np.repeat(touching, step)
@@ -98,10 +105,15 @@ class TiltedPlane:
             now = np.where(touching, force[::step] > 0, moved[::step] < overlap)
             if (now == touching).all():
                 break
+            new = now & ~touching
+            share = room[new] / (room + overlap - moved[::step])[new]
+            for k in range(1, step):
+                was = before[k::step][new]
+                wanted[k::step][new] = was + share * (moved[k::step][new] - was)
             touching = now
         else:
             raise RuntimeError(f"no contact found at d = {d} a, θ = {self.theta} rad")
-        self.touching, self.moved = touching, moved
+        self.touching, self.moved, self.depth = touching, moved, d
         base = np.zeros(self.green.base.shape[:2])
         for ring in np.unique(self.ring):
             where, load, share = self.parts[ring]

@@ -12,21 +12,21 @@ from softfinger.tools.solid_tip.meridian import FloatArray
 
 
 class SolidTip:
-    """One base at one ν from the file's arrays, for E = a = 1."""
+    """One block of the file's arrays at one ν, for E = a = 1."""
 
     def __init__(
-        self, arrays: Mapping[str, NDArray[np.generic]], base: str, poisson: float
+        self, arrays: Mapping[str, NDArray[np.generic]], block: str, poisson: float
     ) -> None:
         low, high = arrays["nu_range"]
         y = (2 * poisson - low - high) / (high - low)
         self.poisson = poisson
         self.s_max, self.theta_max = float(arrays["s_max"]), float(arrays["theta_max"])
         self.push, self.energy, self.coef = (
-            chebyshev.chebval(y, np.moveaxis(arrays[f"{base}.{name}"].astype(float), -1, 0))
+            chebyshev.chebval(y, np.moveaxis(arrays[f"{block}.{name}"].astype(float), -1, 0))
             for name in ("push", "energy", "coef")
         )
-        self.m = arrays[f"{base}.m"].astype(int)
-        self.basis = arrays[f"{base}.basis"].astype(float)
+        self.m = arrays[f"{block}.m"].astype(int)
+        self.basis = arrays[f"{block}.basis"].astype(float)
         self.edges = arrays["ring_edges"].astype(float)
 
     def press(self, d: float, theta: float) -> tuple[float, float, FloatArray]:
@@ -40,7 +40,7 @@ class SolidTip:
         amplitude = (
             chebyshev.chebval2d(x, w, self.coef.transpose(1, 2, 0)) * np.sin(theta) ** self.m
         )
-        amplitude[0] = np.cos(theta)
+        amplitude[0] = np.cos(theta) * (1 - np.sin(theta) ** 2 * amplitude[0])  # F/N
         pressure = np.zeros((self.m.max() + 1, self.edges.size - 1))
         np.add.at(pressure, self.m, push * amplitude[:, None] * self.basis)
         return push, energy, pressure

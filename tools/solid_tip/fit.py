@@ -39,18 +39,19 @@ class Samples(NamedTuple):
     theta: FloatArray
     push: FloatArray
     energy: FloatArray
+    shear: FloatArray
     base: FloatArray  # (n, H, R) harmonics of the base pressure, means over rings
 
     @classmethod
     def of(cls, presses: list[Press], base_radius: FloatArray) -> Samples:
         """Collects ``presses``; ``base_radius`` are the nodes of their base pressure."""
         rings = ring_means(base_radius)
-        d, theta, push, energy = (
+        d, theta, push, energy, shear = (
             np.array([getattr(each, name) for each in presses])
-            for name in ("d", "theta", "push", "energy")
+            for name in ("d", "theta", "push", "energy", "shear")
         )
         base = np.array([each.base[:HARMONICS] @ rings.T for each in presses])
-        return cls(d, theta, push, energy, base)
+        return cls(d, theta, push, energy, shear, base)
 
 
 def ring_means(base_radius: FloatArray) -> FloatArray:
@@ -125,25 +126,29 @@ def fit(
     push = np.array([push_of(each) for each in energy])
     areas = np.pi * np.diff(RING_EDGES**2)
     patterns = np.array([one.base / one.push[:, None, None] for one in all_samples])
-    cosine = np.cos(all_samples[0].theta)
-    first = np.mean(patterns[:, :, 0] / cosine[:, None], axis=(0, 1))
+    s, theta = np.sqrt(all_samples[0].d), all_samples[0].theta
+    design = terms(s, theta, ORDERS)[0]
+    # Of the shear along the plane T = N sin θ cos θ Q, for F = N cos θ (1 − sin² θ Q).
+    slope = np.sin(theta) * np.cos(theta)
+    ratio = np.array([one.shear / one.push for one in all_samples])
+    stick = np.linalg.lstsq(design * slope[:, None], ratio.T, rcond=None)[0].T
+    force = np.cos(theta) - ratio * np.sin(theta)
+    first = np.mean(patterns[:, :, 0] / force[..., None], axis=(0, 1))
     first /= areas @ first
-    patterns[:, :, 0] -= cosine[:, None] * first
+    patterns[:, :, 0] -= force[..., None] * first
     scale = np.sqrt(areas @ first**2)
-    ms, basis, coef = [0], [first], [np.zeros((*ORDERS, len(nodes)))]
-    s = np.sqrt(all_samples[0].d)
+    ms, basis, coef = [0], [first], [over_nu(stick.reshape(-1, *ORDERS))]
     for m in range(HARMONICS):
         weight = np.sqrt(areas * (1.0 if m == 0 else 0.5))
         flat = patterns[:, :, m].reshape(-1, areas.size) * weight
         _, size, rows = np.linalg.svd(flat, full_matrices=False)
         left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(flat)) / scale  # rms of what is cut
-        design = terms(s, all_samples[0].theta, ORDERS)[0]
-        design = design * np.sin(all_samples[0].theta)[:, None] ** m
+        turned = design * np.sin(theta)[:, None] ** m
         for row in rows[: int(np.sum(left > tolerance))]:
             ms.append(m)
             basis.append(row / weight)
             amplitude = (patterns[:, :, m] * weight) @ row
-            each = np.linalg.lstsq(design, amplitude.T, rcond=None)[0].T.reshape(-1, *ORDERS)
+            each = np.linalg.lstsq(turned, amplitude.T, rcond=None)[0].T.reshape(-1, *ORDERS)
             coef.append(over_nu(each))
     return {
         "push": over_nu(push),
