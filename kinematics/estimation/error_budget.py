@@ -6,6 +6,9 @@ over d, in the coordinates in which white noise makes the identity. A shift of a
 place on the sensor, the pitch and the modulus are the same in every frame: each has a pattern of
 pressure, and moves the estimate as the fit answers that pattern. So does a misfit that is smooth
 over the footprint; how much of it there is shows in how alike the residuals of neighbours are.
+
+Kernels that take ``solid`` first depend on the tip: those here are of springs, and `solid_budget`
+has a solid tip's, of which a scene compiles the ones it needs.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from softfinger.kinematics.compiled.simd import Pointer, address
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.likelihood import BY_U, BY_V, BY_W, STRESS
+from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import (
     DEPTHS,
     READING,
@@ -39,7 +43,7 @@ _FEW = 48.0  # cells within which nothing is smooth or rough
 # square of the motion in depth over d and of the turn: measured over the envelope, with shifts of
 # 1 kPa, of 0.5 mm, of 1 % of the pitch and 5 % of the modulus.
 _D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
-_D_BY_TURN, _GAIN_BY_TURN, _REST = 0.8, 2.0, 0.3
+_D_BY_TURN, _GAIN_BY_TURN, _REST = 0.8, 2.0, 1.6
 _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
 
 
@@ -70,38 +74,48 @@ class Uncertainty:
             object.__setattr__(self, "correlation", rho)
 
 
-def set_budget(
-    state: EstimatorState, known: Uncertainty, grid: SensorGrid, tip: Fingertip, law: float
-) -> None:
-    """Fill in the budget, and raise the activity test's level to what the errors alone may make.
+def set_errors(state: EstimatorState, known: Uncertainty, law: float) -> None:
+    """Fill in what depends on no tip.
 
     ``law`` [Pa] is how far the material's law is off the points that it was made from: to the
     cells that it presses that is like a shift.
     """
-    budget, options = state.budget, state.options
+    budget = state.budget
     budget.shift = math.hypot(known.baseline, law)
     budget.baseline, budget.centre, budget.pitch = known.baseline, known.centre, known.pitch
-    budget.modulus = 0.0 if options.free_gain else known.modulus
+    budget.modulus = 0.0 if state.options.free_gain else known.modulus
     budget.systematic = max(budget.shift, known.centre, known.pitch, budget.modulus) > 0.0
+    budget.sharing = 1.0
+    if known.correlation is not None and known.correlation.size > 1:
+        rho = both_ways(known.correlation)
+        budget.correlated = True
+        budget.sharing = float((rho**2).sum())
+        budget.along = float(known.correlation[0, 1]) if known.correlation.shape[1] > 1 else 0.0
+
+
+def set_budget(
+    state: EstimatorState, known: Uncertainty, grid: SensorGrid, tip: Fingertip, law: float
+) -> None:
+    """Fill in the budget, and raise the activity test's level to what the errors alone may make."""
+    set_errors(state, known, law)
+    budget, options = state.budget, state.options
     level = options.patch_level
     weights = _NEIGHBOURS.copy()
     weights[2, 2] = 0.0
     norm = float(np.sqrt((weights**2).sum()))
-    if known.correlation is not None and known.correlation.size > 1:
-        rho = _both_ways(known.correlation)
-        budget.correlated = True
-        budget.sharing = float((rho**2).sum())
-        budget.along = float(known.correlation[0, 1]) if known.correlation.shape[1] > 1 else 0.0
+    if budget.correlated:
+        rho = both_ways(known.correlation)
         _set_inflation(budget, rho, grid, tip, options.free_gain)
         with_centre = float((weights * _fitted(rho, 5)).sum())
-        spread = float(_quadratic(weights, rho)) - with_centre**2
+        spread = float(quadratic(weights, rho)) - with_centre**2
         level = (level * math.sqrt(max(spread, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
     # A shift of twice the baseline's standard deviation is no contact.
     options.patch_level = level + 2.0 * known.baseline / options.noise * weights.sum() / norm
 
 
-def _both_ways(correlation: FloatArray) -> FloatArray:
+def both_ways(correlation: FloatArray | None) -> FloatArray:
     """The correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
+    assert correlation is not None
     rows, cols = correlation.shape
     return np.asarray(
         correlation[np.abs(np.arange(1 - rows, rows))][:, np.abs(np.arange(1 - cols, cols))]
@@ -119,7 +133,7 @@ def _fitted(rho: FloatArray, size: int) -> FloatArray:
     return out
 
 
-def _quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
+def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     """Σ over pairs of cells of field · ρ · field, for one field [rows, cols] or several […, n]."""
     several = fields.reshape(*fields.shape[:2], -1)
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
@@ -159,11 +173,11 @@ def _set_inflation(
         white = np.einsum("xyi,xyj->ij", jacobian, jacobian)
         inverse = np.linalg.inv(np.linalg.cholesky(white))
         first = 4 - len(columns)
-        budget.inflation[k, first:, first:] = inverse @ _quadratic(jacobian, rho) @ inverse.T
+        budget.inflation[k, first:, first:] = inverse @ quadratic(jacobian, rho) @ inverse.T
 
 
 @inner_kernel
-def colour(state: EstimatorState, d: float) -> float:
+def colour(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
     """Make ``fit.inverse`` the covariance under correlated noise of variance 1; the trace of K."""
     fit = state.fit
     budget = state.budget
@@ -196,7 +210,9 @@ def colour(state: EstimatorState, d: float) -> float:
 
 
 @fast_inner_kernel
-def smooth_misfit(state: EstimatorState, packed: Pointer) -> tuple[float, float]:
+def smooth_misfit(
+    solid: SolidFit | None, state: EstimatorState, packed: Pointer
+) -> tuple[float, float]:
     """Σ over neighbours in the packed cells of the product of their residuals [Pa²]; their number.
 
     Noise of single cells adds nothing to it on average, what is smooth over the footprint all.
@@ -222,13 +238,15 @@ def smooth_misfit(state: EstimatorState, packed: Pointer) -> tuple[float, float]
 
 
 @inner_kernel
-def hidden_misfit(state: EstimatorState, packed: Pointer, beyond: float) -> float:
+def hidden_misfit(
+    solid: SolidFit | None, state: EstimatorState, packed: Pointer, beyond: float
+) -> float:
     """Square sum [Pa²] of what the model leaves smoothly over the footprint; 0 within the noise.
 
     ``beyond`` [Pa²] is all that it leaves beyond what is expected: in a footprint of few cells no
     part of that can be told from smooth.
     """
-    total, number = smooth_misfit(state, packed)
+    total, number = smooth_misfit(solid, state, packed)
     variance = state.signal.variance
     # What the last step takes off is not in the packed cells yet.
     total -= number * variance * state.budget.along + state.fit.decrement
@@ -239,13 +257,16 @@ def hidden_misfit(state: EstimatorState, packed: Pointer, beyond: float) -> floa
 
 
 @fast_inner_kernel
-def _patterns(state: EstimatorState, packed: Pointer) -> None:
+def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
     """Jᵀq and qᵀq of the patterns q: a shift of all cells, of the tip in x and in y, the pitch."""
     face = state.fit.face
     u = face.u
     v = face.v
     w = face.w
     a2 = state.model.radius * state.model.radius
+    # Variances of x and of y in a cell, times 4.
+    xx_cell = state.model.pitch_x * state.model.pitch_x / 3.0
+    yy_cell = state.model.pitch_y * state.model.pitch_y / 3.0
     size = state.model.rows * state.model.cols
     answers = address(state.budget.answers)
     squares = address(state.budget.squares)
@@ -259,7 +280,10 @@ def _patterns(state: EstimatorState, packed: Pointer) -> None:
             x = packed[BY_V * size + k] * per_g
             y = packed[BY_W * size + k] * per_g
             # The strain is 1 − (u − v x − w y) g with g = 1/√(a² − x² − y²), so ∂g/∂x = x g³.
-            steep = (u - v * x - w * y) / max(a2 - x * x - y * y, 0.01 * a2)
+            q = max(a2 - x * x - y * y, 0.01 * a2)
+            # Near the rim the mean of g³ over a cell is more than its middle's.
+            wide = (xx_cell * x * x + yy_cell * y * y) / (q * q)
+            steep = (u - v * x - w * y) * (1.0 + 0.5 * min(wide, 1.0)) / q
             by_x = g * (v - steep * x)
             by_y = g * (w - steep * y)
             own = packed[WEIGHT * size + k] * packed[plane + k]
@@ -284,7 +308,35 @@ def _patterns(state: EstimatorState, packed: Pointer) -> None:
 
 
 @inner_kernel
-def systematic(state: EstimatorState, packed: Pointer, d: float, out: Matrix) -> float:
+def bend(solid: SolidFit | None, state: EstimatorState, d: float, out: Matrix) -> None:
+    """Add to ``out`` what a motion ``budget.moved`` is off the straight answer for its size."""
+    fit = state.fit
+    moved = state.budget.moved
+    gain = fit.gain
+    u = fit.face.u
+    v = fit.face.v
+    w = fit.face.w
+    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
+    deeper = n_z * (u * n_z * n_z * (v * moved[2] + w * moved[3]) - moved[1]) / d
+    square = min(deeper * deeper, 1.0)
+    turned = min(moved[2] * moved[2] + moved[3] * moved[3], 1.0)
+    by_turn = _D_BY_TURN * d * turned
+    rest = _REST * turned * d / state.grid.radius
+    out[1, 1] += (_D_BY_DEPTH * d * square) ** 2 + by_turn * by_turn + (rest * d) ** 2
+    out[2, 2] += rest * rest
+    out[3, 3] += rest * rest
+    if state.options.free_gain:
+        gain_by_turn = _GAIN_BY_TURN * gain * turned
+        out[0, 0] += (_GAIN_BY_DEPTH * gain * square) ** 2 + gain_by_turn * gain_by_turn
+        out[0, 0] += (rest * gain) ** 2
+        out[0, 1] += by_turn * gain_by_turn
+        out[1, 0] += by_turn * gain_by_turn
+
+
+@inner_kernel
+def systematic(
+    solid: SolidFit | None, state: EstimatorState, packed: Pointer, d: float, out: Matrix
+) -> float:
     """Covariance of (gain, u, v, w) by what all frames share, into ``out``.
 
     ``fit.inverse`` is that of white noise of variance 1 [Pa²]. Returns the square sum [Pa²] that
@@ -293,11 +345,7 @@ def systematic(state: EstimatorState, packed: Pointer, d: float, out: Matrix) ->
     fit = state.fit
     budget = state.budget
     gain = fit.gain
-    u = fit.face.u
-    v = fit.face.v
-    w = fit.face.w
-    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    _patterns(state, packed)
+    patterns(solid, state, packed)
     factor = (1.0, -gain, gain, gain)
     sizes = (budget.shift, gain * budget.centre, gain * budget.centre, gain * budget.pitch)
     moved = budget.moved
@@ -321,19 +369,5 @@ def systematic(state: EstimatorState, packed: Pointer, d: float, out: Matrix) ->
         for i in range(4):
             for j in range(4):
                 out[i, j] += moved[i] * moved[j]
-        # A motion of this size is not quite straight.
-        deeper = n_z * (u * n_z * n_z * (v * moved[2] + w * moved[3]) - moved[1]) / d
-        square = min(deeper * deeper, 1.0)
-        turned = min(moved[2] * moved[2] + moved[3] * moved[3], 1.0)
-        by_turn = _D_BY_TURN * d * turned
-        rest = _REST * turned
-        out[1, 1] += (_D_BY_DEPTH * d * square) ** 2 + by_turn * by_turn + (rest * d) ** 2
-        out[2, 2] += rest * rest
-        out[3, 3] += rest * rest
-        if state.options.free_gain:
-            gain_by_turn = _GAIN_BY_TURN * gain * turned
-            out[0, 0] += (_GAIN_BY_DEPTH * gain * square) ** 2 + gain_by_turn * gain_by_turn
-            out[0, 0] += (rest * gain) ** 2
-            out[0, 1] += by_turn * gain_by_turn
-            out[1, 0] += by_turn * gain_by_turn
+        bend(solid, state, d, out)
     return 4.0 * max(left, 0.0)

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd_sums import LANES
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -24,6 +23,7 @@ from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budge
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
+from softfinger.kinematics.estimation.solid_budget import set_solid_budget
 from softfinger.kinematics.estimation.solid_projection import SolidFit, solid_fit
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE, cell_integrals
@@ -40,9 +40,10 @@ class ContactEstimate:
     frame's squared pressure, nothing else presses, and what it leaves smoothly over the footprint
     could hide no more than 60 % of d (one standard deviation), or 3 % with a gain beyond 1/2 to 2,
     where both say that this is another tip. Such a misfit, as of a curved face, and the known
-    uncertainties are in the covariance. Without contact d and the tilts are 0 and that is valid.
-    It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip that stands
-    elsewhere on the sensor.
+    uncertainties are in the covariance; where together they leave more than half of d uncertain
+    (one standard deviation), that is not valid either. Without contact d and the tilts are 0 and
+    that is valid. It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip
+    that stands elsewhere on the sensor.
 
     ``covariance`` is of (d, tilt_x, tilt_y, gain), ``systematic`` the part of it that all frames
     share and averaging does not lessen; a fixed gain has a zero row, and without contact all is
@@ -122,7 +123,7 @@ _TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iterati
 _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
 PATCH_LEVEL = 4.9
-_SOUND = 0.97  # of the radius: cells beyond it don't count under a bonded tip
+_RIM = 0.03  # of the radius: cells so near to a bonded tip's rim don't count
 _EXPLAINED_MIN = 0.8  # share of the frame's squared pressure below which an estimate is not valid
 
 
@@ -134,8 +135,8 @@ class ContactEstimator:
     modelled pressure, by default for a tip of springs alone: a solid tip's frame hardly changes its
     shape with d, which then shows in the force only. Otherwise it is 1. ``live`` [rows, cols] bool
     masks dead cells. ``readings`` says where the board's readings end. ``known`` are the sensor's
-    other uncertainties, none by default, and for springs alone: they widen the covariance, and make
-    the activity test as much less sensitive. A material's own ``fit_error`` counts among them. The
+    other uncertainties, none by default: they widen the covariance, and make the activity test as
+    much less sensitive. A material's own ``fit_error`` counts among them. The
     fit goes up to a tilt of 71.57° (tan 3), and no further.
 
     Raises ValueError for arguments out of their range.
@@ -167,7 +168,10 @@ class ContactEstimator:
         self._full = math.nan  # of the last frame's type
         self.saturation = readings.saturation
         self._quantum = readings.quantum
-        alive = np.ones(grid.shape, dtype=bool) if live is None else np.asarray(live, dtype=bool)
+        known = known or Uncertainty()
+        alive = _within(grid, tip, known)
+        if live is not None:
+            alive &= np.asarray(live, dtype=bool)
         state = self._state = EstimatorState()
         options = self._options = state.options
         options.noise = noise
@@ -183,19 +187,18 @@ class ContactEstimator:
         options.patch_level = PATCH_LEVEL
         options.explained_min = _EXPLAINED_MIN
         options.modulus = material.reference_modulus
-        state.budget.sharing = 1.0
         options.blur = grid.blur
         options.rotation = grid.rotation
         self._solid: Any = None
         self._places: IntArray | None
         if tip.physics == "solid":
-            self._arena, self._places, self._solid = _lay_out_solid(
-                state, grid, tip, alive, material
-            )
+            self._arena, self._places, solid = _lay_out_solid(state, grid, tip, alive, material)
+            set_solid_budget(state, solid, known, grid, tip, self._places, material.fit_error)
+            self._solid = solid.array
         else:
             set_law(state.law, material.law)
             state.moments.ratios = moment_ratios(tip, material)
-            set_budget(state, known or Uncertainty(), grid, tip, material.fit_error)
+            set_budget(state, known, grid, tip, material.fit_error)
             self._arena, self._places = _lay_out(state, grid, tip, alive)
         self._estimate: Any = state.estimate.array
         self._frame = np.zeros(grid.shape)
@@ -316,6 +319,29 @@ class ContactEstimator:
         return self._arena, self._places, self._solid
 
 
+def _within(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
+    """The cells [rows, cols] that don't lie at a solid tip's rim, where the model may be wrong.
+
+    A bonded base's stress is singular there, which no two meshes have alike: from independent
+    elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. And where
+    the tip's place is uncertain, the rim may be elsewhere.
+    """
+    margin = 2.0 * (known.centre + known.pitch * tip.radius)
+    if tip.base == "bonded":
+        margin = max(margin, _RIM * tip.radius)
+    if tip.physics == "springs" or margin == 0.0:
+        return np.ones(grid.shape, np.bool_)
+    cells = grid.on(tip)
+    x, y = (
+        np.abs(start + pitch * (np.arange(count) + 0.5)) + 0.5 * pitch
+        for start, pitch, count in (
+            (cells.x, cells.pitch_x, cells.cols),
+            (cells.y, cells.pitch_y, cells.rows),
+        )
+    )
+    return np.asarray(np.hypot(x, y[:, None]) < tip.radius - margin - grid.blur)
+
+
 @lru_cache(maxsize=4)
 def _integrals(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     """Of a grid's cells under a tip: two fingers' are mostly the same."""
@@ -371,23 +397,9 @@ def _lay_out_solid(
     tip: Fingertip,
     live: NDArray[np.bool_],
     material: Material,
-) -> tuple[FloatArray, IntArray, Records[SolidFit]]:
-    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory.
-
-    A bonded base's stress is singular at its rim, which no two meshes have alike: from independent
-    elements' frames the model's differ by 3 % rms with the cells there, and 0.6 % without. They are
-    left out.
-    """
+) -> tuple[FloatArray, IntArray, SolidFit]:
+    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory."""
     geometry = grid.on(tip)
-    if tip.base == "bonded":
-        x, y = (
-            np.abs(start + pitch * (np.arange(count) + 0.5)) + 0.5 * pitch
-            for start, pitch, count in (
-                (geometry.x, geometry.pitch_x, geometry.cols),
-                (geometry.y, geometry.pitch_y, geometry.rows),
-            )
-        )
-        live = live & (np.hypot(x, y[:, None]) < _SOUND * tip.radius - grid.blur)
     state.grid.assign(geometry)
     state.model.assign(geometry)
     centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
@@ -401,4 +413,4 @@ def _lay_out_solid(
     solid.model = solid.readings + len(places)
     scratch = np.zeros(2 * len(places))
     arena = np.concatenate([centres.ravel(), cells.ravel(), packed.ravel(), scratch])
-    return arena, places, solid.array
+    return arena, places, solid

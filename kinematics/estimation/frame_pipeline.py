@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from typing import Any, cast
 
-from numba.core import types
-
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address, further
@@ -19,7 +17,7 @@ from softfinger.kinematics.estimation.gauss_newton import fit, judge, linearise,
 from softfinger.kinematics.estimation.moments import refine, start_from_frame
 from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
 from softfinger.kinematics.estimation.solid_fit import fit_solid, start_solid
-from softfinger.kinematics.estimation.solid_projection import SolidFit, presses
+from softfinger.kinematics.estimation.solid_projection import SolidFit, is_solid, presses
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_face
 
@@ -33,6 +31,7 @@ D_MAX = 0.75  # of the radius
 HIDDEN_MAX = 0.6
 HIDDEN_MAX_FAR = 0.03
 GAIN_FAR = 2.0
+SHARED_MAX = 0.5  # of d, one standard deviation of what all frames share: beyond, it's anything
 
 
 @inner_kernel
@@ -179,17 +178,13 @@ def _without_moments(
     return False
 
 
-def _is_solid(kind: Any) -> bool:
-    return not isinstance(kind, types.NoneType)
-
-
 for _springs, _rubber in (
     (_begin_cold, _begin_solid),
     (_fit, _fit_solid),
     (_presses_outside, _presses_nowhere),
     (_by_moments, _without_moments),
 ):
-    cast(Any, _springs).also(_rubber, _is_solid)
+    cast(Any, _springs).also(_rubber, is_solid)
 
 
 @inner_kernel
@@ -231,8 +226,10 @@ def _likelihood(
 
 @inner_kernel
 def _is_this_tip(state: EstimatorState) -> bool:
-    """Whether a misfit leaves it possible that the model is the tip's."""
+    """Whether a misfit leaves it possible that the model is the tip's, and d is known at all."""
     estimate = state.estimate
+    if math.sqrt(state.budget.covariance[0, 0]) > SHARED_MAX * estimate.d:
+        return False
     near = GAIN_FAR * state.options.fixed_gain > estimate.gain
     near = near and GAIN_FAR * estimate.gain > state.options.fixed_gain
     return bool(estimate.hidden <= (HIDDEN_MAX if near else HIDDEN_MAX_FAR))
@@ -273,7 +270,7 @@ def _judge_moments(
     linearise(state, frame, arena, places, energy)
     if not solve(fit, state.options.free_gain):
         return False
-    variance = judge(state, further(arena, state.at.packed))
+    variance = judge(None, state, further(arena, state.at.packed))
     if not variance > 0.0:
         return False
     _explain(state, energy)

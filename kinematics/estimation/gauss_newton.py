@@ -15,6 +15,7 @@ from softfinger.kinematics.estimation.blurred_cells import spread
 from softfinger.kinematics.estimation.error_budget import colour, hidden_misfit, systematic
 from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, press
 from softfinger.kinematics.estimation.packing import pack
+from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
 from softfinger.kinematics.sensing.footprint import IntArray, set_face
 
@@ -93,7 +94,9 @@ def solve(fit: Fit, free: bool) -> bool:
 
 
 @inner_kernel
-def set_covariance(fit: Fit, inverse: Matrix, variance: float, out: Matrix) -> None:
+def set_covariance(
+    solid: SolidFit | None, fit: Fit, inverse: Matrix, variance: float, out: Matrix
+) -> None:
     """Covariance of (d, n_x, n_y, gain) into ``out``, from that of (gain, u, v, w) over variance.
 
     At the fit's face.
@@ -186,7 +189,7 @@ def _take_step(fit: Fit, a: float) -> bool:
 
 
 @inner_kernel
-def judge(state: EstimatorState, packed: Pointer) -> float:
+def judge(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> float:
     """χ² of the solved fit, and the covariance by what all frames share and by a smooth misfit.
 
     The noise's variance [Pa²] is returned, widened by a misfit beyond its own scatter; after that
@@ -203,22 +206,22 @@ def judge(state: EstimatorState, packed: Pointer) -> float:
     estimate.residual = misfit - fit.sums.readings
     expected = hidden = 0.0
     if budget.systematic:
-        expected = systematic(state, packed, d, budget.shared)
+        expected = systematic(solid, state, packed, d, budget.shared)
     beyond = misfit - expected - variance * freedom
     if beyond > variance * math.sqrt(2.0 * max(freedom, 0.0)):
-        hidden = hidden_misfit(state, packed, beyond)
+        hidden = hidden_misfit(solid, state, packed, beyond)
     if hidden > 0.0:
         if not budget.systematic:
             budget.shared[:] = 0.0
         for i in range(4):
             for j in range(4):
                 budget.shared[i, j] += hidden * fit.inverse[i, j]
-        set_covariance(fit, fit.inverse, hidden, budget.covariance)
+        set_covariance(solid, fit, fit.inverse, hidden, budget.covariance)
         estimate.hidden = math.sqrt(budget.covariance[0, 0]) / d
     if budget.systematic or hidden > 0.0:
-        set_covariance(fit, budget.shared, 1.0, budget.covariance)
+        set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
     if budget.correlated:
-        freedom = fit.sums.weight - colour(state, d)
+        freedom = fit.sums.weight - colour(solid, state, d)
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
     excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.sharing / freedom), 1.0)
@@ -233,19 +236,28 @@ def _finish(state: EstimatorState, packed: Pointer, iterations: int) -> bool:
     v = fit.face.v
     w = fit.face.w
     n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    d = state.grid.radius - fit.face.u * n_z
-    estimate.d = d
+    estimate.d = state.grid.radius - fit.face.u * n_z
     estimate.n_x = v * n_z
     estimate.n_y = w * n_z
+    return conclude(None, state, packed, iterations)
+
+
+@inner_kernel
+def conclude(
+    solid: SolidFit | None, state: EstimatorState, packed: Pointer, iterations: int
+) -> bool:
+    """The covariance and χ² at the fit's end; whether there are cells enough."""
+    fit = state.fit
+    estimate = state.estimate
     estimate.gain = fit.gain
     estimate.iterations = iterations
-    variance = judge(state, packed)
-    set_covariance(fit, fit.inverse, variance, fit.covariance)
+    variance = judge(solid, state, packed)
+    set_covariance(solid, fit, fit.inverse, variance, fit.covariance)
     if state.options.free_gain:
         # The more d is uncertain, the less straight it is in the gain.
         covariance = fit.covariance
         shared = state.budget.covariance
-        uncertain = (covariance[0, 0] + shared[0, 0]) / (d * d)
+        uncertain = (covariance[0, 0] + shared[0, 0]) / (estimate.d * estimate.d)
         wider = 1.0 + GAIN_CURVATURE * min(uncertain, 1.0)
         for i in range(4):
             for j in range(4):

@@ -10,18 +10,20 @@ from __future__ import annotations
 
 import math
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import IntPointer, Pointer, address, further
-from softfinger.kinematics.estimation.gauss_newton import GAIN_CURVATURE, solve
+from softfinger.kinematics.estimation.gauss_newton import conclude, solve
 from softfinger.kinematics.estimation.solid_projection import (
     SolidFit,
+    columns_at,
     counting,
     dot,
+    multiply,
     project,
     set_model,
 )
 from softfinger.kinematics.estimation.state import EstimatorState
-from softfinger.kinematics.sensing.solid_pressure import PICTURES, weigh
+from softfinger.kinematics.sensing.solid_pressure import PICTURES
 
 _PASSES = 24  # projections of a frame
 _LIMITED = 4  # of them that may end where the data do, one after the other
@@ -36,17 +38,12 @@ def _set_sums(state: EstimatorState, solid: SolidFit) -> float:
 
     The columns are those of `gauss_newton.solve`: ∂/∂gain, and over the gain −∂/∂d, ∂/∂n_x, ∂/∂n_y.
     """
-    weights = solid.weights
     fit = state.fit
     count = solid.count
-    weigh(weights, solid.d, solid.n_x, solid.n_y)
-    by_d = address(weights.by_d)
-    for k in range(count):
-        by_d[k] = -by_d[k]
-    columns = address(weights.value), by_d, address(weights.by_x), address(weights.by_y)
+    columns = columns_at(solid)
     sides = address(solid.sides)
     whole = solid.counted == solid.cells
-    _multiply(address(solid.products if whole else solid.used), columns, count, sides)
+    multiply(address(solid.products if whole else solid.used), columns, count, sides)
     normal = fit.sums.normal
     right = fit.sums.right
     at = 0
@@ -60,30 +57,6 @@ def _set_sums(state: EstimatorState, solid: SolidFit) -> float:
     cost: float = -fit.gain * (right[0] + dot(columns[0], address(solid.projected), count))
     fit.sums.misfit = solid.square + cost
     return cost
-
-
-@fast_inner_kernel
-def _multiply(
-    matrix: Pointer,
-    columns: tuple[Pointer, Pointer, Pointer, Pointer],
-    count: int,
-    out: Pointer,
-) -> None:
-    """The symmetric ``matrix`` [PICTURES, PICTURES] times four columns, into ``out`` by rows."""
-    a, b, c, d = columns
-    for k in range(4 * PICTURES):
-        out[k] = 0.0
-    for j in range(count):
-        row = further(matrix, j * PICTURES)
-        p = a[j]
-        q = b[j]
-        r = c[j]
-        s = d[j]
-        for k in range(count):
-            out[k] += p * row[k]
-            out[PICTURES + k] += q * row[k]
-            out[2 * PICTURES + k] += r * row[k]
-            out[3 * PICTURES + k] += s * row[k]
 
 
 @inner_kernel
@@ -222,39 +195,23 @@ def fit_solid(
         sheared = solid.strongest * math.hypot(solid.shear[0] - x, solid.shear[1] - y)
         same = steps == 1 or not (changed or counting(state, solid) > solid.count)
         if same and limited == 0 and sheared < 0.5 * math.sqrt(state.signal.variance):
-            return _finish(state, solid, total)
+            return _finish(state, solid, arena, total)
     return False
 
 
 @inner_kernel
-def _finish(state: EstimatorState, solid: SolidFit, iterations: int) -> bool:
+def _finish(state: EstimatorState, solid: SolidFit, arena: Pointer, iterations: int) -> bool:
     """The estimate and its covariance at the fit's end."""
-    fit = state.fit
     estimate = state.estimate
-    free = state.options.free_gain
-    variance = state.signal.variance
-    freedom = solid.counted - (6.0 if free else 5.0)
+    fit = state.fit
     area = state.grid.radius * state.grid.radius
     along = area * math.cos(state.options.rotation)
     across = area * math.sin(state.options.rotation)
     estimate.shear_x = along * solid.shear[0] - across * solid.shear[1]
     estimate.shear_y = across * solid.shear[0] + along * solid.shear[1]
-    misfit = max(fit.sums.misfit - fit.decrement, 0.0)
     estimate.d = solid.d
     estimate.n_x = solid.n_x
     estimate.n_y = solid.n_y
-    estimate.gain = fit.gain
-    estimate.chi2 = misfit / (variance * max(freedom, 1.0))
-    estimate.cells = int(solid.counted)
-    estimate.iterations = iterations
-    estimate.residual = misfit - solid.raw
-    # A misfit beyond its own scatter widens the covariance, and so does an uncertain d.
-    wider = max(estimate.chi2 - 3.0 * math.sqrt(2.0 / max(freedom, 1.0)), 1.0) * variance
-    if free:
-        spread = wider * fit.inverse[1, 1] / (solid.d * solid.d)
-        wider *= 1.0 + GAIN_CURVATURE * min(spread, 1.0)
-    # From (gain, d, n_x, n_y) to (d, n_x, n_y, gain).
-    for i in range(4):
-        for j in range(4):
-            fit.covariance[(i + 3) % 4, (j + 3) % 4] = wider * fit.inverse[i, j]
-    return bool(freedom > 0.0)
+    fit.sums.readings = solid.raw
+    fit.sums.weight = solid.counted - 2.0  # shear's
+    return conclude(solid, state, arena, iterations)

@@ -10,17 +10,18 @@ along, by taking out of all other pictures what they share with these two.
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+from numba.core import types
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
-from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
+from softfinger.kinematics.compiled.simd import IntPointer, Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.likelihood import CLIP, CLIP_END
-from softfinger.kinematics.estimation.state import EstimatorState
+from softfinger.kinematics.estimation.state import EstimatorState, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import (
     PICTURES,
@@ -36,7 +37,22 @@ _NEAR = 0.03  # rad round a contact for which that holds
 
 Sums = Annotated[FloatArray, PICTURES]
 Products = Annotated[FloatArray, PICTURES, PICTURES]
+Columns: TypeAlias = tuple[Pointer, Pointer, Pointer, Pointer]
 Likeness = Annotated[FloatArray, PICTURES, 2]  # how much of each shear picture is in each other
+
+
+class SolidBudget(Record):
+    """Sums over the cells for `solid_budget`, less what is like shear."""
+
+    shift: Sums  # Σ picture
+    cells: float
+    moved: Annotated[FloatArray, 3, PICTURES, PICTURES]  # Σ change of one · other picture
+    squares: Annotated[FloatArray, 3, PICTURES, PICTURES]  # Σ change · change
+    coloured: Products  # Σ over pairs of cells of picture · their correlation · picture
+    shear: float  # the same of both of shear's alone, scaled to 1
+    whole: Sums  # scratch: what each picture counts, with shear's
+    sums: Sums  # scratch
+    kept: Matrix  # scratch
 
 
 class SolidFit(Record):
@@ -67,6 +83,7 @@ class SolidFit(Record):
     raw: float  # and as it came
     counted: float  # cells
     limited: bool  # the last step ended where the data do
+    budget: SolidBudget
 
 
 def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
@@ -86,12 +103,52 @@ def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
     return fit
 
 
+def is_solid(kind: Any) -> bool:
+    """Whether that is Numba's type of a `SolidFit`; springs have None in its place."""
+    return not isinstance(kind, types.NoneType)
+
+
 @fast_inner_kernel
 def dot(a: Pointer, b: Pointer, count: int) -> float:
     total = 0.0
     for k in range(count):
         total += a[k] * b[k]
     return total
+
+
+@inner_kernel
+def columns_at(solid: SolidFit) -> Columns:
+    """What each picture counts in the contact at work, and the partials by −d, n_x and n_y."""
+    weights = solid.weights
+    weigh(weights, solid.d, solid.n_x, solid.n_y)
+    by_d = address(weights.by_d)
+    for k in range(weights.pictures):
+        by_d[k] = -by_d[k]
+    return address(weights.value), by_d, address(weights.by_x), address(weights.by_y)
+
+
+@fast_inner_kernel
+def multiply(
+    matrix: Pointer,
+    columns: Columns,
+    count: int,
+    out: Pointer,
+) -> None:
+    """The symmetric ``matrix`` [PICTURES, PICTURES] times four columns, into ``out`` by rows."""
+    a, b, c, d = columns
+    for k in range(4 * PICTURES):
+        out[k] = 0.0
+    for j in range(count):
+        row = further(matrix, j * PICTURES)
+        p = a[j]
+        q = b[j]
+        r = c[j]
+        s = d[j]
+        for k in range(count):
+            out[k] += p * row[k]
+            out[PICTURES + k] += q * row[k]
+            out[2 * PICTURES + k] += r * row[k]
+            out[3 * PICTURES + k] += s * row[k]
 
 
 @inner_kernel

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 
 E = 0.304e6
 TIP = Fingertip(0.020)
@@ -119,6 +121,45 @@ def test_the_errors_are_as_large_as_the_covariance_says(
     score, valid = nees(known, free, frame, d, degrees)
     assert 0.8 < score < 1.3
     assert valid > 0.9
+
+
+def test_a_solid_tips_are_too(subtests: pytest.Subtests) -> None:
+    """With shear on the face; the places and pitches have the standard deviation that is known."""
+    tip = Fingertip(0.020, "solid", 0.49, "lying")
+
+    def frames(grid: SensorGrid) -> SolidPressure:
+        return SolidPressure(tip, LINEAR, grid.pictures(tip))
+
+    straight = frames(GRID)
+    turns = np.arange(8) * 0.25 * math.pi + 0.1
+    moved = [
+        frames(replace(GRID, centre=(PLACE[0] + 7.07e-4 * c, PLACE[1] + 7.07e-4 * s)))
+        for c, s in zip(np.cos(turns), np.sin(turns), strict=True)
+    ]
+    stretched = [
+        frames(replace(GRID, pitch=PITCH * share, centre=(PLACE[0] * share, PLACE[1] * share)))
+        for share in (0.99, 1.01)
+    ]
+    out = np.empty(GRID.shape)
+    for case, (known, _, _) in CASES.items():
+        models = moved if known.centre else stretched if known.pitch else [straight]
+        estimator = ContactEstimator(tip, LINEAR, GRID, NOISE, known=known)
+        for d, theta in ((0.001, 0.0), (0.002, 0.4), (0.006, 0.2)):
+            truth = (d, theta, -0.5 * theta)
+            rng, squares = np.random.default_rng(12), []
+            for k in range(96):
+                gain = 1.0 + rng.normal(0.0, known.modulus)
+                shear = tuple(rng.normal(0.0, 0.1, 2))
+                contact = (d, math.sin(truth[1]), math.sin(truth[2]))
+                models[k % len(models)](contact, gain, out, shear)
+                noise = white(rng) if known.correlation is None else correlated_noise(rng)
+                found = estimator(out + noise + rng.normal(0.0, known.baseline))
+                if found.valid and not found.misfit:
+                    error = np.array([found.d, found.tilt_x, found.tilt_y]) - truth
+                    squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3)
+            with subtests.test(case=case, d=d):
+                assert 0.7 < np.mean(squares) < 1.35
+                assert len(squares) > 80
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,0 +1,235 @@
+"""A solid tip's part of `error_budget`: its patterns of error, as sums of pictures.
+
+A frame is a sum of pictures, and so is what it changes by where the tip stands elsewhere, or the
+cells are wider: each picture has its change. All sums over cells of pictures and changes are made
+once, so that a frame's own take products of matrices alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.simd import Pointer, address, further
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.estimation import error_budget, gauss_newton
+from softfinger.kinematics.estimation.error_budget import (
+    Uncertainty,
+    both_ways,
+    quadratic,
+    set_errors,
+)
+from softfinger.kinematics.estimation.solid_projection import (
+    SolidFit,
+    columns_at,
+    dot,
+    is_solid,
+    multiply,
+    set_model,
+)
+from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.kinematics.sensing.solid_pressure import PICTURES
+
+# What the fit makes of a motion besides its straight answer, as shares of d and of the tilt by the
+# square of the motion in depth over d, and of d by that of the turn: measured with shifts of 1 kPa
+# and of 0.5 mm.
+_D_BY_DEPTH, _TILT_BY_DEPTH, _D_BY_TURN = 0.4, 1.2, 1.6
+
+
+def set_solid_budget(
+    state: EstimatorState,
+    solid: SolidFit,
+    known: Uncertainty,
+    grid: SensorGrid,
+    tip: Fingertip,
+    places: IntArray,
+    law: float,
+) -> None:
+    """As `error_budget.set_budget`, for the live cells ``places`` of ``grid``.
+
+    A shift is no contact to a solid tip whatever its size: the activity test takes the mean off.
+    """
+    set_errors(state, known, law)
+    budget = solid.budget
+    live = np.ascontiguousarray(grid.pictures(tip)[:, places])
+    shear = live[-2:]
+    across = np.linalg.inv(shear @ shear.T)
+
+    def alone(fields: FloatArray) -> FloatArray:
+        """The fields less what is like shear."""
+        return np.asarray(fields - fields @ shear.T @ across @ shear)
+
+    shown = alone(live)
+    count = len(live) - 2
+    ones = alone(np.ones((1, live.shape[1])))
+    budget.shift[:count] = shown[:count] @ ones[0]
+    budget.cells = float((ones**2).sum())
+    for k, (x, y, stretch) in enumerate(
+        ((known.centre, 0.0, 0.0), (0.0, known.centre, 0.0), (0.0, 0.0, known.pitch))
+    ):
+        size = max(x, y, stretch)
+        if size > 0.0:
+            moved = alone(
+                (
+                    _elsewhere(grid, x, y, stretch).pictures(tip)[:, places]
+                    - _elsewhere(grid, -x, -y, -stretch).pictures(tip)[:, places]
+                )
+                / (2.0 * size)
+            )
+            budget.moved[k, : count + 2, :count] = moved @ shown[:count].T
+            budget.squares[k, : count + 2, : count + 2] = moved @ moved.T
+    if state.budget.correlated:
+        rho = both_ways(known.correlation)
+
+        def coloured(fields: FloatArray) -> FloatArray:
+            whole = np.zeros((len(fields), grid.rows * grid.cols))
+            whole[:, places] = fields
+            return quadratic(whole.T.reshape(grid.rows, grid.cols, -1), rho)
+
+        budget.coloured[:count, :count] = coloured(shown[:count])
+        budget.shear = float((across * coloured(shear)).sum())
+        first = live[:1] - live[0].mean()
+        state.options.patch_level *= math.sqrt(coloured(first)[0, 0] / (first**2).sum())
+
+
+def _elsewhere(grid: SensorGrid, x: float, y: float, stretch: float) -> SensorGrid:
+    """The grid with the tip's centre moved, and with wider cells."""
+    wider = 1.0 + stretch
+    return replace(
+        grid,
+        pitch=(grid.pitches[0] * wider, grid.pitches[1] * wider),
+        centre=(grid.centre[0] * wider + x, grid.centre[1] * wider + y),
+    )
+
+
+@fast_inner_kernel
+def _apply(matrix: Pointer, values: Pointer, rows: int, count: int, out: Pointer) -> None:
+    """``values`` times rows of a ``matrix`` [·, PICTURES]: its first ``count`` columns."""
+    for k in range(count):
+        out[k] = 0.0
+    for j in range(rows):
+        row = further(matrix, j * PICTURES)
+        value = values[j]
+        for k in range(count):
+            out[k] += value * row[k]
+
+
+@inner_kernel
+def _patterns(solid: SolidFit, state: EstimatorState, packed: Pointer) -> None:
+    budget = solid.budget
+    count = solid.count
+    each = columns_at(solid)
+    pictures = solid.weights.pictures
+    whole = address(budget.whole)
+    for k in range(pictures):
+        whole[k] = each[0][k]
+    for k in range(2):
+        whole[pictures + k] = solid.shear[k] / state.fit.gain
+    sizes = (state.budget.shift, state.budget.centre, state.budget.centre, state.budget.pitch)
+    sums = address(budget.sums)
+    for source in range(4):
+        state.budget.squares[source] = budget.cells
+        change = address(budget.shift)
+        if source > 0 and sizes[source] > 0.0:
+            start = (source - 1) * PICTURES * PICTURES
+            squares = further(address(budget.squares), start)
+            _apply(squares, whole, pictures + 2, pictures + 2, sums)
+            state.budget.squares[source] = dot(sums, whole, pictures + 2)
+            change = further(address(budget.moved), start)
+            _apply(change, whole, pictures + 2, count, sums)
+            change = sums
+        for column in range(4):
+            state.budget.answers[column, source] = dot(each[column], change, count)
+
+
+@inner_kernel
+def _bend(solid: SolidFit, state: EstimatorState, d: float, out: Matrix) -> None:
+    moved = state.budget.moved
+    square = min((moved[1] / d) ** 2, 1.0)
+    turned = _D_BY_TURN * d * min(moved[2] * moved[2] + moved[3] * moved[3], 1.0)
+    deeper = _D_BY_DEPTH * d * square
+    along_x = _TILT_BY_DEPTH * solid.n_x * square
+    along_y = _TILT_BY_DEPTH * solid.n_y * square
+    out[1, 1] += deeper * deeper + turned * turned
+    out[2, 2] += along_x * along_x
+    out[2, 3] += along_x * along_y
+    out[3, 2] += along_x * along_y
+    out[3, 3] += along_y * along_y
+
+
+@inner_kernel
+def _colour(solid: SolidFit, state: EstimatorState, d: float) -> float:
+    fit = state.fit
+    first = 0 if state.options.free_gain else 1
+    count = solid.count
+    columns = columns_at(solid)
+    sides = address(solid.sides)
+    multiply(address(solid.budget.coloured), columns, count, sides)
+    factor = (1.0, -fit.gain, fit.gain, fit.gain)
+    # JᵀCJ times the inverse, then the inverse times that.
+    half = fit.matrix
+    kept = solid.budget.kept
+    for i in range(4):
+        for j in range(4):
+            both = dot(further(sides, i * PICTURES), columns[j], count)
+            kept[i, j] = factor[i] * factor[j] * both
+    trace = 0.0
+    for i in range(first, 4):
+        for j in range(first, 4):
+            value = 0.0
+            for m in range(first, 4):
+                value += kept[i, m] * fit.inverse[m, j]
+            half[i, j] = value
+        trace += half[i, i]
+    for i in range(first, 4):
+        for j in range(first, 4):
+            value = 0.0
+            for m in range(first, 4):
+                value += fit.inverse[i, m] * half[m, j]
+            kept[i, j] = value
+    for i in range(first, 4):
+        for j in range(first, 4):
+            fit.inverse[i, j] = kept[i, j]
+    # Shear's two are off the cells' number already.
+    return trace + solid.budget.shear - 2.0
+
+
+@inner_kernel
+def _smooth_misfit(solid: SolidFit, state: EstimatorState, packed: Pointer) -> tuple[float, float]:
+    set_model(solid, packed, state.fit.gain)
+    model = further(packed, solid.model)
+    readings = further(packed, solid.readings)
+    total = 0.0
+    number = 0.0
+    for k in range(1, solid.cells):
+        # Cells that don't count read 0.
+        if readings[k] != 0.0 and readings[k - 1] != 0.0:
+            total += (readings[k] - model[k]) * (readings[k - 1] - model[k - 1])
+            number += 1.0
+    return total, number
+
+
+@inner_kernel
+def _set_covariance(
+    solid: SolidFit, fit: Fit, inverse: Matrix, variance: float, out: Matrix
+) -> None:
+    # From (gain, d, n_x, n_y) to (d, n_x, n_y, gain).
+    for i in range(4):
+        for j in range(4):
+            out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
+
+
+for _springs, _rubber in (
+    (error_budget.patterns, _patterns),
+    (error_budget.bend, _bend),
+    (error_budget.colour, _colour),
+    (error_budget.smooth_misfit, _smooth_misfit),
+    (gauss_newton.set_covariance, _set_covariance),
+):
+    cast(Any, _springs).also(_rubber, is_solid)
