@@ -40,8 +40,9 @@ _NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # 
 _PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
 _FEW = 48.0  # cells within which nothing is smooth or rough
 # What the fit makes of a motion besides its straight answer, as shares of d and of the gain by the
-# square of the motion in depth over d and of the turn: measured over the envelope, with shifts of
-# 1 kPa, of 0.5 mm, of 1 % of the pitch and 5 % of the modulus.
+# square of the motion in depth over d and of the turn, and by that of the turn times d/a in any
+# direction: measured over the envelope, with shifts of 1 kPa, of 0.5 mm, of 1 % of the pitch and
+# 5 % of the modulus.
 _D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
 _D_BY_TURN, _GAIN_BY_TURN, _REST = 0.8, 2.0, 1.6
 _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products

@@ -123,7 +123,7 @@ _TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iterati
 _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
 PATCH_LEVEL = 4.9
-_RIM = 0.03  # of the radius: cells so near to a bonded tip's rim don't count
+_RIM = {"bonded": 0.03, "lying": 0.05}  # of the radius: nearer to a solid tip's rim none counts
 _EXPLAINED_MIN = 0.8  # share of the frame's squared pressure below which an estimate is not valid
 
 
@@ -323,14 +323,13 @@ def _within(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.
     """The cells [rows, cols] that don't lie at a solid tip's rim, where the model may be wrong.
 
     A bonded base's stress is singular there, which no two meshes have alike: from independent
-    elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. And where
-    the tip's place is uncertain, the rim may be elsewhere.
+    elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. Under a
+    tilt a lying base pulls there, where real rubber lifts. And where the tip's place is uncertain,
+    the rim may be elsewhere.
     """
-    margin = 2.0 * (known.centre + known.pitch * tip.radius)
-    if tip.base == "bonded":
-        margin = max(margin, _RIM * tip.radius)
-    if tip.physics == "springs" or margin == 0.0:
+    if tip.physics == "springs":
         return np.ones(grid.shape, np.bool_)
+    margin = max(_RIM[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     cells = grid.on(tip)
     x, y = (
         np.abs(start + pitch * (np.arange(count) + 0.5)) + 0.5 * pitch
