@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import struct
 from typing import Any
 
@@ -15,7 +14,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
-from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus, collide, overlay
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.fuzz.servo_bus import fuzz
 from tests.harness.free_joints import FreeJoints
 from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus, put_fault
@@ -211,30 +210,12 @@ def test_servos_at_another_rate_hear_nothing() -> None:
 # --- servos that answer at once ------------------------------------------------------------------
 
 
-def test_a_low_bit_wins() -> None:
-    assert overlay([(0, b"\x0f\xff"), (0, b"\x3c\xf0")]) == b"\x0c\xf0"
-    assert overlay([(0, b"\x55")]) == b"\x55"
-    assert overlay([(3, b"abc"), (3, b"abc")]) == b"abc"
-    alone = bytes(range(256))
-    assert overlay([(0, alone)]) == alone
-
-
-def test_shifted_bits_are_garbled() -> None:
-    reply = framing.status(1, 0, b"\xfc\x03\x30")
-    whole = [overlay([(0, reply), (shift, reply)]) == reply for shift in range(10)]
-    assert whole == [True] + [False] * 9
-    # At a slow rate a bit is longer than the servos' jitter.
-    source = random.Random(3)
-    assert any(collide([reply, reply], 9600, source) == reply for _ in range(5))
-    assert not any(collide([reply, reply], 4_000_000, source) == reply for _ in range(5))
-
-
 def test_servos_that_share_an_id_answer_at_once() -> None:
     bus = make_bus(ids=(1, 1, 2), counts=(100, 200, 300))
     read = frame(1, framing.READ, b"\x84\x00\x04\x00")
-    replies = [bus.feed(read, 0.0) for _ in range(8)]
-    sound = [framing.status(1, 0, (100 * k).to_bytes(4, "little")) for k in (1, 2)]
-    assert not any(reply in sound for reply in replies)
+    low, high = (framing.status(1, 0, (100 * k).to_bytes(4, "little")) for k in (1, 2))
+    both = zip(low + b"\xff", b"\xff" + high, strict=True)
+    assert bus.feed(read, 0.0) == bytes(a & b for a, b in both)
     assert len(bus.feed(frame(2, framing.PING), 0.0)) == 14
     assert bus.feed(frame(BROADCAST, framing.PING), 0.0)[-14:-9] == b"\xff\xff\xfd\x00\x02"
     group = frame(BROADCAST, framing.SYNC_READ, b"\x84\x00\x04\x00\x02\x01")

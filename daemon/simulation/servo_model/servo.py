@@ -112,6 +112,10 @@ class EmulatedServo:
         """0 answers pings only, 1 reads too, 2 everything."""
         return self.table.memory[reg.STATUS_RETURN_LEVEL]
 
+    def answers_reads(self, fast: bool) -> bool:
+        """Whether it answers group reads."""
+        return self.status_return_level >= 1 and (self.fast_reads or not fast)
+
     @property
     def alert(self) -> int:
         """The alert bit of its status packets."""

@@ -8,9 +8,11 @@ after it has heard the one named before it; so where one is missing, those after
 from __future__ import annotations
 
 import math
-import random
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import reduce
+from itertools import zip_longest
+from operator import and_
 from typing import Any, NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
@@ -71,7 +73,6 @@ class ServoBus:
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
         self.packets = 0  # that came through
-        self._jitter = random.Random(seed)
         self._now = -math.inf
         self._due = -math.inf  # no servo does anything by itself before then
 
@@ -207,7 +208,7 @@ class ServoBus:
                     replies.append(TimedReply(delay, status))
             elif servo.shadow_id == packet.id and instruction != framing.PING:
                 _execute(servo, instruction, packet.parameters, t)
-        return self._at_once(replies, servos)
+        return _at_once(replies)
 
     def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[TimedReply]:
         instruction, data = packet.instruction, packet.parameters
@@ -216,7 +217,7 @@ class ServoBus:
             for servo_id in sorted({servo.id for servo in servos}):
                 same = [servo for servo in servos if servo.id == servo_id]
                 answers = [_status(each, *_execute(each, instruction, data, t)) for each in same]
-                replies += self._at_once(answers, same)
+                replies += _at_once(answers)
             return replies
         if instruction in _GROUP_READS and len(data) >= 5:
             address, length = _SPAN.unpack_from(data)
@@ -226,9 +227,9 @@ class ServoBus:
             wanted = list(_ITEM.iter_unpack(data))
             return self._group_read(wanted, servos, t, instruction == framing.FAST_BULK_READ)
         if instruction == framing.SYNC_WRITE:
-            self._sync_write(data, servos, t)
+            _write_each(_sync_items(data), servos, t)
         elif instruction == framing.BULK_WRITE:
-            self._bulk_write(data, servos, t)
+            _write_each(_bulk_items(data), servos, t)
         elif instruction in _TO_ALL:
             for servo in servos:
                 guarded = servo.firmware >= _FACTORY_RESET_GUARD and data == b"\xff"
@@ -243,82 +244,63 @@ class ServoBus:
         t: float,
         fast: bool,
     ) -> list[TimedReply]:
-        by_id = {servo.id: servo for servo in servos}
-        if len(by_id) < len(servos):
-            return self._shared_read(wanted, servos, t)
         if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
             return []  # an ID may stand in the list once only
         replies: list[TimedReply] = []
-        if fast:
-            length = 1 + sum([length + 4 for _, _, length in wanted])
-            piece = framing.fast_head(length)
+        piece = framing.fast_head(1 + sum([length + 4 for _, _, length in wanted]))
         block = b""
         crc, delay = 0, 0.0
         for servo_id, address, length in wanted:
-            servo = by_id.get(servo_id)
-            if servo is None or servo.status_return_level < 1 or (fast and not servo.fast_reads):
+            same = [servo for servo in servos if servo.id == servo_id and servo.answers_reads(fast)]
+            if not same or (fast and len(same) > 1):
                 break
-            data = servo.read(address, length, t)
-            error = framing.OK if data is not None else framing.ACCESS
             if not fast:
-                replies.append(_status(servo, error, data or b""))
+                data = struct.pack("<HH", address, length)
+                replies += _at_once(
+                    [_status(servo, *_execute(servo, framing.READ, data, t)) for servo in same]
+                )
                 continue
             # Each CRC goes over all bytes before it, the earlier CRCs too.
-            piece += bytes((error | servo.alert, servo_id))
-            piece += bytes(length) if data is None else data
+            values = same[0].read(address, length, t)
+            error = framing.ACCESS if values is None else framing.OK
+            piece += bytes((error | same[0].alert, servo_id)) + (values or bytes(length))
             crc = crc16(piece, crc)
             block += piece
             piece = crc.to_bytes(2, "little")
-            delay += servo.return_delay
+            delay += same[0].return_delay
         if not block:
             return replies
         # The blocks follow each other as one packet; the delays before them add up.
         return [TimedReply(delay, block + piece)]
 
-    def _shared_read(
-        self, wanted: list[tuple[int, int, int]], servos: list[EmulatedServo], t: float
-    ) -> list[TimedReply]:
-        """A group read where several servos have one ID: they talk at once, fast read or not."""
-        replies: list[TimedReply] = []
-        for servo_id, address, length in wanted:
-            same = [servo for servo in servos if servo.id == servo_id]
-            if not same:
-                break
-            answers = [
-                _status(servo, framing.OK, servo.read(address, length, t) or b"") for servo in same
-            ]
-            replies += self._at_once(answers, same)
-        return replies
 
-    def _at_once(self, replies: list[TimedReply], servos: list[EmulatedServo]) -> list[TimedReply]:
-        """Replies of servos that share an ID come as one, garbled."""
-        if len(replies) < 2:
-            return replies
-        data = collide([reply.data for reply in replies], servos[0].baud, self._jitter)
-        return [TimedReply(min(reply.delay for reply in replies), data)]
+def _write_each(
+    items: Iterable[tuple[int, int, bytes]], servos: list[EmulatedServo], t: float
+) -> None:
+    """What a group write asks of each servo: ID, address, data."""
+    for servo_id, address, data in items:
+        for servo in servos:
+            if servo_id in (servo.id, servo.shadow_id):
+                servo.write(address, data, t)
 
-    def _sync_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
-        if len(data) < _SPAN.size:
-            return
-        address, length = _SPAN.unpack_from(data)
-        size = length + 1
-        if length == 0 or (len(data) - _SPAN.size) % size:
-            return
+
+def _sync_items(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    if len(data) < _SPAN.size:
+        return
+    address, length = _SPAN.unpack_from(data)
+    size = length + 1
+    if length and (len(data) - _SPAN.size) % size == 0:
         for i in range(_SPAN.size, len(data), size):
-            for servo in servos:
-                if data[i] in (servo.id, servo.shadow_id):
-                    servo.write(address, data[i + 1 : i + size], t)
+            yield data[i], address, data[i + 1 : i + size]
 
-    def _bulk_write(self, data: bytes, servos: list[EmulatedServo], t: float) -> None:
-        i = 0
-        while i + _ITEM.size <= len(data):
-            servo_id, address, length = _ITEM.unpack_from(data, i)
-            i += _ITEM.size + length
-            if i > len(data):
-                return
-            for servo in servos:
-                if servo_id in (servo.id, servo.shadow_id):
-                    servo.write(address, data[i - length : i], t)
+
+def _bulk_items(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    i = 0
+    while i + _ITEM.size <= len(data):
+        servo_id, address, length = _ITEM.unpack_from(data, i)
+        i += _ITEM.size + length
+        if i <= len(data):
+            yield servo_id, address, data[i - length : i]
 
 
 def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> TimedReply:
@@ -357,39 +339,14 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
     return framing.INSTRUCTION_ERROR, b""
 
 
-JITTER = 20e-6  # s by which return delays of servos of one setting differ
-_FRAME = 10  # bits of a byte on the wire: start, eight data bits from the lowest, stop
+def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
+    """Replies of servos that share an ID come as one, garbled: a low bit wins.
 
-
-def collide(replies: Sequence[bytes], baud: int, source: random.Random) -> bytes:
-    """What a client receives when several servos answer at once: their bits on one line.
-
-    The line idles high and a low bit wins. Servos start within JITTER of each other, so that
-    replies that are alike may even come through whole, at slow rates above all.
+    Servos never begin at the same instant, so that even replies that are alike garble each other:
+    each begins a byte after the one before it.
     """
-    return overlay([(round(source.random() * JITTER * baud), reply) for reply in replies])
-
-
-def overlay(streams: Sequence[tuple[int, bytes]]) -> bytes:
-    """Bytes that a UART makes of streams that each begin at a number of bits."""
-    length = max(start + _FRAME * len(data) for start, data in streams)
-    line = [1] * (length + _FRAME)
-    for start, data in streams:
-        for i, byte in enumerate(data):
-            at = start + _FRAME * i
-            line[at] = 0
-            for bit in range(8):
-                line[at + 1 + bit] &= byte >> bit & 1
-    heard = bytearray()
-    at = 0
-    while at < length:
-        if line[at]:
-            at += 1
-            continue
-        byte = sum(line[at + 1 + bit] << bit for bit in range(8))
-        stop = line[at + 9]
-        heard.append(byte if stop else 0)  # a byte without its stop bit is read as 0
-        at += _FRAME
-        while at < length and not stop and not line[at]:
-            at += 1  # the line must rise before a byte can start
-    return bytes(heard)
+    if len(replies) < 2:
+        return replies
+    begun = (b"\xff" * k + reply.data for k, reply in enumerate(replies))
+    data = bytes(reduce(and_, column) for column in zip_longest(*begun, fillvalue=0xFF))
+    return [TimedReply(min(reply.delay for reply in replies), data)]
