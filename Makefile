@@ -50,7 +50,7 @@ format: $(TO_TEST)
 $(TO_RUN): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "softfinger needs Python 3.11 or later; say which with PYTHON=…"; exit 1; }
-	@echo "Setting up $(VENV) once: numpy, numba and six small packages, about 100 MB to fetch."
+	@echo "Setting up $(VENV) once: numpy, numba and seven small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --editable .
 	@$(BIN)/softfinger compile --config demo

@@ -10,10 +10,14 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
 
 from softfinger import __version__
 from softfinger.daemon.errors import SettingsError, SoftfingerError
+
+if TYPE_CHECKING:
+    import argparse
 
 SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
     "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
@@ -31,12 +35,26 @@ SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
     "calibrate": ("calibration", "calibrate the pressure sensor under a tip, step by step"),
     "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
     "limits": ("setup", "list every limit: condition, consequence, setting"),
+    "config": ("setup", "list and show the profiles, and every setting with its default"),
     "compile": ("processes", "compile a hand's kernels ahead of its first start"),
     "keys": ("setup", "make the keys that addresses outside this machine need"),
     "install-service": ("setup", "print or write a systemd unit and udev rules"),
+    "completion": ("setup", "print what completes these words in bash, zsh or fish"),
     "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
     "bench": ("benchmarks", "measure run time, beside the usual alternatives"),
 }
+
+_FIRST_STEPS = """\
+softfinger {version}: two rotational fingers with soft tips. To begin:
+  softfinger run --monitor          a simulated hand and its live page; q ends both
+  softfinger send arm               in another terminal: torque on; then grasp force=10
+  softfinger run --config PROFILE   another hand; softfinger config list names some
+  softfinger doctor --config FILE   what a hand of metal still lacks
+  softfinger help                   all subcommands; help SUBCOMMAND: its arguments"""
+_EPILOG = """\
+softfinger help SUBCOMMAND: its arguments. To begin: softfinger run --monitor
+Exit status: 0 done; 1 it could not be done, with the reason; 2 wrong arguments or settings;
+130 ended by Ctrl-C. What a subcommand has beside these is in its help."""
 
 
 def _open_standard_streams() -> None:
@@ -48,27 +66,23 @@ def _open_standard_streams() -> None:
             setattr(sys, name, os.fdopen(descriptor, mode))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``softfinger``; returns the exit status."""
-    # While modules are imported Ctrl-C ends the process as it ends any other: no traceback.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def make_parser(imported: Collection[str]) -> tuple[argparse.ArgumentParser, dict[str, Any]]:
+    """The parser with all subcommands, and the modules of those ``imported``: they have arguments.
+
+    Without its module a subcommand has none.
+    """
     import argparse
     import importlib
 
-    _open_standard_streams()
-    words = list(sys.argv[1:] if argv is None else argv)
-    if words[:1] == ["help"]:
-        words = [*words[1:2], "--help"]
     parser = argparse.ArgumentParser(
         prog="softfinger",
         description="Two rotational fingers with soft tips: daemon and tools.",
-        epilog="softfinger help SUBCOMMAND: its arguments. To begin: softfinger run --monitor",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"softfinger {__version__}")
-    # Only the subcommand that is called is imported, for its arguments and for its work.
-    called = next((word for word in words if word in SUBCOMMANDS), None)
-    subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND")
-    module = None
+    subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
+    modules = {}
     for name, (room, text) in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(
             name,
@@ -76,13 +90,34 @@ def main(argv: Sequence[str] | None = None) -> int:
             description=text,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        if name == called:
+        if name in imported:
             module = importlib.import_module(f"softfinger.tools.{room}.{name.replace('-', '_')}")
             module.add_arguments(subparser)
-    arguments = parser.parse_args(words)
-    if module is None:  # no words at all: argparse has refused everything else
-        parser.print_help()
+            modules[name] = module
+    return parser, modules
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of ``softfinger``; returns the exit status."""
+    # While modules are imported Ctrl-C ends the process as it ends any other: no traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    _open_standard_streams()
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words:
+        print(_FIRST_STEPS.format(version=__version__))
         return 0
+    if words[:1] == ["help"]:
+        words = [*words[1:2], "--help"]
+    # Only the subcommand that is called is imported, for its arguments and for its work.
+    called = next((word for word in words if word in SUBCOMMANDS), "")
+    parser, modules = make_parser([called])
+    if not (called or words[0].startswith("-")):
+        import difflib
+
+        near = difflib.get_close_matches(words[0], SUBCOMMANDS, n=1, cutoff=0.0)
+        parser.error(f"found {words[0]!r}, expected a subcommand; nearest: {near[0]}")
+    arguments = parser.parse_args(words)
+    module = modules[called]
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         status: int = module.run(arguments)

@@ -5,25 +5,34 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 from softfinger.daemon.client.command_client import UNCONFIRMED, NoAnswer, send
 from softfinger.daemon.client.connection import PATIENCE
+from softfinger.daemon.control.modes import COMMANDS
 from softfinger.daemon.errors import KeyFileError
 from softfinger.tools.arguments import add_keys, client_keys, command_address, seconds
 
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+_ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
+_UNITS = {  # that a number may carry, by its key; without one it is SI
+    "force": {"N": 1.0, "mN": 1e-3},
+    **dict.fromkeys(("angle", "left", "right"), _ANGLES),
+}
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
-set compliance=RAD/NM, stop, clear, status. Numbers are SI; an angle may carry its unit, as in
-angle=10deg.
+set compliance=RAD/NM, stop, clear, status. Numbers are SI, or carry their unit: force=10N,
+angle=8deg or 8°.
 Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was received,
 but the servos have not confirmed torque off yet."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    parser.add_argument("command", metavar="COMMAND")
+    parser.add_argument("command", metavar="COMMAND", choices=tuple(COMMANDS))
     parser.add_argument("values", metavar="key=value", nargs="*")
     parser.add_argument("--address", type=command_address, default="", help="command socket")
     add_keys(parser)
@@ -42,13 +51,11 @@ def run(arguments: argparse.Namespace) -> int:
     request: dict[str, Any] = {"command": arguments.command}
     if arguments.client:
         request["client"] = arguments.client
-    for word in arguments.values:
-        key, separator, text = word.partition("=")
-        value = _value(text)
-        if not separator or value is None:
-            print(f"send: found {word!r}, expected key=number", file=sys.stderr)
-            return 2
-        request[key] = value
+    try:
+        request |= si_numbers(arguments.values)
+    except ValueError as error:
+        print(f"send: {error}", file=sys.stderr)
+        return 2
     try:
         reply = send(arguments.address, request, arguments.timeout, client_keys(arguments.keys))
     except (NoAnswer, KeyFileError) as error:
@@ -61,10 +68,24 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if reply.get("ok") else 1
 
 
-def _value(text: str) -> float | None:
-    """A number, or an angle in degrees as radians; None for what is neither."""
-    try:
-        number = float(text.removesuffix("deg"))
-    except ValueError:
-        return None
-    return math.radians(number) if text.endswith("deg") else number
+def si_numbers(words: list[str]) -> dict[str, float]:
+    """The numbers of ``key=value`` words, in SI. Raises ValueError with the word and the reason."""
+    numbers = {}
+    for key, text in _pairs(words):
+        found = _NUMBER.fullmatch(text)
+        if not key or found is None:
+            raise ValueError(f"found {key + text!r}, expected key=number")
+        unit, known = found[2], _UNITS.get(key.removesuffix("="), {})
+        if unit and unit not in known:
+            expected = f"expected {' or '.join(known)}" if known else "expected a number alone"
+            raise ValueError(f"found {key + text!r} in {unit!r}, {expected}")
+        numbers[key.removesuffix("=")] = float(found[1]) * known.get(unit, 1.0)
+    return numbers
+
+
+def _pairs(words: list[str]) -> Iterator[tuple[str, str]]:
+    """``key=`` and the text after it; ``angle=8 deg`` may come as two words."""
+    text = " ".join(words)
+    for pair in re.split(r"\s+(?=\S+=)", text) if words else ():
+        key, equals, value = pair.partition("=")
+        yield (key + equals, value) if equals else ("", pair)

@@ -1,0 +1,47 @@
+"""Bash completes softfinger's words by the script that `softfinger completion bash` prints."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Inline
+
+pytest.importorskip("shtab")
+
+_TAB = """
+source "$1"; shift
+COMP_WORDS=("$@") COMP_CWORD=$(($# - 1))
+"$(complete -p softfinger | sed 's/.* -F \\([^ ]*\\) .*/\\1/')" softfinger "${@: -1}" "${@: -2:1}"
+echo "${COMPREPLY[@]}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (("re",), "record replay"),
+        (("send", "ro"), "rotate"),
+        (("run", "--log-"), "--log-file"),
+        (("run", "--log", ""), "plain json"),
+        (("calibrate", "cu"), "curve"),
+        (("run", "--config", "my"), "my.toml"),
+    ],
+)
+def test_a_tab_completes(
+    inline: Inline, tmp_path: Path, words: tuple[str, ...], completed: str
+) -> None:
+    script = tmp_path / "script"
+    script.write_text(inline("completion", "bash").stdout, encoding="utf-8")
+    (tmp_path / "my.toml").touch()
+    done = subprocess.run(
+        ["bash", "--norc", "-c", _TAB, "bash", script, "softfinger", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout.strip() == completed

@@ -1,0 +1,79 @@
+"""The command line's front: first steps, profiles shown, numbers with units."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from softfinger.daemon.profile.load import find, names
+from softfinger.tools.cli import SUBCOMMANDS
+from tests.conftest import Inline
+
+
+def test_no_words_name_the_first_steps_and_help_all_subcommands(inline: Inline) -> None:
+    first = inline()
+    assert (first.returncode, first.stderr) == (0, "")
+    assert "softfinger run --monitor" in first.stdout
+    shown = inline("help")
+    assert shown.returncode == 0
+    assert all(f"\n    {name}" in shown.stdout for name in SUBCOMMANDS)
+    assert "Exit status: 0 " in shown.stdout
+    wrong = inline("recrod", "run.mcap")
+    assert wrong.returncode == 2
+    assert "found 'recrod', expected a subcommand; nearest: record" in wrong.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("grasp force=5deg", "found 'force=5deg' in 'deg', expected N or mN"),
+        ("rotate angle=8N", "found 'angle=8N' in 'N', expected rad or deg or °"),
+        ("grasp force=5 mm", "found 'force=5 mm' in 'mm', expected N or mN"),
+        ("grasp force=nan", "found 'force=nan', expected key=number"),
+        ("grasp 5", "found '5', expected key=number"),
+        ("gasp", "argument COMMAND: invalid choice: 'gasp'"),
+    ],
+)
+def test_what_is_no_number_of_its_kind_is_not_sent(inline: Inline, words: str, said: str) -> None:
+    done = inline("send", *words.split(), "--timeout", "0.1")
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "no answer" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "numbers"),
+    [
+        (["angle=8°"], {"angle": math.radians(8)}),
+        (["angle=-8", "deg", "force=10N"], {"angle": math.radians(-8), "force": 10.0}),
+        (["left=0.1 rad", "right=1e-1"], {"left": 0.1, "right": 0.1}),
+        (["force=2500mN"], {"force": 2.5}),
+    ],
+)
+def test_numbers_may_carry_their_unit(words: list[str], numbers: dict[str, float]) -> None:
+    from softfinger.tools.terminal.send import si_numbers
+
+    assert si_numbers(words) == pytest.approx(numbers)
+
+
+def test_profiles_and_keys_are_shown_from_any_folder(
+    inline: Inline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    listed = inline("config", "list").stdout.splitlines()
+    assert [line.split()[0] for line in listed] == names()
+    assert all(len(line.split()) > 2 for line in listed), "each says what it is"
+    assert inline("config", "show", "hil").stdout == find(Path("hil")).read_text("utf-8")
+    every = tomllib.loads(inline("config", "reference").stdout)
+    assert (
+        tomllib.loads(inline("config", "reference", "tactile").stdout)["tactile"]
+        == every["tactile"]
+    )
+    (line,) = inline("config", "reference", "tactile.full_count").stdout.splitlines()
+    assert line.startswith("tactile.full_count = 65535 # ")
+    missing = inline("config", "reference", "tactile.radius")
+    assert missing.returncode == 2
+    assert "tactile.radius: found no such section or key" in missing.stderr
