@@ -1,4 +1,4 @@
-"""Imports run one way: tools → daemon → kinematics, and no files or rooms import in a circle."""
+"""Imports run one way, without circles; classes have names of their own, exceptions one root."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import softfinger
 ROOT = Path(softfinger.__file__).parents[1]
 ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it
 PAGE = ROOT / "docs" / "architecture.md"
+BUILT_IN = {"Exception", "ValueError", "RuntimeError", "OSError", "TimeoutError"}
 
 
 @cache
@@ -26,9 +27,14 @@ def modules() -> dict[str, Path]:
     }
 
 
+@cache
+def parsed(file: Path) -> ast.Module:
+    return ast.parse(file.read_bytes())
+
+
 def imported(file: Path) -> Iterator[str]:
     """Modules of ours that ``file`` imports, at its top or within a function, but for types."""
-    waiting: list[ast.AST] = [ast.parse(file.read_bytes())]
+    waiting: list[ast.AST] = [parsed(file)]
     while waiting:
         node = waiting.pop()
         if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
@@ -137,7 +143,19 @@ def test_each_class_has_a_name_of_its_own() -> None:
     names = Counter(
         node.name
         for file in modules().values()
-        for node in ast.parse(file.read_bytes()).body
+        for node in parsed(file).body
         if isinstance(node, ast.ClassDef)
     )
     assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_every_exception_derives_from_the_root() -> None:
+    alone = [
+        f"{file}: {node.name}"
+        for file in modules().values()
+        for node in ast.walk(parsed(file))
+        if isinstance(node, ast.ClassDef) and node.bases
+        if {base.id for base in node.bases if isinstance(base, ast.Name)} <= BUILT_IN
+        and all(isinstance(base, ast.Name) for base in node.bases)
+    ]
+    assert alone == []

@@ -69,8 +69,8 @@ def compared(hand, scene: Scene) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize(("loss", "method"), [(0.002, "Radau"), (0.0, "DOP853")])
-def test_agreement_with_an_adaptive_solver_and_order_two(name, loss, method):
+@pytest.mark.parametrize("loss", [0.002, 0.0])
+def test_agreement_with_an_adaptive_solver_and_order_two(name, loss):
     scene = SCENES[name]
     hand = start(scene, loss, 10)
     p = hand.plant.parameters
@@ -88,9 +88,9 @@ def test_agreement_with_an_adaptive_solver_and_order_two(name, loss, method):
         equations,
         (0, SECONDS),
         compared(hand, scene),
-        method=method,
-        rtol=1e-9,
-        atol=1e-12,
+        method="LSODA",
+        rtol=1e-10,
+        atol=1e-13,
     )
     exact = found.y[:, -1]
     scale = np.repeat([0.2, 0.08, 1.0, 0.001], [2, 3, 5, len(exact) - 10])

@@ -54,33 +54,34 @@ def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) ->
 
 
 @pytest.mark.parametrize(
-    "simulation",
+    ("sense", "angle_known", "simulation"),
     [
-        {},
-        {"tip_friction": 0.2, "object_mass": 0.2, "modulus_scale": 0.7},
-        {"tip_friction": 0.8, "object_mass": 0.05, "modulus_scale": 1.3},
-        {"tip_creep_time": 20.0, "tip_micro_slip": True, "tip_shear_stiffness": 0.8},
+        (1.0, False, {}),
+        (-1.0, True, {"tip_friction": 0.2, "object_mass": 0.2, "modulus_scale": 0.7}),
+        (1.0, True, {"tip_friction": 0.8, "object_mass": 0.05, "modulus_scale": 1.3}),
+        (-1.0, False, {"tip_creep_time": 20.0, "tip_micro_slip": True, "tip_shear_stiffness": 0.8}),
     ],
     ids=["as assumed", "slippery, heavy, soft", "rough, light, hard", "relaxing"],
 )
-def test_the_upright_law_needs_no_angle(simulation: dict[str, float]) -> None:
-    for sense, angle_known in ((1.0, False), (-1.0, True)):
-        sections = {
-            "control": {"law": "upright"},
-            "scene": {"object_model": angle_known},
-            "simulation": {"object_angle": sense * START, **simulation},
-        }
-        with Watched(sections) as hand:
-            hand.grasp(FORCE)
-            hand.run(4.5)
-            assert hand.mode == "holding"
-            assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
-            assert np.abs(hand.plant.force / FORCE - 1.0).max() < 0.02
-            if angle_known:
-                hand.command("rotate", angle=0.1)
-                hand.run(2.0)
-                turned = float(hand.plant.object_pose[2])
-                assert turned == pytest.approx(0.1, abs=math.radians(0.2))
+def test_the_upright_law_needs_no_angle(
+    sense: float, angle_known: bool, simulation: dict[str, float]
+) -> None:
+    sections = {
+        "control": {"law": "upright"},
+        "scene": {"object_model": angle_known},
+        "simulation": {"object_angle": sense * START, **simulation},
+    }
+    with Watched(sections) as hand:
+        hand.grasp(FORCE)
+        hand.run(4.5)
+        assert hand.mode == "holding"
+        assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
+        assert np.abs(hand.plant.force / FORCE - 1.0).max() < 0.02
+        if angle_known:
+            hand.command("rotate", angle=0.1)
+            hand.run(2.0)
+            turned = float(hand.plant.object_pose[2])
+            assert turned == pytest.approx(0.1, abs=math.radians(0.2))
 
 
 def test_solid_tips_come_upright_too() -> None:
