@@ -113,13 +113,14 @@ def make_estimator(
         saturation, quantum = converter.saturation, converter.quantum
         # The estimator takes half a count off a threshold, in the frame's unit.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
+    free_gain = settings.estimator.free_gain
     return ContactEstimator(
         make_tip(settings),
         material,
         calibrated_grid(settings, finger, calibration),
         noise=tactile.noise,
         method=settings.estimator.method,
-        free_gain=settings.estimator.free_gain,
+        free_gain=None if free_gain == "auto" else free_gain,
         live=alive,
         readings=Readings(saturation, threshold, quantum),
         known=uncertainty(settings, calibration),

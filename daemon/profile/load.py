@@ -30,6 +30,7 @@ _EXPECTED = (
     ("a valid tuple", "an array"),
     ("a valid integer", "a whole number"),
     ("a valid ", "a "),
+    ("True or False", "true or false"),
 )
 
 

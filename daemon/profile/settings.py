@@ -166,10 +166,14 @@ class TactileSettings(Section):
 
 
 class EstimatorSettings(Section):
-    """How d and θ come from a frame."""
+    """How d and θ come from a frame.
+
+    ``auto`` frees the gain of springs, and takes a solid tip's for known: its frames tell d by the
+    force alone.
+    """
 
     method: Literal["moments", "ml"] = "ml"
-    free_gain: bool = True  # estimate measured/modelled pressure too
+    free_gain: Literal["auto", True, False] = "auto"  # estimate measured/modelled pressure too
 
 
 class LoopSettings(Section):

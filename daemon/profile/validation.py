@@ -17,6 +17,7 @@ from softfinger.daemon.types import FINGERS
 
 _LONGEST = 60  # characters of a value that are shown
 _DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own
+_CELLS_MIN = 9  # under a solid tip
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
@@ -97,6 +98,37 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
         yield (
             f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {deepest:g} m, "
             "0.4 of a solid tip's radius"
+        )
+    yield from _cells_under(settings)
+
+
+def _cells_under(settings: Settings) -> Iterator[str]:
+    """A solid tip's contact is told from all of its base. Kinematics has the rest of this check."""
+    tactile, a = settings.tactile, settings.tip.radius
+    if tactile.backend == "none":
+        return
+    if tactile.blur > 0.25 * a:
+        yield (
+            f"tactile.blur: found {tactile.blur:g} m, expected at most {0.25 * a:g} m, a quarter "
+            "of a solid tip's radius: more of it hides θ"
+        )
+        return
+    pitch_y = tactile.pitch_y or tactile.pitch
+    within = 0.95 * a - tactile.blur - 2.0 * (tactile.centre_error + tactile.pitch_error * a)
+    cells = sum(
+        math.hypot(
+            (abs(col - 0.5 * (tactile.cols - 1) - tactile.centre[0] / tactile.pitch) + 0.5)
+            * tactile.pitch,
+            (abs(row - 0.5 * (tactile.rows - 1) - tactile.centre[1] / pitch_y) + 0.5) * pitch_y,
+        )
+        < within
+        for row in range(tactile.rows)
+        for col in range(tactile.cols)
+    )
+    if cells < _CELLS_MIN:
+        yield (
+            f"tactile.pitch, tactile.centre: found {cells} cells well within a solid tip's rim, "
+            f"expected at least {_CELLS_MIN}"
         )
 
 
@@ -260,7 +292,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...]
     (("scene", "servos"), _servos),
     (("servos", "loop"), _timing),
     (("material",), _material),
-    (("tip", "material", "estimator", "safety"), _solid_tip),
+    (("tip", "material", "estimator", "safety", "tactile"), _solid_tip),
     (("simulation",), _wedge),
     (("control", "safety", "loop"), _dither),
     (("tactile",), _cells),

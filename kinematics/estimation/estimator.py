@@ -124,6 +124,7 @@ _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
 PATCH_LEVEL = 4.9
 _RIM = {"bonded": 0.03, "lying": 0.05}  # of the radius: nearer to a solid tip's rim none counts
+_CELLS_MIN = 9  # that a solid tip's contact and shear can be told from
 _EXPLAINED_MIN = 0.8  # share of the frame's squared pressure below which an estimate is not valid
 
 
@@ -172,6 +173,10 @@ class ContactEstimator:
         alive = _within(grid, tip, known)
         if live is not None:
             alive &= np.asarray(live, dtype=bool)
+        if tip.physics == "solid" and alive.sum() < _CELLS_MIN:
+            raise ValueError(
+                f"a solid tip needs {_CELLS_MIN} live cells within its rim, got {alive.sum()}"
+            )
         state = self._state = EstimatorState()
         options = self._options = state.options
         options.noise = noise
@@ -320,7 +325,7 @@ class ContactEstimator:
 
 
 def _within(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
-    """The cells [rows, cols] that don't lie at a solid tip's rim, where the model may be wrong.
+    """The cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
 
     A bonded base's stress is singular there, which no two meshes have alike: from independent
     elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. Under a

@@ -83,7 +83,7 @@ def pictures(tip: Fingertip, cells: Grid) -> FloatArray:
         place = (np.arange(points) + 0.5) / points
         at_x = x[cols, None, None] + width * place[None, None, :]
         at_y = y[rows, None, None] + height * place[None, :, None]
-        z = (at_x + 1j * at_y).reshape(len(rows), -1)
+        z = (at_x + 1j * at_y).reshape(len(rows), points**2)
         out[:, rows * cells.cols + cols] = _means(tip, z)
     return out
 

@@ -214,11 +214,19 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
 def test_a_profile_that_no_solid_tip_has_is_refused() -> None:
     from softfinger.daemon.profile.validation import problems
 
-    settings = Settings.model_validate(
-        {"tip": {"physics": "solid"}, "estimator": {"method": "moments"}}
-    )
-    assert [each.partition(":")[0] for each in problems(settings)] == [
+    def wrong(**sections: dict[str, object]) -> list[str]:
+        settings = Settings.model_validate({"tip": {"physics": "solid"}, **sections})
+        return [each.partition(":")[0] for each in problems(settings)]
+
+    assert wrong(estimator={"method": "moments"}) == [
         "material.law",
         "estimator.method",
         "safety.d_max",
     ]
+    sound = {"material": {"law": "constant"}, "safety": {"d_max": 0.008}}
+    assert wrong(**sound) == []
+    assert wrong(**sound, tactile={"blur": 0.008}) == ["tactile.blur"]
+    for tactile in ({"pitch": 0.01}, {"centre_error": 0.01}, {"centre": (0.06, 0.0)}):
+        assert wrong(**sound, tactile=tactile) == ["tactile.pitch, tactile.centre"]
+    with pytest.raises(ValueError, match="9 live cells within its rim, got 4"):
+        ContactEstimator(TIPS[0], RUBBER, SensorGrid(44, 44, 0.01), NOISE)
