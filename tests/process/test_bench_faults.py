@@ -12,17 +12,15 @@ import pytest
 
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.safety.limits import LIMITS
-from softfinger.tools.benchmarks.campaigns import faults, faults_trials
-from softfinger.tools.benchmarks.campaigns.faults_cases import CASES, FaultCase
-from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, judge_wire
-from softfinger.tools.benchmarks.framework.campaign import Tally
-from softfinger.tools.benchmarks.framework.rigs import HIL
+from softfinger.tools.benchmarks import faults
+from softfinger.tools.benchmarks.faults import CASES, Trial, judge_wire, run_trials, upper_bound
+from softfinger.tools.benchmarks.rigs import HIL, RigError
 
 BY_NAME = {case.name: case for case in CASES}
 
 
 def test_one_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faults_trials, "_READY_WITHIN", 100.0)  # s, until the hand grips
+    monkeypatch.setattr(faults, "_READY_WITHIN", 100.0)  # s, until the hand grips
     (table,) = faults.measure(1, "board silent")
     (row,) = table.rows
     # A busy machine may trip the hand; what must never be is no trial's excuse.
@@ -74,9 +72,9 @@ def test_a_grip_on_old_frames_is_seen() -> None:
     state = {"torque": True, "fault": "", "mode": "holding"}
     state |= {side: {"frame_age_s": 0.02} for side in ("left", "right")}
     found = Trial(1)
-    faults_trials._judge_age(rig, state, found)
+    faults.judge_age(rig, state, found)
     assert found.wrong == ""
-    faults_trials._judge_age(rig, {**state, "right": {"frame_age_s": 0.3}}, found)
+    faults.judge_age(rig, {**state, "right": {"frame_age_s": 0.3}}, found)
     assert "frame 0.300 s old" in found.wrong
 
 
@@ -101,7 +99,7 @@ def test_a_grip_on_old_frames_is_seen() -> None:
     ],
 )
 def test_what_was_expected_is_told_from_what_was_not(name: str, trial: Trial, missed: str) -> None:
-    faults_trials._judge(BY_NAME[name], trial)
+    faults.judge(BY_NAME[name], trial)
     assert missed in trial.missed
     assert bool(trial.missed) == bool(missed)
 
@@ -118,8 +116,8 @@ def test_a_case_is_summed_up_by_counts_and_times() -> None:
     trials = [
         Trial(k, fault="tactile.silent", fault_s=0.1, safe_s=0.1 + 0.01 * k) for k in range(3)
     ]
-    outcome = Tally([*trials, Trial(3, missed="no fault")], passed=3, disturbed=2)
-    row = faults.summary("board silent", "fault", 0.14, outcome)
+    found = [*trials, Trial(3, missed="no fault")]
+    row = faults.summary(BY_NAME["board silent"], found, 2)
     assert (row["passed"], row["trials"], row["disturbed"]) == (3, 4, 2)
     assert (row["fault ms"], row["motors off ms at most"]) == (
         pytest.approx(100),
@@ -133,6 +131,33 @@ def test_every_fault_that_latches_has_a_time_and_names_that_exist() -> None:
     rows = {row.name for row in LIMITS}
     assert len({case.name for case in CASES}) == len(CASES)
     for case in CASES:
-        assert isinstance(case, FaultCase)
         assert set(case.names) <= rows
         assert (case.expect in ("fault", "dies")) <= (case.within > 0.0)
+
+
+def test_disturbed_trials_are_made_again_and_failures_counted() -> None:
+    seen = {1: Trial(1, missed="late", waited_s=1.0), 3: Trial(3, wrong="crash")}
+    seeds: list[int] = []
+
+    def one(seed: int) -> Trial:
+        seeds.append(seed)
+        return seen.get(seed, Trial(seed))
+
+    found, disturbed = run_trials(3, one)
+    assert seeds == [1, 2, 3, 4]
+    assert ([each.failure for each in found], disturbed) == (["", ": crash", ""], 1)
+
+
+def test_a_set_up_that_does_not_work_is_given_up() -> None:
+    def broken(seed: int) -> Trial:
+        raise RigError("no hand")
+
+    found, _ = run_trials(100, broken)
+    assert [each.wrong for each in found] == ["the set-up failed: no hand"] * 3
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 40])
+def test_the_upper_bound_is_the_poisson_one(count: int) -> None:
+    mean = upper_bound(count, 1000) * 1000
+    tail = sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(count + 1))
+    assert tail == pytest.approx(0.05, abs=0.004)

@@ -17,8 +17,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from softfinger.tools.benchmarks.campaigns.faults_rig import Rig
-from softfinger.tools.benchmarks.campaigns.faults_trials import Trial, judge_wire
+from softfinger.tools.benchmarks.faults import Trial, judge_wire
+from softfinger.tools.benchmarks.rigs import Rig
 
 SECONDS = 600.0
 _LOOK = 5.0  # s between two looks at wire and memory

@@ -1,4 +1,4 @@
-"""``softfinger bench``: tables, turns, campaigns, comparison of runs, and the command line."""
+"""``softfinger bench``: tables, turns, slopes, comparison of runs, and the command line."""
 
 from __future__ import annotations
 
@@ -6,18 +6,21 @@ import json
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import bench, tick, wakeup
-from softfinger.tools.benchmarks.campaigns import accuracy
-from softfinger.tools.benchmarks.framework import interleaved
-from softfinger.tools.benchmarks.framework.campaign import RigError, run_trials, upper_bound
-from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Report, Row, figure, slower
+from softfinger.tools.benchmarks import accuracy, bench, measuring, servos, tick
+from softfinger.tools.benchmarks.measuring import (
+    Report,
+    Row,
+    Subject,
+    figure,
+    interleave,
+    slopes,
+    slower,
+)
 
 REPORT = """\
 # /dev/cpu_dma_latency set to 0us
@@ -54,7 +57,7 @@ def test_a_figure_has_median_and_tail() -> None:
 def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0]
     order: list[str] = []
-    monkeypatch.setattr(interleaved.time, "perf_counter_ns", lambda: clock[0])
+    monkeypatch.setattr(measuring.time, "perf_counter_ns", lambda: clock[0])
 
     def subject(name: str, cost: int, calls: int) -> Subject:
         def run(repeat: int) -> None:
@@ -71,7 +74,7 @@ def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def rows_of(stick: float, **medians: float) -> list[Row]:
     """A run's rows: a yardstick, and others of 2 % noise."""
-    rows = [figure("yardstick", "µs", [stick]) | {"table": ""}]
+    rows = [figure("yardstick", "µs", [stick] * 100) | {"table": ""}]
     for name, median in medians.items():
         samples = [0.99 * median, median, 1.01 * median]
         rows.append(figure(name, "µs", samples) | {"table": "t"})
@@ -87,50 +90,21 @@ def test_what_became_slower_is_told_from_noise_and_from_a_slower_machine() -> No
     assert str(none) == "slower than before, over the yardstick: 0 of 2"
 
 
-@dataclass
-class Judged:
-    failure: str = ""
-    disturbed: bool = False
-
-
-def test_disturbed_trials_are_made_again_and_failures_counted() -> None:
-    found = {1: Judged("late", disturbed=True), 3: Judged("crash")}
-    seeds: list[int] = []
-
-    def one(seed: int) -> Judged:
-        seeds.append(seed)
-        return found.get(seed, Judged())
-
-    outcome = run_trials(3, one, lambda seed, reason: Judged(reason))
-    assert seeds == [1, 2, 3, 4]
-    assert (len(outcome.trials), outcome.passed, outcome.disturbed) == (3, 2, 1)
-    assert outcome.failed
-    assert outcome.failures == ["seed 3, crash"]
-
-
-def test_a_set_up_that_does_not_work_is_given_up() -> None:
-    def broken(seed: int) -> Judged:
-        raise RigError("no hand")
-
-    outcome = run_trials(100, broken, lambda seed, reason: Judged(reason))
-    assert (len(outcome.trials), outcome.passed) == (3, 0)
-    assert outcome.failure_bound == 1.0
-    assert "the set-up failed: no hand" in outcome.failures[0]
-
-
-@pytest.mark.parametrize("count", [0, 1, 5, 40])
-def test_the_upper_bound_is_the_poisson_one(count: int) -> None:
-    mean = upper_bound(count, 1000) * 1000
-    tail = sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(count + 1))
-    assert tail == pytest.approx(0.05, abs=0.004)
+def test_slopes_are_exponents_or_cost_for_each_more() -> None:
+    rows = [figure(f"cells: {n}", "µs", [3.0 * n**2], cells=n) for n in (8, 16, 64)]
+    rows += [figure(f"sensors: {n}", "µs", [5.0 + 2.0 * n], cells=n) for n in (0, 1, 2)]
+    assert slopes(rows, "cells") == (
+        "  cells: ∝ (cells)^2.00, at the end ^2.00",
+        "  sensors: +2 µs for each more of cells",
+    )
 
 
 def test_a_report_of_cyclictest_is_read_with_what_its_histogram_does_not_reach() -> None:
-    assert wakeup.histogram(REPORT).tolist() == pytest.approx(
+    assert tick.histogram(REPORT).tolist() == pytest.approx(
         [14.5e-6, 14.5e-6, 14.5e-6, 15.5e-6, 250e-6, 250e-6]
     )
     with pytest.raises(ValueError, match="nothing that can be read"):
-        wakeup.histogram("usage: cyclictest")
+        tick.histogram("usage: cyclictest")
 
 
 # The command line
@@ -142,7 +116,8 @@ def canned(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 
     def set_time(micros: float) -> None:
         rows = [figure("pipeline alone, nobody subscribed", "µs", [micros] * 5)]
-        monkeypatch.setattr(tick, "measure", lambda brief: [Report(tick.TITLE, rows, "error")])
+        table = Report("tick", rows, page=("pipeline",))
+        monkeypatch.setattr(tick, "measure", lambda brief: [table])
 
     monkeypatch.setattr(bench, "PAGE", ("tick",))
     set_time(20.0)
@@ -160,10 +135,11 @@ def test_figures_are_kept_and_compared(
         ("tick", "yardstick"),
     ]
     canned(2000.0)
-    assert cli.main(["bench", "--against", str(old)]) == 0
+    assert cli.main(["bench", "--against", str(old), "--plot", str(tmp_path / "x.png")]) == 3
     printed = capsys.readouterr().out
-    assert f"{tick.TITLE}: pipeline alone" in printed, "the page"
-    assert "slower than before" in printed
+    assert "tick: pipeline alone" in printed, "the page"
+    assert "slower than before, over the yardstick: 1 of 1" in printed
+    assert (tmp_path / "x.png").stat().st_size > 5_000
 
 
 def test_a_measurement_that_fails_leaves_the_others(
@@ -174,11 +150,11 @@ def test_a_measurement_that_fails_leaves_the_others(
     def let_go(brief: bool) -> list[Report]:
         raise RuntimeError("the hand let go")
 
-    monkeypatch.setattr(wakeup, "measure", let_go)
-    assert cli.main(["bench", "wakeup", "tick"]) == 1
+    monkeypatch.setattr(servos, "measure", let_go)
+    assert cli.main(["bench", "servos", "tick"]) == 1
     printed = capsys.readouterr()
-    assert "bench: wakeup: the hand let go" in printed.err
-    assert tick.TITLE in printed.out
+    assert "bench: servos: the hand let go" in printed.err
+    assert "pipeline alone" in printed.out
 
 
 def test_a_failed_campaign_is_no_success(
@@ -192,8 +168,8 @@ def test_a_failed_campaign_is_no_success(
 
     monkeypatch.setattr(accuracy, "measure", measure)
     assert cli.main(["bench", "campaign", "accuracy"]) == 0
-    assert cli.main(["bench", "campaign", "accuracy", "--trials", "7", "--only", "bound"]) == 1
-    assert asked == [(None, ""), (7, "bound")]
+    assert cli.main(["bench", "campaign", "accuracy", "--trials", "7", "--only", "dead"]) == 1
+    assert asked == [(None, ""), (7, "dead")]
     capsys.readouterr()
 
 
@@ -207,8 +183,7 @@ def test_a_failed_campaign_is_no_success(
             ["campaign", "faults", "--only", "no such fault"],
             "no case of faults has this in its name",
         ),
-        (["campaign", "faults", "--only", "("], "no case of faults has this in its name"),
-        (["tick", "--plot", "x.png"], "only contact and estimator have a picture"),
+        (["campaign", "faults", "--plot", "x.png"], "campaigns have no picture"),
         (["tick", "--against", "/nowhere.json"], "no figures of `bench --json`"),
     ],
 )

@@ -89,6 +89,21 @@ def test_move_goes_where_it_is_told_within_the_limits(make: Make) -> None:
         command(daemon, "move", left=5.0)
 
 
+@pytest.mark.parametrize("step", [3600.0, -3600.0])
+def test_a_wall_clock_that_is_set_changes_nothing_but_timestamps(
+    make: Make, monkeypatch: pytest.MonkeyPatch, step: float
+) -> None:
+    daemon = grasped(make(), 8.0)
+    loop, wall = daemon.loop, daemon.clock.wall
+    before, seq = wall(), loop.state.seq
+    monkeypatch.setattr(daemon.clock, "wall", lambda: wall() + step)
+    loop.advance(1.0)
+    assert (loop.state.mode, loop.state.fault) == ("holding", "")
+    assert loop.state.seq == seq + round(1.0 / loop.period)
+    assert loop.state.wall == pytest.approx(before + step + 1.0, abs=0.1)
+    assert torque_of(daemon).all()
+
+
 def test_stop_turns_torque_off_at_the_same_tick(make: Make) -> None:
     daemon = grasped(make(), 8.0)
     command(daemon, "stop")

@@ -1,4 +1,4 @@
-"""`bench`: its measurements, one module each with ``measure(brief) -> list[Report]``.
+"""``softfinger bench``: one module for each thing it measures, and what they share.
 
-``PAGE`` names the rows that belong on the page: by a table's title, how their names begin.
+`measuring`, `picture` and `rigs` know no single measurement; `accuracy` and `faults` are campaigns.
 """

@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -15,27 +16,27 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.own_files import write_text
 
 if TYPE_CHECKING:
-    from softfinger.tools.benchmarks.framework.report import Report, Row
+    from softfinger.tools.benchmarks.measuring import Report, Row
 
 MEASUREMENTS = {
-    "contact": "the contact model, run time against error, beside SciPy",
+    "contact": "lookup of force and energy, run time against error, beside SciPy",
     "estimator": "pressure grid to d and tilt, run time against error, beside OpenCV and others",
-    "tick": "one tick without serial",
-    "scenes": "the tick of each kind of scene, and what each skipping step saves",
-    "control": "grasping, turning and holding on the simulated hand",
+    "tick": "the tick back to back, in place and over ptys; wake-ups beside cyclictest",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
-    "hil": "one tick over the emulated hand's ptys",
-    "reflex": "from a slip's onset to the servos' bytes",
-    "wakeup": "wake-ups of the loop beside cyclictest and time.sleep",
     "startup": "start to the first published state, memory",
+    "control": "what each grip law reaches on the simulated hand",
+    "reflex": "from a slip's onset to the servos' bytes",
+    "scenes": "what each thing that a scene skips saves, a tick and at the first start",
+    "growth": "cost and error against cells, tolerance, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
-    "accuracy": "the estimator over its whole envelope against the Cramér-Rao bound, ten minutes",
-    "faults": "every fault on the emulated hand and what comes of it, an hour for 100 trials each",
+    "accuracy": "the estimator over its whole range against the Cramér-Rao bound, ten minutes",
+    "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
 }
-PAGE = ("contact", "estimator", "tick", "servos", "hil", "wakeup", "startup")
+PAGE = ("contact", "estimator", "tick", "servos", "startup")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤")
 _CAMPAIGN = "campaign"
+FAILED, SLOWER = 1, 3  # exit statuses; 2 is for words that are refused
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,23 +53,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--trials", type=_count, metavar="N", help="trials of each case of a campaign"
     )
     parser.add_argument(
-        "--only", default="", metavar="PATTERN", help="cases of a campaign with this in their name"
+        "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
     )
     parser.add_argument(
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw them (extra 'plot')")
     parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw run time against error (extra 'plot')"
-    )
-    parser.add_argument(
-        "--against", type=Path, metavar="OLD.json", help="show what is slower than in that file"
+        "--against",
+        type=Path,
+        metavar="OLD.json",
+        help=f"show what is slower than in that file; exit status {SLOWER} if anything is",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the files that were asked for."""
-    from softfinger.tools.benchmarks.framework.report import Report, slower, yardstick
+    from softfinger.tools.benchmarks.measuring import Report, figure, slower, yardstick
 
     campaign = arguments.names[:1] == [_CAMPAIGN]
     texts = CAMPAIGNS if campaign else MEASUREMENTS
@@ -79,58 +81,90 @@ def run(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
+    load = [os.getloadavg()[0]]
     rows: list[Row] = []
     drawn: list[Report] = []
     page: list[Row] = []
-    failed = False
+    status = 0
     for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        module = _module(name)
+        before = yardstick()
         try:
             if campaign:
-                tables = module.measure(arguments.trials, arguments.only)
+                tables = _module(name).measure(arguments.trials, arguments.only)
             else:
-                tables = module.measure(brief=arguments.brief or not arguments.names)
+                tables = _module(name).measure(brief=arguments.brief or not arguments.names)
         except RuntimeError as error:  # on a busy machine a hand may let go
             print(f"bench: {name}: {error}", file=sys.stderr)
-            failed = True
+            status = FAILED
             continue
-        for table in [*tables, Report("", [yardstick()])]:
+        stick = Report("", [figure("yardstick", "µs", before + yardstick())])
+        for table in [*tables, stick]:
             head = {"measurement": name, "table": table.title}
             # JSON knows no NaN, which alone differs from itself.
             rows += [
                 head | {key: None if value != value else value for key, value in row.items()}
                 for row in table.rows
             ]
-            failed = failed or table.failed
-        drawn += [table for table in tables if table.error]
+            if table.failed:
+                status = FAILED
+                print(*table.notes, sep="\n", file=sys.stderr)
         if arguments.names:
             print(*tables, sep="\n\n", end="\n\n")
-        else:
-            page += _key_figures(tables, module.PAGE)
-    if page:
-        print(Report("", page))
+        drawn += tables
+        page += [
+            {"name": f"{table.title}: {row['name']}"}
+            | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.x) if key}
+            for table in tables
+            for row in table.on_page
+        ]
+    load.append(os.getloadavg()[0])
+    if not arguments.names:
+        title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
+        print(Report(title, page))
+        shown = [table for table in drawn if table.on_page]
+        drawn = [table if table.x else replace(table, rows=table.on_page) for table in shown]
     if arguments.json:
         content = {
-            "machine": platform.machine(),
+            "machine": _processor(),
             "cores": os.cpu_count(),
             "python": platform.python_version(),
+            "load": load,
             "rows": rows,
         }
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
     if arguments.plot:
-        from softfinger.tools.benchmarks.framework.report import draw
-
-        draw(drawn, arguments.plot)
+        _draw(drawn, arguments.plot)
     if old:
-        print(slower(old, rows))
-    return 1 if failed else 0
+        found = slower(old, rows)
+        print(found)
+        status = status or (SLOWER if found.rows else 0)
+    return status
 
 
 def _module(name: str) -> ModuleType:
-    room = "benchmarks.campaigns" if name in CAMPAIGNS else "benchmarks"
-    return importlib.import_module(f"softfinger.tools.{room}.{name}")
+    return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
+
+
+def _draw(tables: list[Report], path: Path) -> None:
+    """Tables of points as they are, bars of the rows with the first one's unit."""
+    from softfinger.tools.benchmarks.picture import draw
+
+    panels = []
+    for table in tables:
+        bars = [row for row in table.rows if row.get("unit") == table.rows[0].get("unit")]
+        panels.append(table if table.x else replace(table, rows=bars))
+    draw([panel for panel in panels if any("median" in row for row in panel.rows)], path)
+
+
+def _processor() -> str:
+    """The processor's name where Linux says it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.machine()
 
 
 def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
@@ -141,14 +175,14 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
         if name not in texts:
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
-        if texts is CAMPAIGNS and not _module(name).known(arguments.only):
+        if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
             raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
     if arguments.plot:
         from softfinger.tools.extras import MissingExtra
         from softfinger.tools.style import settings
 
-        if not {"contact", "estimator"} & set(names):
-            raise ValueError("--plot: only contact and estimator have a picture")
+        if texts is CAMPAIGNS:
+            raise ValueError("--plot: campaigns have no picture")
         try:
             settings()
         except MissingExtra as error:
@@ -164,17 +198,6 @@ def _read(path: Path) -> list[Row]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"--against {path}: no figures of `bench --json`: {error}") from None
     return found
-
-
-def _key_figures(tables: list[Report], chosen: dict[str, tuple[str, ...]]) -> list[Row]:
-    """Rows of the page: those whose names begin as ``chosen`` has it, by the table's title."""
-    return [
-        {"name": f"{table.title}: {row['name']}"}
-        | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.error) if key}
-        for table in tables
-        for row in table.rows
-        if str(row["name"]).startswith(chosen.get(table.title, ()))
-    ]
 
 
 def _count(text: str) -> int:

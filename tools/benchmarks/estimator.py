@@ -2,8 +2,10 @@
 
 All of one run, in turns, over the same frames: 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 12°,
 0.2 % of the modulus as noise. "kernel" is the compiled entry called by compiled code, "call" the
-Python call of the control loop. Errors are RMS over these frames. Then the errors over the envelope
-against the Cramér-Rao bound, in the short form of `bench campaign accuracy`.
+Python call of the control loop. Errors are RMS over these frames, beside the Cramér-Rao bound.
+
+The other packages keep what is above three times the noise, and turn the moments that they give
+into d and the tilts by the model's own closed forms.
 """
 
 from __future__ import annotations
@@ -24,97 +26,120 @@ from softfinger.daemon.tactile.flexitac import FlexiTacDecoder
 from softfinger.daemon.tactile.glove import GloveDecoder
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks.campaigns import accuracy_envelope
-from softfinger.tools.benchmarks.campaigns.accuracy_trials import (
-    LINEAR,
-    MODULUS,
-    SIZE,
-    TIP,
-    Place,
-    bound,
-    jacobian,
-    tilts,
-)
-from softfinger.tools.benchmarks.estimator_rivals import rivals
-from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Report, figure
+from softfinger.tools.benchmarks.measuring import Report, Subject, each, figure, interleave
 
 FloatArray = NDArray[np.float64]
 Truth: TypeAlias = tuple[float, float, float]  # d [m], tilt_x, tilt_y [rad]
+Method = Callable[[FloatArray], Truth]
+Moments = Callable[[FloatArray], tuple[float, float, float, float]]
 
-TITLE = "estimator, 44 × 44 cells, 4 mm, 12°"
-D_ERROR, TILT_ERROR = "d RMS µm", "tilt RMS °"
-PAGE = {
-    TITLE: (
-        *("moments: warm", "ml, gain free: warm", "no contact: activity", "decode: cobs"),
-        *("NumPy", "SciPy", "OpenCV", "scikit"),
-    )
-}
-_FRAMES = 32
-_SHARE = 0.002  # of the modulus
-_NOISE = _SHARE * MODULUS
+ERROR = "RMS of d [µm]"
+TIP = Fingertip(radius=0.020)
+MODULUS = 0.304e6  # Pa
+LINEAR = Material.constant(MODULUS)
+SIZE, WIDTH = 44, 0.058  # cells a side, m
+NOISE = 0.002 * MODULUS
 _PASCAL_PER_COUNT = 4.0
-_PLACE = Place(0.004, math.radians(12.0), 0.7, (0.31, -0.17))
-_TRUTH: Truth = _PLACE.truth[:3]
-GRID = _PLACE.grid
+_FRAMES = 32
 _DECODERS: dict[str, Callable[[int, int], Decoder]] = {
     "cobs": CobsDecoder,
     "flexitac": FlexiTacDecoder,
     "glove": GloveDecoder,
 }
+_STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 
 
 @dataclass
-class _Timed:
+class Timed:
+    """A way to estimate: what is timed, and what it finds in the frames [n, 3]."""
+
     subject: Subject
-    found: Callable[[], FloatArray] | None = None  # estimates [n, 3]
+    found: Callable[[], FloatArray] | None = None
     aim_us: float | None = None
-    truth: Truth = _TRUTH
+    truth: Truth = (0.0, 0.0, 0.0)
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """RMS of d and of the tilts."""
+        if self.found is None:
+            return {}
+        rms = np.sqrt(np.mean((self.found()[:, :3] - np.array(self.truth)) ** 2, axis=0))
+        return {ERROR: 1e6 * float(rms[0]), "of tilts [°]": math.degrees(math.hypot(*rms[1:]))}
 
 
-def measure(brief: bool = False, rounds: int = 25, frames: int = 500) -> list[Report]:
-    """Times with errors; unless ``brief`` the errors over the envelope, ``frames`` a contact."""
-    random = np.random.default_rng(4)
-    noise = random.standard_normal((_FRAMES, SIZE, SIZE))
-    pressed = GRID.pressure(TIP, LINEAR, *_TRUTH) + _NOISE * noise
-    cases = {**_methods(pressed), **_steps(pressed, _NOISE * noise)}
+def tilts(theta: float, azimuth: float) -> tuple[float, float]:
+    """(tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
+    s = math.sin(theta)
+    return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
+
+
+GRID = SensorGrid(SIZE, SIZE, WIDTH / SIZE, (0.31 * WIDTH / SIZE, -0.17 * WIDTH / SIZE))
+TRUTH: Truth = (0.004, *tilts(math.radians(12.0), 0.7))
+_CORNER: Truth = (0.008, *tilts(math.radians(30.0), 0.7))
+
+
+def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
+    """Times with errors, and the bound."""
+    noise = np.random.default_rng(4).standard_normal((_FRAMES, SIZE, SIZE))
+    frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
+    cases = {
+        "moments: warm, kernel": kernel_case(frames, TRUTH, 1.0, method="moments"),
+        "ml: warm, kernel": kernel_case(frames, TRUTH, 15.0),
+        "ml: cold, kernel": kernel_case(frames, TRUTH, 30.0, cold=True),
+        "ml: warm, call": _calls(ContactEstimator(TIP, LINEAR, GRID, NOISE).update, frames),
+        "no contact: kernel": replace(kernel_case(NOISE * noise, TRUTH, 0.3), found=None),
+    }
     if not brief:
-        cases |= _elsewhere(noise)
-    for framing in ("cobs",) if brief else _DECODERS:
-        cases[f"decode: {framing} frame, call"] = _decode(framing, pressed)
-    cases |= _rivals(pressed, brief)
-    subjects = {name: case.subject for name, case in cases.items()}
-    times = interleave(subjects, 10 if brief else rounds)
+        deep = GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
+        cases |= {
+            "ml, gain known: warm, kernel": kernel_case(frames, TRUTH, 15.0, free_gain=False),
+            "ml, at (8 mm, 30°): warm, kernel": kernel_case(deep, _CORNER, 15.0),
+            "ml, at (8 mm, 30°): cold, kernel": kernel_case(deep, _CORNER, 30.0, cold=True),
+        }
+    for framing in _DECODERS:
+        cases[f"decode: {framing}"] = Timed(decode(framing, frames), aim_us=20.0)
+    cases |= {name: _calls(method, frames) for name, method in _rivals().items()}
+    times = interleave(
+        {name: case.subject for name, case in cases.items()}, 10 if brief else rounds
+    )
     rows = [
-        figure(name, "µs", 1e-3 * times[name], case.aim_us) | _errors(case)
+        figure(name, "µs", 1e-3 * times[name], case.aim_us, **case.errors)
         for name, case in cases.items()
     ]
-    sigma = np.sqrt(np.diag(bound(jacobian(_PLACE), _NOISE, True)))
-    limit = {D_ERROR: 1e6 * float(sigma[0]), TILT_ERROR: math.degrees(math.hypot(*sigma[1:3]))}
-    rows.append({"name": "Cramér-Rao bound, gain free"} | limit)
-    tables = [Report(TITLE, rows, D_ERROR)]
-    if brief:
-        return tables
-    sweep = accuracy_envelope.Sweep(1, frames, 3, 4 * frames, degrees=(0.0, 10.0, 20.0, 30.0))
-    return tables + accuracy_envelope.against_the_bound(sweep)
+    sigma = np.sqrt(np.diag(bound(jacobian(GRID, (*TRUTH, 1.0)), NOISE)))
+    rows.append({"name": "Cramér-Rao bound", ERROR: 1e6 * float(sigma[0])})
+    page = ("moments: warm", "ml: warm, k", "ml: cold", "no contact", "decode: cobs")
+    others = ("NumPy", "SciPy", "OpenCV", "scikit")
+    return [Report("frame to contact", rows, ERROR, (*page, *others))]
 
 
-def _errors(case: _Timed) -> dict[str, float]:
-    if case.found is None:
-        return {}
-    off = case.found()[:, :3] - np.array(case.truth)
-    rms = np.sqrt(np.mean(off**2, axis=0))
-    return {D_ERROR: 1e6 * float(rms[0]), TILT_ERROR: math.degrees(math.hypot(*rms[1:]))}
+def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> FloatArray:
+    """∂ pressure/∂(d, tilt_x, tilt_y, gain) [cells, 4], by central differences."""
+    columns = []
+    for k, step in enumerate(_STEPS):
+        ends = []
+        for sign in (1.0, -1.0):
+            at = list(truth)
+            at[k] += sign * step
+            ends.append(grid.pressure(TIP, LINEAR, at[0], at[1], at[2], at[3]))
+        columns.append(((ends[0] - ends[1]) / (2.0 * step)).ravel())
+    return np.stack(columns, axis=1)
 
 
-def _estimator(**options: Any) -> ContactEstimator:
-    return ContactEstimator(TIP, LINEAR, GRID, _NOISE, **options)
+def bound(
+    slopes: FloatArray, noise: float, free: bool = True, live: NDArray[np.bool_] | None = None
+) -> FloatArray:
+    """The Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from the ``live`` cells."""
+    used = slopes if live is None else slopes[live.ravel()]
+    used = used[:, : 4 if free else 3]
+    return np.asarray(np.linalg.inv(used.T @ used) * noise**2)
 
 
 @kernel
@@ -139,123 +164,138 @@ def _loop(
             out[k, 2] = estimate.tilt_y
 
 
-def _kernel(estimator: ContactEstimator, frames: FloatArray, cold: bool = False) -> _Timed:
+def kernel_case(
+    frames: FloatArray,
+    truth: Truth,
+    aim_us: float | None = None,
+    cold: bool = False,
+    grid: SensorGrid = GRID,
+    **options: Any,
+) -> Timed:
     """The compiled entry, from the last estimate or from each frame alone."""
+    estimator = ContactEstimator(TIP, LINEAR, grid, NOISE, **options)
     out = np.zeros((len(frames), 3))
 
     def run(repeat: int) -> None:
         _loop(repeat, frames, cold, estimator.state.array, *estimator.arena, out)
 
-    return _Timed(Subject(run, len(frames)), lambda: out)
+    return Timed(Subject(run, len(frames)), lambda: out, aim_us, truth)
 
 
-def _methods(frames: FloatArray) -> dict[str, _Timed]:
-    """Each method, from the last estimate and from the frame alone."""
-    cases = {}
-    for name, options, warm, cold in (
-        ("moments", {"method": "moments"}, 1.0, None),
-        ("ml, gain free", {}, 15.0, 30.0),
-        ("ml, gain known", {"free_gain": False}, 15.0, 30.0),
-    ):
-        for words, is_cold, aim in (("warm", False, warm), ("cold", True, cold)):
-            case = _kernel(_estimator(**options), frames, is_cold)
-            cases[f"{name}: {words}, kernel"] = replace(case, aim_us=aim)
-        cases[f"{name}: warm, call"] = _call(_estimator(**options), frames)
-    return cases
+def _calls(method: Callable[[FloatArray], Any], frames: FloatArray) -> Timed:
+    """Calls from Python, of an estimator or of another's way."""
 
-
-def _call(estimator: ContactEstimator, frames: FloatArray) -> _Timed:
-    def run(repeat: int) -> None:
-        for _ in range(repeat):
-            for frame in frames:
-                estimator.update(frame)
+    def answer(frame: FloatArray) -> Truth:
+        e = method(frame)
+        return e if isinstance(e, tuple) else (e.d, e.tilt_x, e.tilt_y)
 
     def found() -> FloatArray:
-        estimates = (estimator.update(frame) for frame in frames)
-        return np.array([(e.d, e.tilt_x, e.tilt_y) for e in estimates])
+        return np.array([answer(frame) for frame in frames])
 
-    return _Timed(Subject(run, len(frames)), found)
-
-
-def _steps(frames: FloatArray, empty: FloatArray) -> dict[str, _Timed]:
-    """What is skipped, on and off."""
-    always, exact = _estimator(), _estimator()
-    always.state.options.peak_level = always.state.options.patch_level = -1e9
-    exact.state.options.tolerance = 1e-9
-    seen = _estimator()
-
-    def again(repeat: int) -> None:
-        for _ in range(repeat):
-            seen.update(frames[0], seq=1)
-
-    return {
-        "no contact: activity test, kernel": replace(
-            _kernel(_estimator(), empty), found=None, aim_us=0.3
-        ),
-        "no contact: fitted all the same, kernel": replace(_kernel(always, empty), found=None),
-        "frame already seen: call": _Timed(Subject(again)),
-        "ml, gain free: warm, no early stop, kernel": _kernel(exact, frames),
-    }
+    return Timed(each(method, [(frame,) for frame in frames]), found, truth=TRUTH)
 
 
-def _elsewhere(noise: FloatArray) -> dict[str, _Timed]:
-    """The same at the envelope's costliest corner, with Table I's law, and with a blur."""
-    cases: dict[str, _Timed] = {}
-
-    def add(name: str, truth: Truth, material: Material, grid: SensorGrid, **options: Any) -> None:
-        deviation = _SHARE * material.reference_modulus
-        frames = grid.pressure(TIP, material, *truth) + deviation * noise
-        moments = "method" in options
-        for words, cold in (("warm", False),) if moments else (("warm", False), ("cold", True)):
-            estimator = ContactEstimator(TIP, material, grid, deviation, **options)
-            aim = None if grid.blur else 1.0 if moments else 30.0 if cold else 15.0
-            case = replace(_kernel(estimator, frames, cold), aim_us=aim, truth=truth)
-            cases[f"{name}: {words}, kernel"] = case
-
-    deep = (0.008, *tilts(math.radians(30.0), 0.7))
-    add("moments at (8 mm, 30°)", deep, LINEAR, GRID, method="moments")
-    add("ml, gain free, at (8 mm, 30°)", deep, LINEAR, GRID)
-    add("ml, gain known, at (8 mm, 30°)", deep, LINEAR, GRID, free_gain=False)
-    add("ml, gain free, at (8 mm, 30°), Table I's law", deep, Material.table_i(), GRID)
-    for blur in (0.5e-3, 1e-3):
-        blurred = replace(GRID, blur=blur)
-        add(f"moments, blur {blur * 1e3:g} mm", _TRUTH, LINEAR, blurred, method="moments")
-        add(f"ml, gain free, blur {blur * 1e3:g} mm", _TRUTH, LINEAR, blurred)
-    return cases
-
-
-def _decode(framing: str, frames: FloatArray) -> _Timed:
+def decode(framing: str, frames: FloatArray) -> Subject:
     """A framing's bytes, as a board sends them, to counts."""
     encode = ENCODERS[framing].encode
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
     packets = [encode(each, number, 0.01 * number) for number, each in enumerate(counts)]
-    decoder = _DECODERS[framing](SIZE, SIZE)
-
-    def run(repeat: int) -> None:
-        for _ in range(repeat):
-            for packet in packets:
-                decoder.feed(packet, 0.0)
-
-    return _Timed(Subject(run, len(packets)), aim_us=20.0)
+    return each(_DECODERS[framing](*frames.shape[1:]).feed, [(packet, 0.0) for packet in packets])
 
 
-def _rivals(frames: FloatArray, brief: bool) -> dict[str, _Timed]:
-    cases = {}
-    methods, missing = rivals(TIP, LINEAR, GRID, _NOISE)
+# What a user would otherwise take: each gives centroid and variances in cells, (x, y, v_x, v_y),
+# the middle of the grid at 0.
+
+
+def _rivals() -> dict[str, Method]:
+    """The methods that can run here, by name; a line names what to install for the others."""
+    found, missing = {"NumPy moments over a threshold": contact_of(_numpy())}, []
+    for name, package, make in (
+        ("SciPy ndimage center_of_mass, label", "scipy", _ndimage),
+        ("OpenCV moments", "opencv-python-headless", _opencv),
+        ("scikit-image regionprops", "scikit-image", _skimage),
+    ):
+        try:
+            found[name] = contact_of(make())
+        except ImportError:
+            missing.append(package)
     if missing:
-        print(f"for more rows: pip install {' '.join(missing)}", file=sys.stderr)
-    for name, method in methods.items():
-        slow = "least_squares" in name  # milliseconds a frame
-        if slow and brief:
-            continue
-        chosen = frames[:4] if slow else frames
+        print(f"bench estimator: for more rows: pip install {' '.join(missing)}", file=sys.stderr)
+    return found
 
-        def found(method: Any = method, chosen: FloatArray = chosen) -> FloatArray:
-            return np.array([method(frame) for frame in chosen])
 
-        def run(repeat: int, found: Callable[[], FloatArray] = found) -> None:
-            for _ in range(repeat):
-                found()
+def contact_of(moments: Moments) -> Method:
+    """d and the tilts from centroid and variances, by the closed forms of a constant modulus."""
+    pitch, a = GRID.pitches[0], TIP.radius
 
-        cases[name] = _Timed(Subject(run, len(chosen)), found)
-    return cases
+    def method(frame: FloatArray) -> Truth:
+        x, y, variance_x, variance_y = moments(frame)
+        x, y = x * pitch - GRID.centre[0], y * pitch - GRID.centre[1]
+        trace = (variance_x + variance_y - 1 / 6) * pitch**2
+        d = 2 * a - 2 * math.sqrt(max(a * a - 1.5 * max(trace, 0.0), 0.0))
+        for _ in range(6):  # the trace falls with the tilt
+            s2 = min((x * x + y * y) / (a - d / 3) ** 2, 0.9)
+            full = trace + s2 * d * (12 * a - 5 * d) / 36
+            d = 2 * a - 2 * math.sqrt(max(a * a - 1.5 * max(full, 0.0), 0.0))
+        sines = (min(max(each / (a - d / 3), -0.95), 0.95) for each in (x, y))
+        tilt_x, tilt_y = map(math.asin, sines)
+        return d, tilt_x, tilt_y
+
+    return method
+
+
+_LEVEL = 3.0 * NOISE
+_AXIS = np.arange(SIZE) - 0.5 * (SIZE - 1)
+
+
+def _numpy() -> Moments:
+    def moments(frame: FloatArray) -> tuple[float, float, float, float]:
+        kept = np.where(frame > _LEVEL, frame, 0.0)
+        by_col, by_row = kept.sum(axis=0), kept.sum(axis=1)
+        total = by_col.sum()
+        x, y, square = by_col @ _AXIS / total, by_row @ _AXIS / total, _AXIS**2
+        return x, y, by_col @ square / total - x * x, by_row @ square / total - y * y
+
+    return moments
+
+
+def _ndimage() -> Moments:
+    from scipy import ndimage
+
+    def moments(frame: FloatArray) -> tuple[float, float, float, float]:
+        labels, count = ndimage.label(frame > _LEVEL)
+        index = 1 + int(np.argmax(ndimage.sum_labels(frame, labels, np.arange(1, count + 1))))
+        y, x = (at + _AXIS[0] for at in ndimage.center_of_mass(frame, labels, index))
+        total = ndimage.sum_labels(frame, labels, index)
+        v_y = ndimage.sum_labels(frame * (_AXIS[:, None] - y) ** 2, labels, index) / total
+        v_x = ndimage.sum_labels(frame * (_AXIS - x) ** 2, labels, index) / total
+        return x, y, v_x, v_y
+
+    return moments
+
+
+def _opencv() -> Moments:
+    import cv2
+
+    def moments(frame: FloatArray) -> tuple[float, float, float, float]:
+        _, kept = cv2.threshold(frame.astype(np.float32), _LEVEL, 0.0, cv2.THRESH_TOZERO)
+        m = cv2.moments(kept)
+        total = m["m00"]
+        x, y = m["m10"] / total + _AXIS[0], m["m01"] / total + _AXIS[0]
+        return x, y, m["mu20"] / total, m["mu02"] / total
+
+    return moments
+
+
+def _skimage() -> Moments:
+    from skimage.measure import label, regionprops
+
+    def moments(frame: FloatArray) -> tuple[float, float, float, float]:
+        regions = regionprops(label(frame > _LEVEL), intensity_image=frame)
+        region = max(regions, key=lambda each: each.area)
+        central = region.moments_weighted_central
+        y, x = region.centroid_weighted
+        total = central[0, 0]
+        return x + _AXIS[0], y + _AXIS[0], central[0, 2] / total, central[2, 0] / total
+
+    return moments

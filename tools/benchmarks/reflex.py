@@ -11,8 +11,8 @@ import random
 import time
 from typing import Any
 
-from softfinger.tools.benchmarks.campaigns.faults_rig import Rig
-from softfinger.tools.benchmarks.framework.report import Report, figure
+from softfinger.tools.benchmarks.measuring import Report, figure
+from softfinger.tools.benchmarks.rigs import Rig
 
 _FORCE = 10.0  # N: the tips' friction bears 12 N along the faces
 _RAISED = 1.25  # of the goal currents before: a firmer grip, and not only damped joints

@@ -1,14 +1,21 @@
-"""The tick's cost in each kind of scene, and what each skipping step saves, from one run.
+"""What a scene doesn't need costs nothing: what each skipped thing saves, by measurement.
 
-All daemons stand side by side, on canned readings and virtual time, and tick in turns. A skipping
-step is switched off in a daemon of its own, from outside; what it saves is the median of the
-differences to the daemon that has it, round by round, with that median's own error.
+In µs a tick: all daemons stand side by side, on canned readings (or the simulated hand) and virtual
+time, and tick in turns. A step is switched off in a daemon of its own, from outside; what it saves
+is the median of the differences to the daemon that has it, round by round, with that median's own
+error. In seconds of the first start, where the scenes differ in kernels: `softfinger compile` with
+an empty cache, on all processors; and the processor time of that, which other load hardly changes.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
+import os
+import resource
+import subprocess
+import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,56 +28,41 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.tools.benchmarks.framework.interleaved import Subject, interleave
-from softfinger.tools.benchmarks.framework.report import Report, Row, figure
-from softfinger.tools.benchmarks.framework.rigs import Sections, can, hold, virtual_daemon
+from softfinger.tools.benchmarks.measuring import Report, Row, Subject, figure, interleave
+from softfinger.tools.benchmarks.rigs import (
+    SOFTFINGER,
+    RigError,
+    Sections,
+    can,
+    hold,
+    virtual_daemon,
+)
 
 _TICKS = 20  # of a call: whole periods of the frames, as of the published topics
 _SURE = 3.0  # times its own error that a saving must have to be called one
 
 
+def _as_it_is(daemon: Daemon) -> None:
+    """The simulated hand stays."""
+
+
 @dataclass(frozen=True)
 class TimedScene:
-    """A daemon to tick: its settings, whether it holds, a subscribed topic, what is altered."""
+    """A daemon to tick: its settings, whether it holds, what is subscribed, what is altered."""
 
     sections: Sections = field(default_factory=dict)
     holds: bool = True
-    topic: str = ""
+    topics: tuple[str, ...] = ()
+    subscribers: int = 1  # to each of these
     alter: Callable[[Daemon], None] = can
-
-
-ONE = {"scene": {"fingers": ("left",)}}
-CONSTANT = {"material": {"law": "constant"}}
-SENSORS_ONLY = {"servos": {"backend": "none"}}
-SERVOS_ONLY = {"tactile": {"backend": "none"}}
-IDLE, ONE_FINGER = "idle and open", "one finger, idle"
-TWO, TWO_CONSTANT = (
-    "two fingers holding, nobody subscribed",
-    "two fingers holding, constant modulus",
-)
-STATE_ONLY = "two fingers holding, state subscribed"
-SCENES = {
-    IDLE: TimedScene(holds=False),
-    ONE_FINGER: TimedScene(ONE, holds=False),
-    "servos without sensors, idle": TimedScene(SERVOS_ONLY, holds=False),
-    "sensors without servos, one tip touched": TimedScene(SENSORS_ONLY, holds=False),
-    TWO: TimedScene(),
-    TWO_CONSTANT: TimedScene(CONSTANT),
-    STATE_ONLY: TimedScene(topic="hand/state"),
-    "two fingers holding, all subscribed": TimedScene(topic="hand"),
-}
-
-
-def _every_tick_estimated(daemon: Daemon) -> None:
-    can(daemon, every_tick=True)
 
 
 def _always_fitted(daemon: Daemon) -> None:
     can(daemon)
-    tip, noise = daemon.models[0].table.tip, daemon.settings.tactile.noise
     for finger in daemon.loop.perception.fingers:
-        grid, material = finger._estimator.grid, daemon.models[finger.finger].material
-        finger._estimator = ContactEstimator(tip, material, grid, noise)
+        model, grid = daemon.models[finger.finger], finger._estimator.grid
+        noise = daemon.settings.tactile.noise
+        finger._estimator = ContactEstimator(model.table.tip, model.material, grid, noise)
         options = finger._estimator.state.options
         options.peak_level = options.patch_level = -1e9
 
@@ -87,21 +79,11 @@ def _always_cold(daemon: Daemon) -> None:
         estimator.update = cold  # type: ignore[assignment,method-assign]
 
 
-def _always_predicted(daemon: Daemon) -> None:
-    class Live(list[bool]):
-        """Both tips count as touched, whatever the frames say."""
-
-        def __setitem__(self, *_: Any) -> None: ...
-
-    can(daemon)
-    daemon.loop.perception.filter._live = Live([True, True])
-
-
 def _always_packed(daemon: Daemon) -> None:
     can(daemon)
-    broadcast = daemon.loop._publishing
-    assert broadcast is not None
-    broadcast._publisher._link.wanted = bit(schema.STATE) | bit(schema.TACTILE)
+    publishing = daemon.loop._publishing
+    assert publishing is not None
+    publishing._publisher._link.wanted = bit(schema.STATE) | bit(schema.TACTILE)
 
 
 def _tabulated(daemon: Daemon) -> None:
@@ -112,45 +94,95 @@ def _tabulated(daemon: Daemon) -> None:
     daemon.loop.perception.filter._tables = (table.data, table.data)
 
 
-# A step: the scene that has it, and the same without it.
-STEPS: dict[str, tuple[str, TimedScene]] = {
-    "no estimate for a frame already seen": (TWO, TimedScene(alter=_every_tick_estimated)),
-    "no contact, no fit": (IDLE, TimedScene(holds=False, alter=_always_fitted)),
-    "the fit starts from the last contact": (TWO, TimedScene(alter=_always_cold)),
-    "no contact, no prediction published": (IDLE, TimedScene(holds=False, alter=_always_predicted)),
-    "closed form for a constant modulus": (TWO_CONSTANT, TimedScene(CONSTANT, alter=_tabulated)),
-    "topics without subscribers are not packed": (TWO, TimedScene(alter=_always_packed)),
-    "state published at 100 Hz, not each tick": (
-        STATE_ONLY,
-        TimedScene({"stream": {"state_rate": 500.0}}, topic="hand/state"),
+ONE = {"scene": {"fingers": ("left",)}}
+CONSTANT = {"material": {"law": "constant"}}
+HOLDING, IDLE, ONE_IDLE = "two fingers holding", "idle and open", "one finger, idle"
+SCENES = {
+    IDLE: TimedScene(holds=False),
+    ONE_IDLE: TimedScene(ONE, holds=False),
+    "servos without sensors, idle": TimedScene({"tactile": {"backend": "none"}}, holds=False),
+    "sensors without servos, one tip touched": TimedScene(
+        {"servos": {"backend": "none"}}, holds=False
     ),
-    "an absent finger costs nothing": (ONE_FINGER, SCENES[IDLE]),
+    HOLDING: TimedScene(),
+    "two fingers holding, all subscribed": TimedScene(topics=("hand",)),
+}
+# What is skipped: the scene that skips it, and the same without skipping.
+STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
+    "a frame already seen is not estimated": (
+        SCENES[HOLDING],
+        TimedScene(alter=lambda daemon: can(daemon, every_tick=True)),
+    ),
+    "no contact, no fit": (SCENES[IDLE], TimedScene(holds=False, alter=_always_fitted)),
+    "the fit starts from the last contact": (SCENES[HOLDING], TimedScene(alter=_always_cold)),
+    "no blur": (SCENES[HOLDING], TimedScene({"tactile": {"blur": 0.5e-3}})),
+    "a modulus that is constant": (TimedScene(CONSTANT), TimedScene(CONSTANT, alter=_tabulated)),
+    "topics without subscribers": (SCENES[HOLDING], TimedScene(alter=_always_packed)),
+    "state at 100 Hz, not each tick": (
+        TimedScene(topics=("hand/state",)),
+        TimedScene({"stream": {"state_rate": 500.0}}, topics=("hand/state",)),
+    ),
+    "a finger": (SCENES[ONE_IDLE], SCENES[IDLE]),
+    "the simulated hand": (SCENES[HOLDING], TimedScene(alter=_as_it_is)),
+    "the object's taper": (
+        TimedScene(alter=_as_it_is),
+        TimedScene({"simulation": {"object_shape": "wedge"}}, alter=_as_it_is),
+    ),
+}
+# The same of the first start: words for `softfinger compile`, with and without.
+STARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "no blur": ((), ("--set", "tactile.blur=0.5e-3")),
+    "a modulus that is constant": (("--set", "material.law=constant"), ()),
+    "a finger": (("--set", "scene.fingers=['left']"), ()),
+    "the simulated hand": (("--config", "hil"), ()),
+    "no sensors": (("--set", "tactile.backend=none"), ()),
+    "no servos": (("--set", "servos.backend=none"), ()),
+    "kernels of other scenes": ((), ("--all",)),
 }
 
 
 def measure(brief: bool = False, rounds: int = 1000) -> list[Report]:
-    """All scenes and steps in turns."""
-    scenes = SCENES | {f"without: {name}": scene for name, (_, scene) in STEPS.items()}
+    """All scenes and steps in turns; unless ``brief`` the first starts, several minutes."""
+    scenes = dict(SCENES)
+    for name, (base, without) in STEPS.items():
+        scenes |= {f"with {name}": base, f"without {name}": without}
+    same = {id(scene): name for name, scene in scenes.items()}  # each is measured once
     with contextlib.ExitStack() as stack:
-        subjects = {name: _subject(scene, stack) for name, scene in scenes.items()}
+        subjects = {name: ticking(scenes[name], stack) for name in dict.fromkeys(same.values())}
         times = interleave(subjects, 100 if brief else rounds)
-    costs = [figure(name, "µs", 1e-3 * times[name]) for name in SCENES]
-    savings = []
-    for name, (base, _) in STEPS.items():
-        savings.append(saving(name, 1e-3 * times[base], 1e-3 * times[f"without: {name}"]))
-    return [Report("mean tick of each scene", costs), Report("skipping step, µs a tick", savings)]
+    taken = {name: 1e-3 * times[same[id(scene)]] for name, scene in scenes.items()}
+    costs = [figure(name, "µs", taken[name]) for name in SCENES]
+    savings = [saving(name, taken[f"with {name}"], taken[f"without {name}"]) for name in STEPS]
+    tables = [Report("mean tick", costs), Report("skipped, µs a tick", savings)]
+    if not brief:
+        words = dict.fromkeys(word for pair in STARTS.values() for word in pair)
+        starts = {each: first_start(*each) for each in words}
+        rows = []
+        for name, (some, more) in STARTS.items():
+            (wall, busy), (wall_more, busy_more) = starts[some], starts[more]
+            row = {
+                "name": name,
+                "with s": wall,
+                "without s": wall_more,
+                "saves s": wall_more - wall,
+            }
+            rows.append(row | {"of processor time, s": busy_more - busy})
+        tables.append(Report("skipped, s of the first start", rows))
+    return tables
 
 
-def _subject(scene: TimedScene, stack: contextlib.ExitStack) -> Subject:
-    topics = [scene.topic] if scene.topic else []
-    daemon = stack.enter_context(virtual_daemon(scene.sections, *topics))
+def ticking(scene: TimedScene, stack: contextlib.ExitStack) -> Subject:
+    """The ticks of a daemon that stands until ``stack`` is closed. Raises RigError."""
+    daemon = stack.enter_context(
+        virtual_daemon(scene.sections, *scene.topics, subscribers=scene.subscribers)
+    )
     loop, clock = daemon.loop, daemon.clock
     if scene.holds:
         hold(daemon)
     elif daemon.settings.servos.backend == "none":
         loop.advance(4.0)  # until the object has been pressed on a tip
         if not any(contact.contact for contact in loop.state.contacts):
-            raise RuntimeError("no tip was touched")
+            raise RigError("no tip was touched")
     else:
         loop.advance(1.0)
     scene.alter(daemon)
@@ -161,7 +193,7 @@ def _subject(scene: TimedScene, stack: contextlib.ExitStack) -> Subject:
             clock.sleep_until(clock.now() + loop.period)
             loop.tick(clock.now())
         if loop.state.mode != mode:
-            raise RuntimeError(f"{mode} became {loop.state.mode}: {loop.state.fault}")
+            raise RigError(f"{mode} became {loop.state.mode}: {loop.state.fault}")
 
     return Subject(run, _TICKS)
 
@@ -180,3 +212,16 @@ def saving(name: str, with_it: NDArray[np.float64], without: NDArray[np.float64]
         "±": error,
         "measurable": middle > _SURE * error,
     }
+
+
+def first_start(*words: str) -> tuple[float, float]:
+    """Seconds that all kernels of a scene take to compile, by the clock and of processors."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"XDG_CACHE_HOME": folder}
+        environment.pop("NUMBA_CACHE_DIR", None)
+        spent, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+        command = [*SOFTFINGER, "compile", *words]
+        subprocess.run(command, env=environment, check=True, capture_output=True)
+        wall, total = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = total.ru_utime + total.ru_stime - spent.ru_utime - spent.ru_stime
+    return wall, busy

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,13 +16,13 @@ from typing import NamedTuple
 
 import zmq
 
-from softfinger.tools.benchmarks.framework.report import Report, figure
-
-TITLE = "start to the first state"
-PAGE = {TITLE: ("time", "daemon's peak memory")}
+from softfinger.tools.benchmarks.measuring import Report, figure
+from softfinger.tools.benchmarks.rigs import SOFTFINGER
 
 
-class _Start(NamedTuple):
+class Start(NamedTuple):
+    """What one start took."""
+
     seconds: float
     daemon: float  # MB
     worker: float  # MB
@@ -32,24 +31,30 @@ class _Start(NamedTuple):
 def measure(brief: bool = False) -> list[Report]:
     """Seconds to the first ``hand/state`` of the built-in simulated hand, and what it takes."""
     with tempfile.TemporaryDirectory() as name:
-        cold = _start(Path(name))
-        warm = [_start(Path(name)) for _ in range(2 if brief else 5)]
+        cold = start(Path(name))
+        warm = [start(Path(name)) for _ in range(2 if brief else 5)]
         kept = sum(file.stat().st_size for file in Path(name, "softfinger").rglob("*"))
-    rows = [
-        figure("time, cold kernel cache", "s", [cold.seconds], aim=15.0),
-        figure("time, warm kernel cache", "s", [each.seconds for each in warm], aim=0.8),
-        figure("daemon's peak memory, cold", "MB", [cold.daemon], aim=300.0),
-        figure("daemon's peak memory, warm", "MB", [each.daemon for each in warm], aim=150.0),
-        figure("a compiling process's peak memory", "MB", [cold.worker]),
-        figure("kept on disk", "MB", [kept / 1e6]),
+    seconds = [
+        figure("cold kernel cache", "s", [cold.seconds], aim=15.0),
+        figure("warm kernel cache", "s", [each.seconds for each in warm], aim=0.8),
     ]
-    return [Report(TITLE, rows)]
+    memory = [
+        figure("daemon's peak, cold", "MB", [cold.daemon], aim=300.0),
+        figure("daemon's peak, warm", "MB", [each.daemon for each in warm], aim=150.0),
+        figure("a compiling process's peak", "MB", [cold.worker]),
+        figure("kernels on disk", "MB", [kept / 1e6]),
+    ]
+    return [
+        Report("start to the first state", seconds, page=("",)),
+        Report("memory", memory, page=("daemon",)),
+    ]
 
 
-def _start(folder: Path) -> _Start:
+def start(folder: Path, *words: str) -> Start:
+    """One start with this folder for kernels and tables; ``words`` go to ``softfinger run``."""
     stream = f"ipc://{folder}/stream"
-    words = ["--set", f"stream.address={stream}"]
-    words += ["--set", f"commands.address=ipc://{folder}/commands"]
+    addresses = {"stream.address": stream, "commands.address": f"ipc://{folder}/commands"}
+    words += tuple(w for key, value in addresses.items() for w in ("--set", f"{key}={value}"))
     environment = os.environ | {"XDG_CACHE_HOME": str(folder)}
     for each in ("NUMBA_CACHE_DIR", "PYTHONDONTWRITEBYTECODE"):  # a user has neither
         environment.pop(each, None)
@@ -61,9 +66,7 @@ def _start(folder: Path) -> _Start:
         socket.connect(stream)
         before = time.perf_counter()
         process = subprocess.Popen(
-            [sys.executable, "-m", "softfinger", "run", *words],
-            env=environment,
-            stderr=subprocess.DEVNULL,
+            [*SOFTFINGER, "run", *words], env=environment, stderr=subprocess.DEVNULL
         )
         largest = 0.0
         try:
@@ -71,7 +74,7 @@ def _start(folder: Path) -> _Start:
                 if process.poll() is not None:
                     raise RuntimeError(f"the daemon ended with status {process.returncode}")
                 largest = max([largest, *map(_peak, _children(process.pid))])
-            return _Start(time.perf_counter() - before, _peak(process.pid), largest)
+            return Start(time.perf_counter() - before, _peak(process.pid), largest)
         finally:
             process.terminate()
             process.wait()

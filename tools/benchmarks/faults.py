@@ -1,0 +1,531 @@
+"""Campaign: each fault many times on an emulated hand and its daemon, each trial seeded.
+
+For each: the safe state and the time to it, the fault's name, goals within their limits on the
+servos' wire (by the emulated hand's own record), no crash, no hang, and a hand that grips again. A
+trial that went otherwise than expected while other programs held the processors is done again and
+counted as disturbed; what must never be is never excused by that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import random
+import resource
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import msgpack
+import numpy as np
+import zmq
+
+from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.benchmarks.measuring import Report, Row
+from softfinger.tools.benchmarks.rigs import Rig, RigError, stopped
+
+Inject = Callable[[Rig, random.Random], AbstractContextManager[None]]
+# works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints
+# stay where they are, without a fault. dies: the daemon is gone, the servos stop by themselves.
+# stops: `stop` is sent, and no motor is driven in time, with a fault or without.
+Expect = Literal["works", "fault", "either", "lets go", "dies", "stops"]
+
+_TRIALS = 100
+_SHOWN = 5  # failures that are listed of each case
+_GIVE_UP = 3  # trials in a row whose set-up failed
+_SLACK = 0.05  # s that a look may come after what it sees, and a process be late
+_WAITED = 0.015  # s between two looks that others took: what is late then is theirs
+_RESOLUTION = 0.0016  # rad, a count of the servo's
+_CURRENT_UNIT = 0.0027  # A
+_READY_WITHIN = 15.0  # s
+_PLACE_AFTER = 5.0  # s without a grip: the object has slipped away, and is put back
+_TRIPPED = 0.7  # s in which the daemon finds that a servo was stopped
+_TRIES = 5
+_ASKEW = 0.07  # rad between the faces that the tips feel, above which an object is put upright
+_GRIPPING = ("grasping", "holding", "rotating")
+_TURN = 0.08  # rad
+
+# The cases
+
+_SETTINGS = Settings()
+_WATCHDOG = _SETTINGS.servos.watchdog + 0.02  # the servo counts in steps of 20 ms
+_AT_ONCE = 0.03
+_SILENT = _SETTINGS.servos.fault_after + _AT_ONCE
+_FRAMES = _SETTINGS.safety.frame_age_fault / 100.0 + 0.01 + _AT_ONCE  # of a board of 100 Hz
+_FROZEN = _SETTINGS.safety.frozen_after + 0.05  # judged in turn
+_STOP = 0.2  # s from a stop to no motor driven, whatever gets lost
+_SAME = 0.3  # s in which a hand that holds may send the same goal, of which none is missed
+_FLOODERS = 4
+_HARMLESS = ("status", "status", "clear", "arm", "tare")  # none moves a hand that holds
+_ROOM = 1 << 18  # bytes that a daemon without memory may still take
+_JUDGED = 0.1  # s: a row that is judged in turn and must stand for half of that
+
+
+@dataclass(frozen=True)
+class FaultCase:
+    """One kind of fault, injected into a hand that grips."""
+
+    name: str
+    expect: Expect
+    inject: Inject
+    names: tuple[str, ...] = ()  # of the fault that may latch
+    within: float = 0.0  # s in which no motor must be driven any more, where it faults
+    lasts: float = 3.0  # s, at most, that it is looked at
+    holding_only: bool = False  # the hand must hold; else it may be closing or turning, too
+
+
+def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
+    """Words for the emulated hand that begin the fault and end it; ``{}`` is one of ``places``."""
+
+    @contextlib.contextmanager
+    def inject(rig: Rig, chance: random.Random) -> Iterator[None]:
+        place = chance.choice(places)
+        rig.send(begin.format(place))
+        try:
+            yield
+        finally:
+            if end:
+                rig.send(end.format(place))
+
+    return inject
+
+
+_servo = partial(_sent, places=(1, 2))
+
+
+def _board(begin: str, end: str = "{}:well") -> Inject:
+    return _sent(begin, end, places=("left", "right"))
+
+
+@contextlib.contextmanager
+def _killed(rig: Rig, chance: random.Random) -> Iterator[None]:
+    rig.end_daemon(signal.SIGKILL)
+    try:
+        yield
+    finally:
+        rig.start_daemon()
+
+
+def _stood_still(seconds: float) -> Inject:
+    """The daemon's process is stopped for so long, then goes on."""
+
+    @contextlib.contextmanager
+    def inject(rig: Rig, chance: random.Random) -> Iterator[None]:
+        assert rig.daemon is not None
+        rig.daemon.send_signal(signal.SIGSTOP)
+        timer = threading.Timer(seconds, rig.daemon.send_signal, (signal.SIGCONT,))
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.join()
+
+    return inject
+
+
+@contextlib.contextmanager
+def _flooded(rig: Rig, chance: random.Random) -> Iterator[None]:
+    """Clients send as fast as they can what doesn't move a hand that holds; none reads a reply."""
+    ending = threading.Event()
+    packed = [msgpack.packb({"command": chance.choice(_HARMLESS)}) for _ in range(64)]
+
+    def send() -> None:
+        sockets = [rig.context.socket(zmq.DEALER) for _ in range(_FLOODERS)]
+        for each in sockets:
+            each.setsockopt(zmq.LINGER, 0)
+            each.connect(rig.commands)
+        while not ending.wait(0.001):  # the interpreter is shared with the trial's own looks
+            for each in sockets:
+                with contextlib.suppress(zmq.Again):
+                    for payload in packed:
+                        each.send_multipart([b"", payload], zmq.NOBLOCK)
+        for each in sockets:
+            each.close()
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        sender.join()
+
+
+@contextlib.contextmanager
+def _without_memory(rig: Rig, chance: random.Random) -> Iterator[None]:
+    """The daemon may take next to no address space any more, and is asked meanwhile."""
+    assert rig.daemon is not None
+    process = rig.daemon.pid
+    _, hard = resource.prlimit(process, resource.RLIMIT_AS)
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[0])
+    resource.prlimit(process, resource.RLIMIT_AS, (pages * resource.getpagesize() + _ROOM, hard))
+    try:
+        for _ in range(5):
+            rig.status()
+            time.sleep(chance.uniform(0.0, 0.02))
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            resource.prlimit(process, resource.RLIMIT_AS, (hard, hard))
+
+
+_works = partial(FaultCase, expect="works", lasts=0.3)
+_fault = partial(FaultCase, expect="fault")
+_silent = partial(_fault, names=("servos.silent",), within=_SILENT)
+_blind = partial(_fault, names=("tactile.silent",), within=_FRAMES)
+_MISREAD = ("tactile.silent", "tip.force", "tip.displacement", "tip.tilt", "hand.angle",
+            "hand.width")  # fmt: skip
+
+CASES: tuple[FaultCase, ...] = (
+    *(
+        (_silent if share == 1.0 and kind != "duplicate" else _works)(
+            f"replies {name}, {share:.0%}", inject=_sent(f"{kind}={share}")
+        )
+        for kind, name in (("drop", "dropped"), ("late", "late"), ("corrupt", "corrupted"),
+                           ("truncate", "truncated"), ("duplicate", "doubled"))
+        for share in (0.01, 0.1, 1.0)
+    ),
+    _fault("one servo silent", inject=_servo("silent={}", "answer={}"), names=("servos.silent",),
+           within=_WATCHDOG),
+    _silent("one servo rebooted", inject=_servo("reboot={}", "")),
+    *(
+        _fault(f"one servo {name}", inject=_servo(f"{kind}={{0}}", "recover={0} reboot={0}"),
+               names=("servos.alert", *more), within=_SILENT)
+        for kind, name, more in (("overheat", "overheated", ("servos.temperature",)),
+                                 ("overload", "overloaded", ()),
+                                 ("undervoltage", "without supply", ("servos.voltage",)))
+    ),
+    *(
+        _fault(f"one servo's {name}", inject=_servo(f"{kind}={{}}", "recover={}"), names=(latched,),
+               within=within)
+        for kind, name, latched, within in (
+            ("stuck", "encoder stuck", "joint.dead",
+             0.05 / _SETTINGS.control.approach_speed + _JUDGED),
+            ("jump", "encoder jumped", "joint.jump", _AT_ONCE),
+            ("frozen", "readings frozen", "servos.frozen", 0.12 + _AT_ONCE),
+            ("refuse", "readings refused", "servos.silent", _SILENT),
+        )
+    ),
+    _fault("writes lost, 100%", inject=_sent("lose-writes=1"), names=("goal.lost",),
+           within=_SAME + 0.05 + _STOP),
+    *(FaultCase(f"stop, {share:.0%} lost each way", "stops", _sent(f"lose={share} drop={share}"),
+           within=_STOP) for share in (0.0, 0.5, 0.9)),
+    FaultCase("stop, writes lost", "stops", _sent("lose-writes=1"), within=_STOP),
+    _fault("servos' port gone and back", inject=_sent("unplug", "plug"), names=("servos.bus",),
+           within=_WATCHDOG),
+    *(_blind(f"board {name}", inject=_board(f"{{}}:{words}"))
+      for name, words in (("silent", "silent"), ("noisy, 100%", "noisy=1"),
+                          ("torn, 100%", "torn=1"), ("of the wrong size", "wrong-size"))),
+    _blind("board's port gone and back", inject=_board("{}:unplug", "{}:plug")),
+    _fault("board frozen", inject=_board("{}:frozen"), names=("tactile.frozen",), within=_FROZEN,
+           holding_only=True),
+    _fault("board saturated", inject=_board("{}:saturated"), names=_MISREAD[:3], within=_FRAMES),
+    FaultCase("board noisy, 10%", "either", _board("{}:noisy=0.1"), _MISREAD, 0.5, 0.5, True),
+    FaultCase("board torn, 10%", "either", _board("{}:torn=0.1"), ("tactile.silent",), 0.5, 0.5),
+    FaultCase("board zero", "lets go", _board("{}:zero"), lasts=0.4, holding_only=True),
+    FaultCase("daemon killed", "dies", _killed, within=_WATCHDOG),
+    # As long as a servo's reading may be old: the first one after it decides.
+    FaultCase("daemon stood still for 50 ms", "either", _stood_still(0.05), ("servos.silent",), _SILENT,
+         0.3),
+    _fault("daemon stood still for 2 s", inject=_stood_still(2.0),
+           names=("servos.bus", "servos.silent", "tactile.silent"), within=_WATCHDOG, lasts=4.0),
+    _works("command flood", inject=_flooded),
+    _works("daemon without memory", inject=_without_memory),
+)  # fmt: skip
+NAMES = tuple(case.name for case in CASES)
+
+
+# The campaign
+
+
+@dataclass
+class Trial:
+    """What came of one injection."""
+
+    seed: int
+    phase: str = ""
+    fault: str = ""  # its name
+    fault_s: float = math.nan  # until the daemon published it
+    safe_s: float = math.nan  # until no motor was driven any more
+    waited_s: float = 0.0  # longest between two looks that others had the processor
+    wrong: str = ""  # what must never be
+    missed: str = ""  # what was not as expected, and may be the busy machine's doing
+
+    @property
+    def disturbed(self) -> bool:
+        """Not as expected, while other processes held this one up: no measurement."""
+        return bool(self.missed) and not self.wrong and self.waited_s > _WAITED
+
+    @property
+    def failure(self) -> str:
+        """What was not as it must be, with the phase."""
+        text = self.wrong or self.missed
+        return f"{self.phase}: {text}" if text else ""
+
+
+def measure(trials: int | None = None, only: str = "") -> list[Report]:
+    """Every fault whose name ``only`` is found in."""
+    rows, notes, failed = [], [], False
+    with Rig() as rig:
+        for case in CASES:
+            if only not in case.name:
+                continue
+            found, disturbed = run_trials(trials or _TRIALS, partial(trial, rig, case))
+            row = summary(case, found, disturbed)
+            print(f"{case.name}: {row['passed']} of {row['trials']}", file=sys.stderr, flush=True)
+            rows.append(row)
+            wrong = [f"seed {each.seed}, {each.failure}" for each in found if each.failure]
+            notes += [f"  {case.name}, {failure}" for failure in wrong[:_SHOWN]]
+            failed = failed or bool(wrong)
+    return [Report("fault", rows, notes=tuple(notes), failed=failed)]
+
+
+def run_trials(trials: int, one: Callable[[int], Trial]) -> tuple[list[Trial], int]:
+    """``trials`` of ``one(seed)`` that count, and how many were disturbed and made again.
+
+    That many may be made again at most. A RigError is a failed trial; three in a row end the case.
+    """
+    found: list[Trial] = []
+    disturbed = in_a_row = seed = 0
+    while len(found) < trials and in_a_row < _GIVE_UP:
+        seed += 1
+        try:
+            each, in_a_row = one(seed), 0
+        except RigError as error:
+            each, in_a_row = Trial(seed, wrong=f"the set-up failed: {error}"), in_a_row + 1
+        if each.disturbed and disturbed < trials:
+            disturbed += 1
+        else:
+            found.append(each)
+    return found, disturbed
+
+
+def summary(case: FaultCase, found: list[Trial], disturbed: int) -> Row:
+    """Counts, and times [ms] of those trials that have them: median and greatest."""
+    passed, count = sum(not each.failure for each in found), len(found)
+    row: Row = {
+        "name": case.name,
+        "expected": case.expect,
+        "passed": passed,
+        "trials": count,
+        "failures, 95 % below": min(upper_bound(count - passed, count), 1.0),
+        "disturbed": disturbed,
+    }
+    for key, times in (
+        ("fault ms", [each.fault_s for each in found]),
+        ("motors off ms", [each.safe_s for each in found]),
+    ):
+        seen = 1e3 * np.array([time for time in times if np.isfinite(time)])
+        row[key] = float(np.median(seen)) if seen.size else None
+        row[f"{key} at most"] = float(seen.max()) if seen.size else None
+    row["allowed ms"] = 1e3 * case.within if case.expect in ("fault", "dies", "stops") else None
+    counts = Counter(each.fault for each in found if each.fault)
+    row["faults"] = ", ".join(f"{fault} {count}" for fault, count in counts.items())
+    return row
+
+
+def upper_bound(count: int, trials: int) -> float:
+    """The rate at which ``count`` events or fewer in ``trials`` are 5 % likely.
+
+    Poisson's bound by the χ² quantile in Wilson and Hilferty's form: within 1 % from one event on,
+    and −ln 0.05 events for none.
+    """
+    if count == 0:
+        return -math.log(0.05) / trials
+    k = count + 1.0
+    return k * (1.0 - 1.0 / (9.0 * k) + 1.6449 / (3.0 * math.sqrt(k))) ** 3 / trials
+
+
+def trial(rig: Rig, case: FaultCase, seed: int) -> Trial:
+    """Inject once. Raises RigError when the set-up itself fails."""
+    chance = random.Random(f"{case.name} {seed}")
+    found = Trial(seed)
+    rig.start()
+    _grip(rig, case, chance, found)
+    with case.inject(rig, chance):
+        _look(rig, case, found)
+    judge_wire(rig, found)
+    if not rig.alive:
+        status = None if rig.daemon is None else rig.daemon.returncode
+        found.wrong = f"the daemon ended with {status}: {' | '.join(rig.log()[-2:])}"
+    elif rig.status(2.0) is None:
+        found.wrong = "the daemon does not answer"
+    judge(case, found)
+    stays = case.expect == "works" and not found.failure
+    if not stays and not _ready(rig, chance):
+        found.wrong = found.wrong or f"no working hand afterwards: {rig.status()}"
+        _start_anew(rig)
+    return found
+
+
+def _grip(rig: Rig, case: FaultCase, chance: random.Random, found: Trial) -> None:
+    """A hand that grips, and an empty record. Raises RigError when that can't be had."""
+    for attempt in range(_TRIES):
+        if not _ready(rig, chance):
+            if attempt:
+                raise RigError(f"the hand does not grip: {rig.status()}")
+            _start_anew(rig)
+            continue
+        if not _upright(rig):
+            _place(rig)
+            continue
+        found.phase = "holding" if case.holding_only else chance.choice(_GRIPPING)
+        if found.phase == "grasping":
+            rig.ask({"command": "grasp", "force": chance.uniform(4.0, 9.0)})
+        elif found.phase == "rotating":
+            rig.ask({"command": "rotate", "angle": chance.uniform(-_TURN, _TURN)})
+        time.sleep(chance.uniform(0.0, 0.02))
+        rig.states(0.0)
+        rig.waited()
+        # A busy machine may have let a servo's watchdog act already; then once more.
+        if not any(servo["stopped_by_watchdog"] for servo in rig.report("forget")["servos"]):
+            return
+        time.sleep(_TRIPPED)
+    raise RigError("the servos' watchdogs stop them again and again")
+
+
+def _ready(rig: Rig, chance: random.Random) -> bool:
+    """Clear, arm and grasp until the hand holds; False when it does not.
+
+    An object that slipped out of the fingers, or turned over between them, is put back in between,
+    as a person would do.
+    """
+    begin = now = time.monotonic()
+    place = begin + _PLACE_AFTER
+    grasp = {"command": "grasp", "force": chance.uniform(4.0, 9.0)}
+    requests: dict[str, dict[str, Any]]
+    requests = {"fault": {"command": "clear"}, "disarmed": {"command": "arm"}, "armed": grasp}
+    while now < begin + _READY_WITHIN and rig.alive:
+        mode = (rig.status(2.0) or {"mode": ""})["mode"]
+        with contextlib.suppress(NoAnswer):
+            if mode == "holding":
+                return True
+            if now > place:
+                place = now + _PLACE_AFTER
+                _place(rig)
+            elif mode in requests:
+                rig.ask(requests[mode], 5.0)
+        time.sleep(0.01)
+        now = time.monotonic()
+    return False
+
+
+def _upright(rig: Rig) -> bool:
+    """Whether both tips feel opposite faces: a grip on an edge would end in a fault of its own."""
+    states = rig.states(0.1)
+    if not states:
+        return False
+    left, right = states[-1]["left"], states[-1]["right"]
+    apart = (left["theta"] - left["q"]) - (right["theta"] + right["q"])
+    return bool(abs(apart + rig.settings.object.taper) < _ASKEW)
+
+
+def _place(rig: Rig) -> None:
+    """Put the object back, between open fingers where they can be opened."""
+    end = time.monotonic() + 2.0
+    if rig.ask({"command": "release"})["ok"]:
+        while (status := rig.status()) and status["mode"] == "releasing":
+            if time.monotonic() > end:
+                break
+            time.sleep(0.01)
+    rig.send("place")
+
+
+def _start_anew(rig: Rig) -> None:
+    rig.end_daemon()
+    rig.end_hand()
+    rig.start()
+
+
+def _look(rig: Rig, case: FaultCase, found: Trial) -> None:
+    """Watch states and wire until it is clear what comes of the fault, or it has lasted."""
+    begin = now = time.monotonic()
+    modes = set()
+    if case.expect == "stops":
+        with contextlib.suppress(NoAnswer):
+            rig.ask({"command": "stop"})
+    while now < begin + case.lasts:
+        for state in rig.states():
+            t = state["mono_ns"] * 1e-9
+            if state["fault"] and not found.fault and t > begin - 0.1:
+                found.fault, found.fault_s = state["fault_name"], t - begin
+            modes.add(state["mode"])
+            judge_age(rig, state, found)
+        report = rig.report()
+        if stopped(report) and math.isnan(found.safe_s):
+            found.safe_s = report["monotonic"] - begin
+        found.waited_s = max(found.waited_s, rig.waited())
+        safe = not math.isnan(found.safe_s)
+        if safe and (found.fault or case.expect in ("dies", "stops")):
+            return
+        if case.expect == "lets go" and "armed" in modes:
+            return
+        now = time.monotonic()
+    if case.expect == "lets go":
+        found.missed = f"the joints did not stay where they were: {', '.join(sorted(modes))}"
+
+
+def judge_age(rig: Rig, state: dict[str, Any], found: Trial) -> None:
+    """Torque never on in a grip on frames older than their limit."""
+    if not state["torque"] or state["fault"] or state["mode"] not in _GRIPPING:
+        return
+    settings = rig.settings
+    most = settings.safety.frame_age_fault / settings.tactile.rate
+    most += settings.simulation.tactile_delay + settings.tactile.latency + 0.01
+    for side in ("left", "right"):
+        age = state[side]["frame_age_s"]
+        if age > most:
+            found.wrong = f"{state['mode']} on a frame {age:.3f} s old"
+
+
+def judge_wire(rig: Rig, found: Trial) -> None:
+    """No goal outside its limits, no torque without packets, none switched on far from its goal.
+
+    Judged from the emulated hand's record with arithmetic of its own.
+    """
+    settings = rig.settings
+    hand, most = settings.hand, settings.safety.current_max + _CURRENT_UNIT
+    for i, servo in enumerate(rig.report()["servos"]):
+        q, current = servo["goal_q"], servo["goal_current"]
+        low, high = hand.q_min[i] - _RESOLUTION, hand.q_max[i] + _RESOLUTION
+        if q is not None and not (low <= q[0] and q[-1] <= high):
+            found.wrong = f"goal angles {q} rad on the wire"
+        if current is not None and not all(abs(each) <= most for each in current):
+            found.wrong = f"goal currents {current} A on the wire"
+        if servo["torque_on"]["far"]:
+            found.wrong = f"torque on {servo['torque_on']['farthest']:.3f} rad off its goal"
+        quiet, limit = servo["longest_quiet"], settings.servos.watchdog + 0.02
+        if quiet > limit + _SLACK and not servo["watchdog_fired"]["count"]:
+            found.wrong = f"torque on for {quiet:.3f} s without a packet"
+        if servo["goals_refused"] and not servo["watchdog_fired"]["count"]:
+            found.wrong = f"{servo['goals_refused']} goals that the servo refused"
+
+
+def judge(case: FaultCase, found: Trial) -> None:
+    """What was expected, and in time."""
+    safe = not math.isnan(found.safe_s)
+    if case.expect in ("works", "lets go"):
+        if found.fault:
+            found.missed = f"{found.fault} after {found.fault_s:.3f} s"
+        elif safe:
+            found.missed = f"no motor was driven after {found.safe_s:.3f} s"
+        return
+    if case.expect == "either" and not found.fault:
+        return
+    if not found.fault and case.expect == "fault":
+        found.missed = "no fault"
+    elif found.fault and case.expect != "stops" and found.fault not in case.names:
+        found.missed = f"{found.fault} instead of {' or '.join(case.names)}"
+    elif not safe:
+        found.missed = "motors were driven on"
+    elif not found.safe_s <= case.within + _SLACK:
+        found.missed = f"motors driven for {found.safe_s:.3f} s, {case.within:.3f} s allowed"

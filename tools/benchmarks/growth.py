@@ -1,0 +1,142 @@
+"""How cost and error grow: with cells, tolerance, subscribers, sensors and rate.
+
+Each table is of one run in turns, and ends with the fitted slopes: the exponent of a power law over
+all points, and between the last two, which shows where it bends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from softfinger.kinematics.contact.lookup import TableError
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks import contact, estimator
+from softfinger.tools.benchmarks.estimator import ERROR, LINEAR, NOISE, TIP, TRUTH, WIDTH
+from softfinger.tools.benchmarks.measuring import (
+    Report,
+    Row,
+    Subject,
+    figure,
+    interleave,
+    slopes,
+    timed,
+)
+from softfinger.tools.benchmarks.scenes import TimedScene, ticking
+
+_SIDES = (8, 16, 32, 44, 64, 96, 128)  # cells
+_PITCH = WIDTH / 44
+_TOLERANCES = tuple(10.0**-k for k in range(3, 14))
+_SUBSCRIBERS = (0, 1, 3, 10, 30, 100)
+_RATES = (100.0, 200.0, 500.0, 1000.0, 2000.0)  # Hz
+_FRAMES = 32
+
+
+def measure(brief: bool = False) -> list[Report]:
+    """Cells, tolerance, and what a tick costs; ``brief`` takes every other point."""
+    step, rounds = (2, 5) if brief else (1, 25)
+    return [
+        *cells(_SIDES[::step], rounds),
+        *tolerances(_TOLERANCES[::step], rounds),
+        *tick(step, 10 * rounds),
+    ]
+
+
+def _grown(title: str, rows: list[Row], x: str) -> Report:
+    return Report(title, rows, x, notes=slopes(rows, x), grows=True)
+
+
+def cells(sides: tuple[int, ...], rounds: int) -> list[Report]:
+    """Time and error of an estimate, and of decoding, at the same sensor size and at one pitch."""
+    x = "cells a side"
+    random = np.random.default_rng(4)
+    cases = {}
+    limits = {}
+    for n in sides:
+        noise = NOISE * random.standard_normal((_FRAMES, n, n))
+        for name, pitch in (("same size", WIDTH / n), ("same pitch", _PITCH)):
+            grid = SensorGrid(n, n, pitch)
+            frames = grid.pressure(TIP, LINEAR, *TRUTH) + noise
+            for words, cold in (("warm", False), ("cold", True)):
+                case = estimator.kernel_case(frames, TRUTH, grid=grid, cold=cold)
+                cases[f"{words}; {name}: {n}"] = case, n
+            empty = replace(estimator.kernel_case(noise, TRUTH, grid=grid), found=None)
+            cases[f"no contact; {name}: {n}"] = empty, n
+            sigma = estimator.bound(estimator.jacobian(grid, (*TRUTH, 1.0)), NOISE)[0, 0]
+            limits[f"warm; {name}: {n}"] = 1e6 * math.sqrt(sigma)
+        cases[f"decode: {n}"] = estimator.Timed(estimator.decode("cobs", frames)), n
+    times = interleave({name: case.subject for name, (case, _) in cases.items()}, rounds)
+    rows, errors = [], []
+    for name, (case, n) in cases.items():
+        rows.append(figure(name, "µs", 1e-3 * times[name], **{x: n}))
+        if name in limits:
+            error = figure(name, "µm", [case.errors[ERROR]], **{x: n})
+            errors.append(error | {"Cramér-Rao bound": limits[name]})
+    return [_grown("a frame of n × n cells", rows, x), _grown("RMS of d", errors, x)]
+
+
+def tolerances(wanted: tuple[float, ...], rounds: int) -> list[Report]:
+    """A table's lookup time, size and build time."""
+    x = "tolerance"
+    d, theta = contact.points(512)
+    built: dict[float, ContactTable] = {}
+    builds: list[Row] = []
+
+    for tolerance in wanted:
+        build = partial(ContactTable.build, TIP, contact.LAW, tolerance)
+        try:
+            built[tolerance] = build()
+        except TableError:  # not within 256 KiB
+            continue
+        spent = 1e-6 * np.array(timed(build, 3))
+        builds.append(figure(f"build: {tolerance:g}", "s", spent, **{x: tolerance}))
+    subjects = {
+        f"lookup: {t:g}": Subject(partial(contact.loop, table, d, theta), d.size)
+        for t, table in built.items()
+    }
+    times = interleave(subjects, rounds)
+    lookups = [
+        figure(f"lookup: {t:g}", "ns", times[f"lookup: {t:g}"], **{x: t, "bound": table.max_error})
+        for t, table in built.items()
+    ]
+    sizes = [
+        figure(f"size: {t:g}", "KiB", [table.data.nbytes / 1024], **{x: t})
+        for t, table in built.items()
+    ]
+    named = (("lookup", lookups), ("table's size", sizes), ("table's build", builds))
+    return [_grown(title, rows, x) for title, rows in named]
+
+
+def tick(step: int, rounds: int) -> list[Report]:
+    """The mean tick of a hand that holds, on canned readings, but without sensors idle."""
+    scenes: dict[str, dict[float, TimedScene]] = {
+        "subscribers": {
+            n: TimedScene(topics=("hand",), subscribers=n) for n in _SUBSCRIBERS[::step]
+        },
+        "sensors": {
+            0: TimedScene({"tactile": {"backend": "none"}}, holds=False),
+            1: TimedScene({"scene": {"fingers": ("left",)}}, holds=False),
+            2: TimedScene(holds=False),
+        },
+        "rate [Hz]": {
+            rate: TimedScene({"loop": {"rate": rate}}, topics=("hand",)) for rate in _RATES[::step]
+        },
+    }
+    tables = []
+    for x, of_x in scenes.items():
+        with contextlib.ExitStack() as stack:
+            subjects = {f"tick: {value:g}": ticking(s, stack) for value, s in of_x.items()}
+            times = interleave(subjects, rounds)
+        rows = []
+        for name, value in zip(subjects, of_x, strict=True):
+            row = figure(name, "µs", 1e-3 * times[name], **{x: value})
+            if "rate" in x:
+                row["of a processor %"] = 1e-4 * row["median"] * value
+            rows.append(row)
+        tables.append(_grown(f"tick over {x}", rows, x))
+    return tables

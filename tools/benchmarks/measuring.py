@@ -1,0 +1,199 @@
+"""What all measurements share: times in turns, tables of rows, slopes, and what became slower."""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# One measured thing; each key is the heading of its column, "name" the first of them.
+Row = dict[str, Any]
+
+_SLICE_NS = 4e5  # of one repetition: short against the machine's hiccups, long against the clock
+_IN_SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
+_SURE = 3.0  # times its noise by which a median has to rise to be called slower
+_LEAST = 0.05  # share below which no rise is of interest
+_SINGLE = 0.1  # noise of a single sample, as a share; of n samples the n-th part at least
+
+
+@dataclass(frozen=True)
+class Report:
+    """Rows under a title.
+
+    ``x`` names the column that the picture draws the medians against, where there is one, with
+    lines and slopes where ``grows``. ``page`` are the beginnings of the names that the page shows.
+    """
+
+    title: str
+    rows: list[Row]
+    x: str = ""
+    page: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    grows: bool = False
+    failed: bool = False
+
+    @property
+    def on_page(self) -> list[Row]:
+        """The rows that the page shows."""
+        return [row for row in self.rows if str(row["name"]).startswith(self.page or ("\0",))]
+
+    def __str__(self) -> str:
+        """Aligned text; numbers with four digits, nothing for None and NaN."""
+        keys = list(dict.fromkeys(key for row in self.rows for key in row)) or ["name"]
+        lines = [[self.title if key == "name" else key for key in keys]]
+        lines += [[_cell(row.get(key)) for key in keys] for row in self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        words = [any(isinstance(row.get(key), str) for row in self.rows) for key in keys]
+        aligned = [
+            "  ".join(
+                cell.ljust(width) if left else cell.rjust(width)
+                for cell, width, left in zip(line, widths, words, strict=True)
+            ).rstrip()
+            for line in lines
+        ]
+        return "\n".join([*aligned, *self.notes])
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, **more: Any) -> Row:
+    """Median, interquartile range and 99th percentile of samples that are already in ``unit``."""
+    values = np.asarray(samples, dtype=np.float64)
+    low, median, high, p99 = np.percentile(values, [25.0, 50.0, 75.0, 99.0]).tolist()
+    spread = {"median": median, "IQR": high - low, "p99": p99}
+    return {"name": name, **spread, "unit": unit, "aim ≤": aim, "n": int(values.size), **more}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Something to time: ``run(repeat)`` does ``repeat`` × ``calls`` calls."""
+
+    run: Callable[[int], object]
+    calls: int = 1
+
+
+def each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> Subject:
+    """Calls from Python with each of these arguments."""
+
+    def run(repeat: int) -> None:
+        for _ in range(repeat):
+            for one in arguments:
+                call(*one)
+
+    return Subject(run, len(arguments))
+
+
+def interleave(subjects: dict[str, Subject], rounds: int) -> dict[str, NDArray[np.float64]]:
+    """Nanoseconds a call of each subject in each round, float64 [rounds].
+
+    They take turns, so that a slow minute slows all of them. Each is called once before, which
+    compiles it, and then repeated often enough to fill a slice.
+    """
+    repeats = {}
+    for name, subject in subjects.items():
+        subject.run(1)
+        before = time.perf_counter_ns()
+        subject.run(1)
+        spent = max(time.perf_counter_ns() - before, 1)
+        repeats[name] = max(1, round(_SLICE_NS / spent))
+    times = {name: np.empty(rounds) for name in subjects}
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for i in range(rounds):
+            for name, subject in subjects.items():
+                repeat = repeats[name]
+                before = time.perf_counter_ns()
+                subject.run(repeat)
+                spent = time.perf_counter_ns() - before
+                times[name][i] = spent / (repeat * subject.calls)
+    finally:
+        if collecting:
+            gc.enable()
+    return times
+
+
+def timed(call: Callable[[], object], count: int = 1) -> list[float]:
+    """Wall time of each of ``count`` calls [µs]."""
+    samples = []
+    for _ in range(count):
+        before = time.perf_counter_ns()
+        call()
+        samples.append((time.perf_counter_ns() - before) * 1e-3)
+    return samples
+
+
+def yardstick() -> list[float]:
+    """Times [µs] of a fixed piece of work: how fast this machine is just now."""
+    return timed(lambda: sum(i * i for i in range(2000)), 51)
+
+
+def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
+    """How the median of each kind of row grows with its ``x``: a note for each.
+
+    The exponent of a power law, over all points and between the last two, which shows where it
+    bends; time for each more of ``x`` where that begins at 0.
+    """
+    notes = []
+    for name, chosen in by_kind(rows).items():
+        at, median = (np.array([row[key] for row in chosen], float) for key in (x, "median"))
+        if len(chosen) < 2:
+            continue
+        if at.min() <= 0.0:
+            slope = np.polyfit(at, median, 1)[0]
+            notes.append(f"  {name}: {slope:+.3g} {chosen[0]['unit']} for each more of {x}")
+        else:
+            at, median = np.log(at), np.log(median)
+            whole, last = np.polyfit(at, median, 1)[0], np.polyfit(at[-2:], median[-2:], 1)[0]
+            notes.append(f"  {name}: ∝ ({x})^{whole:.2f}, at the end ^{last:.2f}")
+    return tuple(notes)
+
+
+def by_kind(rows: list[Row]) -> dict[str, list[Row]]:
+    """Rows with a median by their kind, which is their name up to the first comma or colon."""
+    kinds: dict[str, list[Row]] = {}
+    for row in rows:
+        if "median" in row:
+            kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
+    return kinds
+
+
+def slower(old: list[Row], new: list[Row]) -> Report:
+    """The times and ratios of ``new`` that rose beyond the noise of both runs.
+
+    Rows are matched by measurement, table and name. Times are taken over their run's own yardstick,
+    so that a slower machine makes nothing slower.
+    """
+
+    def by_key(rows: list[Row]) -> dict[tuple[str, str, str], Row]:
+        chosen = [row for row in rows if row.get("unit") in {*_IN_SECONDS, "×"}]
+        return {(row["measurement"], row["table"], row["name"]): row for row in chosen}
+
+    before, after = by_key(old), by_key(new)
+    rows = []
+    common = [key for key in after if key[2] != "yardstick" and key in before]
+    for key in common:
+        ends = [before[key], after[key]]
+        if min(end["median"] or 0.0 for end in ends) <= 0.0:
+            continue
+        values = [end["median"] * _IN_SECONDS.get(end["unit"], 1.0) for end in ends]
+        if ends[1]["unit"] != "×":
+            sticks = [run[key[0], "", "yardstick"] for run in (before, after)]
+            values = [value / stick["median"] for value, stick in zip(values, sticks, strict=True)]
+            ends += sticks
+        noise = math.hypot(*(max(end["IQR"] / end["median"], _SINGLE / end["n"]) for end in ends))
+        ratio = values[1] / values[0]
+        if ratio > 1.0 + max(_SURE * noise, _LEAST):
+            name = ": ".join(part for part in key if part)
+            rows.append({"name": name, "ratio": ratio, "noise": noise})
+    return Report(f"slower than before, over the yardstick: {len(rows)} of {len(common)}", rows)

@@ -1,0 +1,79 @@
+"""The picture of a run: medians against error or size, or bars, a panel for each table."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from softfinger.tools import style
+from softfinger.tools.benchmarks.measuring import Report, Row, by_kind
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_LONGEST = 46  # characters of a bar's name
+
+
+def draw(reports: list[Report], path: Path) -> None:
+    """A panel for each of ``reports``. Raises MissingExtra without matplotlib."""
+    columns = min(len(reports), 3)
+    rows = math.ceil(len(reports) / columns)
+    looks: dict[str, int] = {}  # of each kind, the same in all panels
+    with style.settings():
+        figure = style.new_figure(4.2 * columns + 0.6, 3.5 * rows + 0.4)
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in panels[len(reports) :]:
+            axes.remove()
+        for axes, report in zip(panels, reports, strict=False):
+            axes.set_title(report.title)
+            if report.x:
+                _points(axes, report, looks)
+            else:
+                _bars(axes, report.rows)
+        style.save(figure, path)
+
+
+def _points(axes: Axes, report: Report, looks: dict[str, int]) -> None:
+    """Run time against ``report.x``; a row without a median is a bound of it."""
+    x = report.x
+    for row in report.rows:
+        if "median" not in row:
+            axes.axvline(row[x], color=style.GREY, linestyle="--", linewidth=1.0)
+    for kind, found in by_kind(report.rows).items():
+        chosen = [row for row in found if row.get(x, math.nan) >= 0.0]  # no NaN
+        if not chosen:
+            continue
+        k = looks.setdefault(kind, len(looks))
+        axes.plot(
+            [row[x] for row in chosen],
+            [row["median"] for row in chosen],
+            linestyle="-" if report.grows else "none",
+            marker=style.MARKERS[k % len(style.MARKERS)],
+            color=style.KINDS[k % len(style.KINDS)],
+            ms=4,
+            label=kind,
+        )
+    scale = "linear" if any(row.get(x) == 0.0 for row in report.rows) else "log"
+    axes.set(xscale=scale, yscale=scale, xlabel=x, ylabel=f"[{report.rows[0]['unit']}]")
+    if not report.grows:
+        axes.set_xlabel(f"{x} (better →)")
+        axes.invert_xaxis()
+    axes.legend(loc="best", fontsize=6)
+
+
+def _bars(axes: Axes, rows: list[Row]) -> None:
+    """Medians, with a tick at the 99th percentile of many samples."""
+    for k, row in enumerate(rows):
+        axes.barh(k, row["median"], color=style.KINDS[0], height=0.6)
+        if row["n"] >= 100:
+            axes.plot(row["p99"], k, "|", color=style.INK, ms=9, mew=1.5)
+        axes.annotate(f" {row['median']:.3g}", (row["median"], k), va="center", fontsize=6)
+    names = [str(row["name"]) for row in rows]
+    short = [name if len(name) <= _LONGEST else name[: _LONGEST - 1] + "…" for name in names]
+    axes.set_yticks(range(len(rows)), short, fontsize=6)
+    axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)
+    tails = any(row["n"] >= 100 for row in rows)
+    axes.set_xlabel(f"median{' and 99th percentile' if tails else ''} [{rows[0]['unit']}]")
+    if max(row["p99"] for row in rows) > 30.0 * min(row["median"] for row in rows):
+        axes.set_xscale("log")
