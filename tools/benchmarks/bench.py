@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.names:
         title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
         print(Report(title, page))
-        shown = [table for table in drawn if table.on_page]
+        shown = [table for table in drawn if len(table.on_page) > 1]
         drawn = [table if table.x else replace(table, rows=table.on_page) for table in shown]
     if arguments.json:
         content = {

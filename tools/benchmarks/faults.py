@@ -234,8 +234,8 @@ CASES: tuple[FaultCase, ...] = (
     FaultCase("board zero", "lets go", _board("{}:zero"), lasts=0.4, holding_only=True),
     FaultCase("daemon killed", "dies", _killed, within=_WATCHDOG),
     # As long as a servo's reading may be old: the first one after it decides.
-    FaultCase("daemon stood still for 50 ms", "either", _stood_still(0.05), ("servos.silent",), _SILENT,
-         0.3),
+    FaultCase("daemon stood still for 50 ms", "either", _stood_still(0.05), ("servos.silent",),
+              _SILENT, 0.3),
     _fault("daemon stood still for 2 s", inject=_stood_still(2.0),
            names=("servos.bus", "servos.silent", "tactile.silent"), within=_WATCHDOG, lasts=4.0),
     _works("command flood", inject=_flooded),

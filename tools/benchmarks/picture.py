@@ -21,6 +21,8 @@ def draw(reports: list[Report], path: Path) -> None:
     rows = math.ceil(len(reports) / columns)
     looks: dict[str, int] = {}  # of each kind, the same in all panels
     with style.settings():
+        from matplotlib.ticker import NullFormatter
+
         figure = style.new_figure(4.2 * columns + 0.6, 3.5 * rows + 0.4)
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in panels[len(reports) :]:
@@ -31,6 +33,8 @@ def draw(reports: list[Report], path: Path) -> None:
                 _points(axes, report, looks)
             else:
                 _bars(axes, report.rows)
+            for axis in (axes.xaxis, axes.yaxis):  # within a decade they would run together
+                axis.set_minor_formatter(NullFormatter())
         style.save(figure, path)
 
 
