@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.names:
         title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
         print(Report(title, page))
-        shown = [table for table in drawn if len(table.on_page) > 1]
+        shown = [table for table in drawn if table.on_page]
         drawn = [table if table.x else replace(table, rows=table.on_page) for table in shown]
     if arguments.json:
         content = {
@@ -155,7 +155,9 @@ def _draw(tables: list[Report], path: Path) -> None:
     for table in tables:
         bars = [row for row in table.rows if row.get("unit") == table.rows[0].get("unit")]
         panels.append(table if table.x else replace(table, rows=bars))
-    draw([panel for panel in panels if any("median" in row for row in panel.rows)], path)
+    panels = [panel for panel in panels if any("median" in row for row in panel.rows)]
+    if panels:
+        draw(panels, path)
 
 
 def _processor() -> str:
