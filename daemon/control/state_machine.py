@@ -263,7 +263,8 @@ class Control:
                 self._lose(dt, goal)
                 return
         self._lost = 0.0
-        self._is_empty(dt)
+        if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
+            self._is_empty(dt)
         if self._by_position:
             goal.q[:] = self._grip.angles(self._pose)
             goal.current[0] = goal.current[1] = self._settings.safety.current_max

@@ -11,15 +11,15 @@ from pathlib import Path
 
 from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
-from softfinger.daemon.diagnosis.ports import check_latency_timer, latency_file
+from softfinger.daemon.diagnosis.ports import check_latency_timer
 from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import Examined, check_angle, examine
+from softfinger.daemon.servos.checks import Examined, examine
 from softfinger.daemon.servos.control_table import ServoModel, by_name
-from softfinger.daemon.servos.joint import JointScale
+from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import open_line
 from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, provision, search
 from softfinger.daemon.types import FINGERS
@@ -59,12 +59,8 @@ def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Resul
     results = [_result("FAIL", each) for each in servo.errors]
     results += [_result("warn", each) for each in servo.notices]
     if servo.table and not servo.errors:
-        low, high = settings.hand.q_min[servo.finger], settings.hand.q_max[servo.finger]
-        position = servo.table.long(reg.PRESENT_POSITION)
-        angle = JointScale.of(settings.servos, servo.finger, model).angle(position)
-        stray = check_angle(name, angle, low, high)
         described = Result("pass", name, _described(servo, model))
-        results.append(described if stray is None else _result("FAIL", stray))
+        results.append(_result("FAIL", servo.stray) if servo.stray else described)
     return results
 
 
@@ -134,11 +130,10 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
     return Result("pass", name, found)
 
 
-def repair_latency_timer(path: str, sysfs: Path | None = None) -> Result | None:
+def repair_latency_timer(path: str, *sysfs: Path) -> Result | None:
     """Set the adapter's latency timer to 1 ms; None when there is nothing to do."""
-    places = () if sysfs is None else (sysfs,)
-    place = latency_file(path, *places)
-    found = check_latency_timer(path, 1.0, *places)
+    place = latency_file(path, *sysfs)
+    found = check_latency_timer(path, 1.0, *sysfs)
     if place is None or found is None or found.status == "pass":
         return None
     subject = f"{path} latency timer"

@@ -13,8 +13,8 @@ from pathlib import Path
 from serial.tools import list_ports
 
 from softfinger.daemon.diagnosis.result import Result, Status
+from softfinger.daemon.servos.port import latency_file
 
-_SYSFS = Path("/sys/class/tty")
 _PROC = Path("/proc")
 
 
@@ -152,18 +152,12 @@ def _pseudo_terminal(folder: Path, link: Path) -> int:
 # --- latency timer ---------------------------------------------------------------------------
 
 
-def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Where the kernel keeps the adapter's latency timer [ms]; None where it has none."""
-    place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
-    return place if place.exists() else None
-
-
-def check_latency_timer(path: str, reply_timeout: float, sysfs: Path = _SYSFS) -> Result | None:
+def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Result | None:
     """Judge a USB adapter's latency timer against the time [s] a reply may take; None without one.
 
     A reply waits in the adapter until the timer is over, so 16 ms hold a read to 60 Hz.
     """
-    place = latency_file(path, sysfs)
+    place = latency_file(path, *sysfs)
     if place is None:
         return None
     subject = f"{path} latency timer"

@@ -16,10 +16,9 @@ from softfinger.daemon.control.modes import GRIPPING, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskOver
 from softfinger.daemon.errors import Refused, ServoError
-from softfinger.daemon.loop.lateness import Lateness
 from softfinger.daemon.loop.publishing import Publishing
 from softfinger.daemon.loop.requests import Requests
-from softfinger.daemon.loop.timing import Statistics, record
+from softfinger.daemon.loop.timing import Lateness, Statistics, record
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import BUS, Breach, Safety

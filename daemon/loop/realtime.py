@@ -1,7 +1,8 @@
-"""Scheduling, memory and timers for a steady tick: the section ``[realtime]``, once, after warm-up.
+"""What the loop asks of the system: scheduling, memory and timers for a steady tick, and systemd.
 
-No measure is needed: one that the system refuses is reported, with what is lost and the command
-that grants it. The spin before a deadline is `daemon.clock`'s.
+The measures of the section ``[realtime]`` are taken once, after warm-up. None is needed: one that
+the system refuses is reported, with what is lost and the command that grants it. The spin before a
+deadline is `daemon.clock`'s. systemd is told (sd_notify) that the daemon is ready, alive, stopping.
 """
 
 from __future__ import annotations
@@ -10,16 +11,19 @@ import ctypes
 import gc
 import os
 import resource
+import socket
 import struct
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
+_SHARE = 0.25  # of the watchdog's time between two signs of life
+_NEVER = float("inf")
 _LATENCY = "/dev/cpu_dma_latency"
 
 # The commands that grant a user what is asked of the system.
@@ -253,3 +257,54 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
     if libc.syscall(get_call, thread, found, size, 0) != 0:
         return False
     return bool(_ATTRIBUTES.unpack(found.raw)[5] == nanoseconds)
+
+
+class Service:
+    """Notifies systemd at the socket in ``NOTIFY_SOCKET``. Nothing here waits, and nothing raises.
+
+    Each is one datagram. The loop calls `alive` at every tick, which sends a few times within the
+    watchdog's time and is a comparison otherwise.
+    """
+
+    def __init__(self, address: str, watchdog: float = 0.0) -> None:
+        """``watchdog`` [s] is the time without a sign of life after which systemd acts; 0: none."""
+        # A name that begins with @ is abstract: its first byte is zero.
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._every = watchdog * _SHARE if watchdog > 0.0 else _NEVER
+        self._due = -_NEVER
+        self._ready = False
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
+
+    @classmethod
+    def of_environment(cls, environment: Mapping[str, str] = os.environ) -> Service | None:
+        """The service that this process is, None when it is none."""
+        address = environment.get("NOTIFY_SOCKET", "")
+        if address[:1] not in ("/", "@") or len(address) < 2:
+            return None
+        wanted = environment.get("WATCHDOG_USEC", "")
+        mine = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        watchdog = int(wanted) * 1e-6 if mine and wanted.isdecimal() else 0.0
+        return cls(address, watchdog)
+
+    def alive(self, t: float) -> None:
+        """A sign of life at time ``t`` [s], sent when one is due; the first one says ready."""
+        if t < self._due:
+            return
+        self._due = t + self._every
+        message = b"WATCHDOG=1" if self._ready else b"READY=1\nWATCHDOG=1"
+        self._ready = True
+        self._send(message)
+
+    def stopping(self) -> None:
+        """The end has begun."""
+        self._send(b"STOPPING=1")
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _send(self, message: bytes) -> None:
+        try:
+            self._socket.sendto(message, self._address)
+        except OSError:
+            pass  # nobody listens, or not now

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.settings import GeometrySettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale, servo_name
+from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.types import FINGERS
 
@@ -54,6 +55,7 @@ class Examined:
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
+    stray: Finding | None = None  # its joint's angle can't be right
 
     @property
     def name(self) -> str:
@@ -69,9 +71,13 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
         if line.ping(servo_id) is None:
             found.append(Examined(finger, servo_id, False))
             continue
-        name = servo_name(servo_id, finger)
+        name, stray = servo_name(servo_id, finger), None
         table = Registers(line.read(servo_id, 0, CHECKED) or b"")
         if table:
+            scale = JointScale.of(settings.servos, finger, model)
+            stray = check_angle(
+                name, scale.angle(table.long(reg.PRESENT_POSITION)), settings.hand, finger
+            )
             errors = check_servo(name, model, table, settings, finger)
             notices = notice_servo(name, model, table, settings)
         else:
@@ -80,7 +86,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
                 "bad line)"
             )
             errors, notices = [Finding(name, why, FIX)], []
-        found.append(Examined(finger, servo_id, True, table, tuple(errors), tuple(notices)))
+        found.append(Examined(finger, servo_id, True, table, tuple(errors), tuple(notices), stray))
     return found
 
 
@@ -205,21 +211,27 @@ def notice_servo(
     return [Finding(name, text) for true, text in notices if true]
 
 
-def check_angle(name: str, q: float, q_min: float, q_max: float) -> Finding | None:
-    """What is wrong with a joint's angle [rad]; None when it lies near the hand's limits."""
-    if q_min - ANGLE_MARGIN <= q <= q_max + ANGLE_MARGIN:
+def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Finding | None:
+    """What is wrong with a joint's angle [rad]; None when it lies near the hand's limits.
+
+    Torque on would swing such a joint back at once.
+    """
+    low, high = hand.q_min[finger], hand.q_max[finger]
+    if low - ANGLE_MARGIN <= q <= high + ANGLE_MARGIN:
         return None
-    return Finding(
-        name,
-        f"the joint is at {math.degrees(q):.0f}°, not in {math.degrees(q_min):.0f}° … "
-        f"{math.degrees(q_max):.0f}°",
-        "turn it there by hand, or correct servos.zero",
-    )
+    found, least, most = (f"{math.degrees(angle):.0f}°" for angle in (q, low, high))
+    problem = f"the joint is at {found}, not in {least} … {most}"
+    return Finding(name, problem, "turn it there by hand, or correct servos.zero")
 
 
-def check_latency(path: str, latency: float) -> Finding | None:
-    """What is wrong with a USB adapter's latency timer [s]; None when it is low or absent."""
-    if latency <= 0.001:
-        return None
-    problem = f"the adapter's latency timer is {latency * 1e3:.0f} ms, so a read takes that long"
-    return Finding(path, problem, f"{FIX} sets it to 1 ms")
+def latency_of(path: str) -> tuple[float, list[Finding]]:
+    """A USB adapter's latency timer [s], 0 without one; and what is wrong with it."""
+    place = latency_file(path)
+    try:
+        milliseconds = 0 if place is None else int(place.read_text())
+    except (OSError, ValueError):
+        milliseconds = 0
+    if milliseconds <= 1:
+        return milliseconds * 1e-3, []
+    problem = f"the adapter's latency timer is {milliseconds} ms, so a read takes that long"
+    return milliseconds * 1e-3, [Finding(path, problem, f"{FIX} sets it to 1 ms")]

@@ -16,6 +16,7 @@ import math
 import struct
 import time
 from collections import deque
+from dataclasses import replace
 
 from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 
@@ -24,7 +25,7 @@ from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import check_latency, examine
+from softfinger.daemon.servos.checks import examine, latency_of
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import Joint, JointScale
 from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
@@ -102,7 +103,7 @@ class DynamixelServos:
         line = ServoLine(port, self._handler)
         torque = Torque(line, model, servos, profile.hand, self._joints)
         try:
-            fast = self._check(line, model, torque)
+            fast = self._check(line, model)
         except BaseException:
             port.closePort()
             raise
@@ -121,7 +122,7 @@ class DynamixelServos:
         self._next_health = self._next_check = -math.inf
         self._line, self._torque = line, torque
 
-    def _check(self, line: ServoLine, model: ServoModel, torque: Torque) -> bool:
+    def _check(self, line: ServoLine, model: ServoModel) -> bool:
         """Whether all servos answer fast sync reads; sets the joints' own limits."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
@@ -135,11 +136,8 @@ class DynamixelServos:
                 f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
                 "`softfinger doctor` looks for them at every rate"
             )
-        latency = port.latency_timer()
-        slow = check_latency(port.port_name, latency)
-        adapter = [] if slow is None else [slow]
-        errors = adapter if latency >= allowed else []
-        notices = [] if latency >= allowed else adapter
+        latency, slow = latency_of(port.port_name)
+        errors, notices = (slow, []) if latency >= allowed else ([], slow)
         for each in found:
             errors += each.errors
             notices += each.notices
@@ -155,11 +153,9 @@ class DynamixelServos:
                 each.table.long(reg.MIN_POSITION_LIMIT),
                 each.table.long(reg.MAX_POSITION_LIMIT),
             )
-        positions = {each.id: each.table.long(reg.PRESENT_POSITION) for each in found}
-        for stray in torque.strayed(positions):
-            notices.append(
-                Finding(stray.subject, stray.problem, f"{stray.fix}; torque is refused there")
-            )
+            if each.stray is not None:
+                fix = f"{each.stray.fix}; torque is refused there"
+                notices.append(replace(each.stray, fix=fix))
         self.notices = tuple(notices)
         for notice in notices:
             _log.warning(notice)

@@ -23,6 +23,12 @@ _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
 
+def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
+    """Where the kernel keeps a USB adapter's latency timer [ms]; None where it has none."""
+    place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
+    return place if place.exists() else None
+
+
 class PortGone(ServoError):
     """The port went away while it was open: adapter unplugged, or its power lost."""
 
@@ -61,7 +67,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             if self._low_latency:
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
-            pass  # a pseudo-terminal or an adapter without that mode; see latency_timer()
+            pass  # a pseudo-terminal or an adapter without that mode; see latency_file()
         self.received.clear()
         self.ser.reset_input_buffer()
         return True
@@ -72,14 +78,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             self.ser.close()
         self.is_open = False
         self._descriptor = -1
-
-    def latency_timer(self) -> float:
-        """The USB adapter's latency timer [s], 0 where there is none."""
-        name = Path(os.path.realpath(self.port_name)).name
-        try:
-            return int((_SYSFS / name / "device" / "latency_timer").read_text()) / 1000.0
-        except (OSError, ValueError):
-            return 0.0
 
     def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
         """Send a packet; whether all of it went out.

@@ -75,9 +75,12 @@ class Torque:
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
         positions = self._positions()
-        strayed = self.strayed(positions)
-        if strayed:
-            raise ServoError("\n".join(map(str, strayed)))
+        strayed = [
+            check_angle(joint.name, joint.scale.angle(positions[i]), self._hand, joint.finger)
+            for i, joint in self._joints.items()
+        ]
+        if any(strayed):
+            raise ServoError("\n".join(str(each) for each in strayed if each))
         if self._mode != reg.CURRENT_MODE:
             packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
             self._store(reg.GOAL_POSITION, packed, "goal position")
@@ -137,19 +140,6 @@ class Torque:
         return data
 
     # --- what forbids it -------------------------------------------------------------------------
-
-    def strayed(self, positions: Mapping[int, int]) -> list[Finding]:
-        """Joints whose angle can't be right; torque there would swing them back at once.
-
-        ``positions`` in counts, by ID.
-        """
-        q_min, q_max = self._hand.q_min, self._hand.q_max
-        found = [
-            check_angle(joint.name, joint.scale.angle(positions[i]), q_min[f], q_max[f])
-            for i, joint in self._joints.items()
-            for f in (joint.finger,)
-        ]
-        return [each for each in found if each is not None]
 
     def _positions(self) -> dict[int, int]:
         positions = {}

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.daemon.loop.sd_notify import Service
+from softfinger.daemon.loop.realtime import Service
 from softfinger.tools.processes.event_log import EventLog
 from tests.conftest import Inline
 from tests.harness.daemon_process import SOFTFINGER, ask, softfinger

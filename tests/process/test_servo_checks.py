@@ -13,11 +13,10 @@ import serial
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import ServoError
+from softfinger.daemon.servos import checks, dynamixel
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos import dynamixel
-from softfinger.daemon.servos import port as port_module
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.port import SerialPort, latency_file
 from softfinger.daemon.types import Goal, Reading
 from tests.harness.servos import RunningBus, backend_settings, connected, hand_bus
 
@@ -196,7 +195,7 @@ def test_an_adapters_latency_timer_is_asked_to_be_low(
     (tmp_path / name / "device").mkdir(parents=True)
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
-    monkeypatch.setattr(port_module, "_SYSFS", tmp_path)
+    monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
     monkeypatch.setattr(dynamixel, "_PATIENCE", 1.0)
     # The mode is not there, as on this pseudo-terminal.
     text = "the adapter's latency timer is 16 ms, so a read takes that long"
@@ -218,8 +217,8 @@ def test_an_adapters_latency_timer_is_asked_to_be_low(
     assert backend.notices == ()
     backend.close()
     place.write_text("nonsense")
+    assert checks.latency_of(bus.path) == (0.0, [])
     port = SerialPort(bus.path, 2_000_000, 1.0, low_latency=False)
     port.openPort()
-    assert port.latency_timer() == 0.0
-    assert asked == [True]
     port.closePort()
+    assert asked == [True]

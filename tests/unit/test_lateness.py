@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from softfinger.daemon.clock import HandClock
 from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.lateness import EVERY, FIRST, RECENT, Lateness
 from softfinger.daemon.loop.publishing import parts
+from softfinger.daemon.loop.timing import EVERY, FIRST, RECENT, Lateness
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
 from softfinger.daemon.wire.packer import message_maker

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.errors import SettingsError, SoftfingerError
-from softfinger.daemon.loop.sd_notify import Service
+from softfinger.daemon.loop.realtime import Service
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.types import State
 from softfinger.tools.arguments import add_profile, profile, seconds
