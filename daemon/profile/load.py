@@ -152,17 +152,29 @@ def _line(details: ErrorDetails) -> str:
     expected = details["msg"]
     for old, new in _EXPECTED:
         expected = expected.replace(old, new, 1)
+    if details["type"] == "less_than_equal" and _is_length(location):
+        metres = 1e-3 * float(details["input"])
+        expected += f" m; {details['input']:g} mm are {metres:g}" if metres < 1.0 else " m"
     return f"{key}: found {shown(details['input'])}, expected {expected}"
 
 
 def _known_keys(location: list[str]) -> list[str]:
+    return list(_model(location).model_fields)
+
+
+def _is_length(location: list[str]) -> bool:
+    extra = _model(location[:1]).model_fields[location[1]].json_schema_extra
+    return isinstance(extra, dict) and extra.get("unit") == "m"
+
+
+def _model(location: list[str]) -> type[BaseModel]:
     model: type[BaseModel] = Settings
     for part in location:
         inner = model.model_fields[part].annotation
         assert isinstance(inner, type)
         assert issubclass(inner, BaseModel)
         model = inner
-    return list(model.model_fields)
+    return model
 
 
 def _with_directory(settings: Settings, directory: Path) -> Settings:

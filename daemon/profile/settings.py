@@ -21,7 +21,8 @@ from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
-Length = Annotated[float, Field(ge=1e-4, le=10, allow_inf_nan=False)]  # m
+_METRES = {"unit": "m"}  # by which a report knows lengths that seem to be in mm
+Length = Annotated[float, Field(ge=1e-4, le=1, allow_inf_nan=False, json_schema_extra=_METRES)]
 Place = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]  # m
 Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]  # rad
 Seconds = Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)]
@@ -92,7 +93,7 @@ class GeometrySettings(Section):
 class TipSettings(Section):
     """The soft hemispherical fingertip: the paper's springs, or solid rubber."""
 
-    radius: Annotated[float, Field(ge=1e-4, le=1)] = 0.020
+    radius: Length = 0.020
     physics: Literal["springs", "solid"] = "springs"
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
@@ -143,8 +144,8 @@ class TactileSettings(Section):
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
     rows: Annotated[int, Field(ge=4, le=256)] = 44
     cols: Annotated[int, Field(ge=4, le=256)] = 44
-    pitch: Length = 0.058 / 44
-    pitch_y: NonNegative = 0.0  # from row to row; 0: as pitch
+    pitch: Annotated[Length, Field(le=0.05)] = 0.058 / 44
+    pitch_y: Annotated[float, Field(ge=0, le=0.05, json_schema_extra=_METRES)] = 0.0  # 0: as pitch
     centre: tuple[Place, Place] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
     rotation: tuple[Angle, Angle] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
     blur: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, the elastomer's standard deviation

@@ -9,7 +9,9 @@ coefficients, which is the kernel's argument and the bytes' content alike. How o
 from __future__ import annotations
 
 import hashlib
+import math
 import struct
+import warnings
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -61,6 +63,8 @@ class Certificate(NamedTuple):
 
 # For numbers, which the fields' types do not name; a call's overhead counts there.
 _contact: Any = ContactForces
+
+_EDGE = 1.0 - 1e-12  # of d and θ: what is outside by rounding alone is inside with it
 
 _MAGIC = b"SFTIPTAB"
 _CHECK = 32  # bytes of a SHA-256
@@ -161,21 +165,45 @@ class ContactTable:
     def __call__(self, d: ArrayLike, theta: ArrayLike) -> ContactForces:
         """Look up at displacement d [m] and tilt θ [rad]; they broadcast.
 
-        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged. Raises
-        TypeError for what is no real number.
+        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged and with a
+        RuntimeWarning. Raises TypeError for what is no real number.
         """
         if type(d) is float and type(theta) is float:
             *six, inside = lookup(self.data, d, theta)
+            if not inside:
+                self._warn(np.array([d]), np.array([theta]))
             numbers = map(np.float64, six)
             return cast(ContactForces, _contact(*numbers, np.bool_(inside), self.max_error))
         shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)
-        (solid_lookups if self.is_solid else lookups)(self.data, depth, tilt, out, within)
+        self._look_up(depth, tilt, out, within)
+        if not within.all():
+            self._warn(depth, tilt)
         f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
         return ContactForces(
             f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error
         )
+
+    def _look_up(
+        self, d: FloatArray, theta: FloatArray, out: FloatArray, within: NDArray[np.bool_]
+    ) -> None:
+        (solid_lookups if self.is_solid else lookups)(self.data, d, theta, out, within)
+
+    def _warn(self, d: FloatArray, theta: FloatArray) -> None:
+        """Warn the caller's caller of points outside the domain, but for NaN."""
+        within = np.empty(d.size, dtype=np.bool_)
+        self._look_up(d * _EDGE, theta * _EDGE, np.empty((6, d.size)), within)
+        outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))
+        if outside.size:
+            first = outside[0]
+            warnings.warn(
+                f"{outside.size} of {d.size} points are outside the contact table, the first at "
+                f"d = {1e3 * d[first]:g} mm, θ = {math.degrees(theta[first]):.3g}°; they have the "
+                "values of its edge, and `inside` is False",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
 
 def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:

@@ -39,6 +39,7 @@ from softfinger.kinematics.sensing.footprint import (
 )
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure, pictures
 
+_PITCH_MAX = 0.1  # m; a greater one is in millimetres
 OWNERS = 256  # cells whose nodes are evaluated at once
 
 
@@ -145,8 +146,8 @@ class SensorGrid:
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1:
             raise ValueError(f"a grid needs rows and columns, got {self.rows} × {self.cols}")
-        if not all(math.isfinite(p) and p > 0.0 for p in self.pitches):
-            raise ValueError(f"pitch must be positive, got {self.pitch}")
+        if not all(0.0 < p <= _PITCH_MAX for p in self.pitches):
+            raise ValueError(f"pitch must be in metres, up to {_PITCH_MAX:g}, got {self.pitch}")
         if not all(math.isfinite(c) for c in (*self.centre, self.rotation)):
             raise ValueError("centre and rotation must be finite")
         if (

@@ -79,10 +79,10 @@ def test_every_kind_of_file_gives_the_same_contacts(counts: np.ndarray, tmp_path
     np.save(tmp_path / "press.npy", counts)
     for name in ("press.npz", "press.npy", "frames", "export.asf", "run.mcap"):
         # The export tells its pitch: a wrong one in the settings must not matter there.
-        pitch = 0.002 if name == "export.asf" else PITCH
-        tactile = Settings().tactile.model_copy(update={"rows": 10, "cols": 10, "pitch": pitch})
+        wrong = {"rows": 10, "cols": 10, "pitch": 0.002} if name == "export.asf" else {}
+        tactile = Settings().tactile.model_copy(update=wrong)
         settings = Settings().model_copy(update={"tactile": tactile})
-        source = open_source(tmp_path / name, settings, None, own=True)
+        source = open_source(tmp_path / name, settings, None, own=name == "run.mcap")
         output = tmp_path / f"{name}.csv"
         write_csv(output, analyse(source, lambda done: None))
         check(output)
@@ -142,6 +142,20 @@ def test_a_frame_of_another_size_is_told(counts: np.ndarray, tmp_path: Path) -> 
         analyse(open_source(path, Settings(), None, own=True), lambda n: None)
 
 
+def test_frames_alone_need_settings_that_fit(
+    inline: Inline, counts: np.ndarray, tmp_path: Path
+) -> None:
+    path = tmp_path / "small.npy"
+    np.save(path, counts[:3, :5, :5])
+    done = inline("analyse", path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "small.npy: no settings in it: name the tip and the sensor by --config" in done.stderr
+    done = inline("analyse", path, "--config", "paper")
+    assert done.returncode == 2
+    assert "small.npy: frames of 5 × 5 cells, expected 44 × 44: set tactile.rows" in done.stderr
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_wrong_settings_and_a_missing_extra(
     inline: Inline, tmp_path: Path, counts: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +163,6 @@ def test_wrong_settings_and_a_missing_extra(
     np.savez(path, frames=counts[:3])
     assert inline("analyse", path, "--set", "tip.radius=0").returncode == 2
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    told = inline("analyse", path)
+    told = inline("analyse", path, "--config", "sim")
     assert told.returncode == 0  # the numbers are there
     assert "pip install 'softfinger[plot]'" in told.stderr

@@ -200,6 +200,14 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> N
         ('[commands]\naddress = "tcp://127.0.0.1:9872"', "commands.address: found"),
         ("servos = 3", "servos: found 3, expected a table"),
         ("[[loop]]\nrate = 100.0", "loop: found [a table], expected a table"),
+        (
+            "[tactile]\npitch = 1.3",
+            "tactile.pitch: found 1.3, expected less than or equal to 0.05 m; 1.3 mm are 0.0013",
+        ),
+        (
+            "[tip]\nradius = 20",
+            "tip.radius: found 20, expected less than or equal to 1 m; 20 mm are 0.02",
+        ),
         ("[tactile]\nrate = 1e300", "tactile.rate: found 1e+300, expected less than or equal to"),
         ("[hand]\nfinger_length = 1e300", "hand.finger_length: found 1e+300"),
         ("[tip]\nradius = 1e-300", "tip.radius: found 1e-300"),

@@ -223,6 +223,17 @@ def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
         assert worst(table, TABLE_I, d[keep], theta[keep]) < 1e-9
 
 
+def test_who_asks_outside_the_domain_is_warned(table: ContactTable) -> None:
+    d = np.array([-1e-3, 0.0, math.nan, 0.004, 0.021, 0.02, 0.004])
+    theta = np.array([0.0, 9.0, 0.0, 1.5, 0.0, 0.0, math.nan])
+    with pytest.warns(RuntimeWarning, match=r"2 of 7 points .* at d = 4 mm, θ = 85.9°") as caught:
+        table(d, theta)
+    assert [each.filename for each in caught] == [__file__]
+    table(d[:3], theta[:3])  # a warning would be an error here
+    table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
+
+
+@pytest.mark.filterwarnings("ignore:.* outside the contact table")
 def test_outside_the_domain_is_clamped_and_flagged(table: ContactTable) -> None:
     limit = float(TIP.theta_limit(0.008))
     edge = table(0.008, limit)
@@ -250,6 +261,7 @@ def test_outside_the_domain_is_clamped_and_flagged(table: ContactTable) -> None:
         assert all(math.isnan(getattr(c, name)) for name in OUTPUTS)
 
 
+@pytest.mark.filterwarnings("ignore:.* outside the contact table")
 @given(
     d=st.floats(allow_nan=True, allow_infinity=True),
     theta=st.floats(allow_nan=True, allow_infinity=True),
@@ -324,6 +336,7 @@ def test_what_is_no_real_number_is_refused(table: ContactTable, wrong: object) -
             table(*pair)
 
 
+@pytest.mark.filterwarnings("ignore:.* outside the contact table")
 def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
     rng = np.random.default_rng(11)
     d, theta = hard_points(TIP.radius, 700, rng)

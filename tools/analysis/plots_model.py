@@ -203,9 +203,8 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     d = np.linspace(0.0, deepest, _GRID)[1:]
     theta = np.linspace(-widest, widest, _GRID)
     limit = table.tip.theta_limit(d)
-    energy = np.ma.masked_where(
-        np.abs(theta)[None, :] > limit[:, None], table(d[:, None], theta[None, :]).energy * 1e3
-    )
+    within = np.clip(theta, -limit[:, None], limit[:, None])
+    energy = np.ma.masked_where(within != theta, table(d[:, None], within).energy * 1e3)
     most = float(energy.max())
     round_ones = {float(f"{most * (k / 8.0) ** 2:.2g}") for k in range(8)}
     levels = np.array([*sorted(round_ones), most])

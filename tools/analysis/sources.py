@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.errors import RecordingError, SettingsError
 from softfinger.daemon.perception.finger_model import FingerModel, make_models
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.recording import load_recording
@@ -48,12 +48,13 @@ class Source:
 def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
     """Open a file of frames.
 
-    With ``own`` a recording of the stream uses the settings it was made with, else ``settings``.
+    With ``own`` a recording of the stream uses the settings it was made with, else ``settings``;
+    frames alone need ``settings``, and have their shape unless the file tells its pitch itself.
     Raises RecordingError with the file's name, and SettingsError or TactileError.
     """
     if path.suffix == ".mcap":
         return _stream(path, settings, cache, own)
-    return _frames_alone(path, settings, cache)
+    return _frames_alone(path, settings, cache, own)
 
 
 def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
@@ -95,13 +96,23 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     return Source(settings, models, present, recording.size, frames, {})
 
 
-def _frames_alone(path: Path, settings: Settings, cache: Path | None) -> Source:
+def _frames_alone(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
     tactile = settings.tactile
     recording = load_recording(path, tactile.pascal_per_count, tactile.rate)
+    if own:
+        raise SettingsError(
+            f"{path}: no settings in it: name the tip and the sensor by --config PROFILE, as "
+            "--config paper, or by --set"
+        )
     count, rows, cols = recording.counts.shape
     changes: dict[str, float] = {"rows": rows, "cols": cols}
     if recording.pitch is not None:
         changes["pitch"], changes["pitch_y"] = recording.pitch
+    elif (rows, cols) != (tactile.rows, tactile.cols):
+        raise SettingsError(
+            f"{path}: frames of {rows} × {cols} cells, expected {tactile.rows} × {tactile.cols}: "
+            "set tactile.rows, tactile.cols and tactile.pitch"
+        )
     settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
 
     def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
