@@ -37,7 +37,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
     stream, commands = own_addresses()
     path = tmp_path_factory.mktemp("shared") / "profile.toml"
     text = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
-    path.write_text(text + "loop.rate = 200.0\nstream.state_rate = 200.0\n", encoding="utf-8")
+    path.write_text(text + "loop.rate = 100.0\n", encoding="utf-8")
     running = Running("--config", str(path))
     yield Shared(running, path, stream, commands)
     running.kill()
@@ -255,8 +255,8 @@ def test_subscribers_that_come_late_stop_reading_or_die_change_nothing(
     late.subscribe("hand/state")
     late.connect(hand.stream)
     seen = []
-    for count in range(400):
-        if count == 150:
+    for count in range(200):
+        if count == 80:
             dying.kill()
         assert late.poll(60_000)
         seen.append(msgpack.unpackb(late.recv_multipart()[1])["seq"])

@@ -47,7 +47,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     stream, commands = own_addresses()
     (place / "profile.toml").write_text(
         f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
-        f'access.keys = "{place / "keys"}"\nloop.rate = 200.0\nservos.watchdog = 0.0\n',
+        f'access.keys = "{place / "keys"}"\nloop.rate = 50.0\nservos.watchdog = 0.0\n',
         encoding="utf-8",
     )
     own = place / "own.mcap"
