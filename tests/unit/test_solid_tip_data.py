@@ -6,15 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import softfinger.kinematics.contact as contact
-from softfinger.tools.solid_tip.evaluate import SolidTip, centroid_and_extent, rms_difference
+from softfinger.tools.solid_tip.evaluate import SolidTip, rms_difference
 from softfinger.tools.solid_tip.fit import NU, THETA_MAX
 
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
 BASES = ("bonded", "lying")
 PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in radii
+
+
+def centroid_and_extent(frame: NDArray[np.float64], pitch: float) -> tuple[float, float, float]:
+    """Centroid along x, and extents σ_x and σ_y, of a frame as the sensor sees it."""
+    place = (np.arange(len(frame)) - (len(frame) - 1) / 2) * pitch
+    total = frame.sum()
+    x, y2 = (frame.sum(axis=0) @ place) / total, (frame.sum(axis=1) @ place**2) / total
+    return x, np.sqrt((frame.sum(axis=0) @ (place - x) ** 2) / total), np.sqrt(y2)
 
 
 @pytest.fixture(scope="module")

@@ -67,14 +67,6 @@ class SolidTip:
         return out
 
 
-def centroid_and_extent(frame: FloatArray, pitch: float) -> tuple[float, float, float]:
-    """Centroid along x, and extents σ_x and σ_y, of a frame as the sensor sees it."""
-    place = (np.arange(len(frame)) - (len(frame) - 1) / 2) * pitch
-    total = frame.sum()
-    x, y2 = (frame.sum(axis=0) @ place) / total, (frame.sum(axis=1) @ place**2) / total
-    return x, np.sqrt((frame.sum(axis=0) @ (place - x) ** 2) / total), np.sqrt(y2)
-
-
 def rms_difference(one: ArrayLike, other: ArrayLike) -> float:
     """Root mean square of the difference over that of ``other``."""
     return float(np.linalg.norm(np.subtract(one, other)) / np.linalg.norm(other))

@@ -34,7 +34,6 @@ FAST_BULK_READ: Final = 0x9A
 OK: Final = 0x00
 RESULT_FAIL: Final = 0x01
 INSTRUCTION_ERROR: Final = 0x02
-CRC_ERROR: Final = 0x03
 DATA_RANGE: Final = 0x04
 DATA_LENGTH: Final = 0x05
 DATA_LIMIT: Final = 0x06
