@@ -162,15 +162,15 @@ class ContactTable:
         """The tip that it was built for."""
         return Fingertip(self.header.radius)
 
-    def __call__(self, d: ArrayLike, theta: ArrayLike) -> ContactForces:
+    def __call__(self, d: ArrayLike, theta: ArrayLike, edge: bool = False) -> ContactForces:
         """Look up at displacement d [m] and tilt θ [rad]; they broadcast.
 
-        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged and with a
-        RuntimeWarning. Raises TypeError for what is no real number.
+        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged, and with a
+        RuntimeWarning unless ``edge`` asks for that. Raises TypeError for what is no real number.
         """
         if type(d) is float and type(theta) is float:
             *six, inside = lookup(self.data, d, theta)
-            if not inside:
+            if not (inside or edge):
                 self._warn(np.array([d]), np.array([theta]))
             numbers = map(np.float64, six)
             return cast(ContactForces, _contact(*numbers, np.bool_(inside), self.max_error))
@@ -178,7 +178,7 @@ class ContactTable:
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)
         self._look_up(depth, tilt, out, within)
-        if not within.all():
+        if not (edge or within.all()):
             self._warn(depth, tilt)
         f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
         return ContactForces(

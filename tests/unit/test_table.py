@@ -229,6 +229,7 @@ def test_who_asks_outside_the_domain_is_warned(table: ContactTable) -> None:
     with pytest.warns(RuntimeWarning, match=r"2 of 7 points .* at d = 4 mm, θ = 85.9°") as caught:
         table(d, theta)
     assert [each.filename for each in caught] == [__file__]
+    assert table(d, theta, edge=True).inside.sum() == 3
     table(d[:3], theta[:3])  # a warning would be an error here
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
 

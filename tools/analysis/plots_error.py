@@ -68,7 +68,8 @@ def _spread(run: RecordedRun, finger: str, field: str) -> FloatArray:
     if run.models is None:
         return np.full(run.t.size, np.nan)
     d, theta = run.states[f"{finger}.d"], run.states[f"{finger}.theta"]
-    contact = run.models[FINGERS.index(finger)].table(np.nan_to_num(d), np.nan_to_num(theta))
+    table = run.models[FINGERS.index(finger)].table
+    contact = table(np.nan_to_num(d), np.nan_to_num(theta), edge=True)
     spread: FloatArray = run.states[f"{finger}.gain"] * np.hypot(
         contact.force_d * run.states[f"{finger}.d_std"],
         contact.force_theta * run.states[f"{finger}.theta_std"],

@@ -176,7 +176,7 @@ def draw_landscape(run: RecordedRun) -> Figure:
         draw_map(panel, table, 1.15 * deepest, max(1.15 * widest, 10.0 / DEGREES))
         for name, (d, theta) in paths.items():
             draw_path(panel, d, theta, name)
-            over = table(d, theta).energy - table(d, 0.0).energy
+            over = table(d, theta, edge=True).energy - table(d, 0.0, edge=True).energy
             over = np.where(np.isfinite(d), over * 1e3, np.nan)
             above.plot(*run.gapped(over), label=name, **LINES[name])
         for marker, what in (("^", "begins"), ("s", "ends")):
@@ -203,8 +203,8 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     d = np.linspace(0.0, deepest, _GRID)[1:]
     theta = np.linspace(-widest, widest, _GRID)
     limit = table.tip.theta_limit(d)
-    within = np.clip(theta, -limit[:, None], limit[:, None])
-    energy = np.ma.masked_where(within != theta, table(d[:, None], within).energy * 1e3)
+    contact = table(d[:, None], theta[None, :], edge=True)
+    energy = np.ma.masked_where(~contact.inside, contact.energy * 1e3)
     most = float(energy.max())
     round_ones = {float(f"{most * (k / 8.0) ** 2:.2g}") for k in range(8)}
     levels = np.array([*sorted(round_ones), most])

@@ -133,8 +133,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     )
     if not result.from_start:
         print(
-            "the recording begins after the first tick: the loop's memory of earlier ticks is "
-            "missing, so the first states may differ"
+            "the recording begins after the first tick, and what the loop remembered is not in it: "
+            "states may differ, all of them if the hand was armed; `run --record` misses nothing"
         )
     for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
         if count:

@@ -67,20 +67,20 @@ class Landscape:
         theta = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * THETA_END
         d = (1.0 - (np.arange(HEIGHT) + 0.5) / HEIGHT) * self.d_end
         depth, angle = np.meshgrid(d, theta, indexing="ij")
-        contact = self._table(depth, angle)
+        contact = self._table(depth, angle, edge=True)
         share = np.cbrt(np.asarray(contact.energy) / self._energy[-1])
         share = np.clip(share, 0.0, 1.0) * (len(_RAMP) - 1)
         stops = np.arange(len(_RAMP))
         colours = [np.interp(share, stops, _RAMP[:, channel]) for channel in range(3)]
         picture = np.stack(colours, axis=-1)
-        picture[np.abs(angle) > Fingertip(self._radius).theta_limit(depth)] = _OUTSIDE
+        picture[~contact.inside] = _OUTSIDE
         return picture.astype(np.uint8)
 
     def contours(self) -> list[Contour]:
         """Lines of equal energy at round values, as far as the contact's domain goes."""
         theta = np.linspace(-THETA_END, THETA_END, 121)
         depth, angle = np.meshgrid(self._d, theta, indexing="ij")
-        energy = np.asarray(self._table(depth, angle).energy)
+        energy = np.asarray(self._table(depth, angle, edge=True).energy)
         contours: list[Contour] = []
         last = 0.0
         for level in _LEVELS[self._energy[-1] > _LEVELS]:
