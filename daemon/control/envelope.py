@@ -1,16 +1,18 @@
 """What the hand is known to hold: a map over shape, size, friction and mass, found by simulation.
 
-`softfinger envelope` makes it; `grasp` asks it for a warning. It holds for the hand it was made for
-and tells of others nothing.
+`softfinger envelope --keep` makes it, `grasp` asks it for a warning. It holds for the hand it was
+made for; the packaged one is the built-in hand's, and tells of others nothing.
 """
 
 from __future__ import annotations
 
 import tomllib
+from bisect import bisect_left
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
 
 KEPT = Path(__file__).with_name("envelope.toml")
 HELD, TURNED, LOST, REFUSED = "htlr"
@@ -27,46 +29,71 @@ _SECTIONS = ("hand", "tip", "material")
 def identity(settings: Settings) -> dict[str, Any]:
     """What of the settings a map belongs to."""
     told = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
-    return told | {"law": settings.control.law}
+    return told | {"control": {"law": settings.control.law}}
+
+
+def raised(settings: Settings, force: float) -> float:
+    """What a grip that was asked for ``force`` [N] is raised to at most, which bears the weight."""
+    most = GRIP_SHARE * settings.safety.force_max
+    return max(min(force + settings.control.grip_raise_max, most), force)
+
+
+def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
+    """The first key of both sections that is not the same, with both values."""
+    for name, section in expected.items():
+        for key, value in section.items():
+            if (other := found[name].get(key)) != value:
+                return f"{name}.{key}: found {other}, expected {value}"
+    return ""
 
 
 class Envelope:
-    """The packaged map, for one hand's settings."""
+    """A map of one hand, asked for the object that the settings name."""
 
-    def __init__(self, settings: Settings, path: Path = KEPT) -> None:
-        """Read it once; for another hand than the map's, nothing is known."""
-        self._map = tomllib.loads(path.read_text(encoding="utf-8"))
-        self._known = self._map["identity"] == identity(settings)
+    def __init__(self, settings: Settings) -> None:
+        """Read the settings' own map, or the packaged one if it is this hand's.
+
+        Raises SettingsError for a map that can't be read, or is another hand's.
+        """
+        own, control = settings.control.envelope, settings.control
+        try:
+            found = tomllib.loads(Path(own or KEPT).read_text(encoding="utf-8"))
+            other = _difference(found["identity"], identity(settings))
+            frictions, self._masses, sizes = found["friction"], found["mass"], found["size"]
+            width, count = settings.object.width, len(self._masses)
+            column = min(range(len(sizes)), key=lambda k: abs(sizes[k] - width))
+            row = max(sum(each <= control.tip_friction + 1e-9 for each in frictions) - 1, 0) * count
+            # Over the masses: what became of a block, of a disc.
+            rows = zip(*(found[shape][row : row + count] for shape in found["shapes"]), strict=True)
+            self._outcomes = ["".join(cells[column] for cells in shapes) for shapes in rows]
+            self._raised = found["raised"]
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise SettingsError(
+                f"control.envelope: {own}: no map of `softfinger envelope --keep`: {error!r}"
+            ) from None
+        if own and other:
+            raise SettingsError(f"control.envelope: {own} is another hand's: {other}")
+        self._known = not other
         self._settings = settings
 
     def warning(self, force: float) -> str:
         """Why a grasp with so many N may fail, by what the settings say of the object, or nothing.
 
         Taken are the nearest size, friction that is no more than `control.tip_friction`, and the
-        mass whose weight is `control.object_load`, scaled to the map's force.
+        mass whose weight is `control.object_load`, scaled by what the grip may be raised to.
         """
         if not self._known:
             return ""
-        found, control, width = self._map, self._settings.control, self._settings.object.width
+        settings, control = self._settings, self._settings.control
         mass = control.object_load / _GRAVITY
-        column = min(range(len(found["size"])), key=lambda k: abs(found["size"][k] - width))
-        friction = max(
-            (k for k, each in enumerate(found["friction"]) if each <= control.tip_friction + 1e-9),
-            default=0,
-        )
-        scaled = mass * found["force"] / force
-        masses = found["mass"]
-        heavier = next((k for k, each in enumerate(masses) if each >= scaled), len(masses) - 1)
-        cells = {
-            shape: found[shape][friction * len(masses) + heavier][column]
-            for shape in found["shapes"]
-        }
-        failing = {shape: cell for shape, cell in cells.items() if cell in (LOST, REFUSED)}
-        if len(failing) < len(cells):
+        scaled = mass * self._raised / raised(settings, force)
+        heavier = min(bisect_left(self._masses, scaled), len(self._masses) - 1)
+        outcome = self._outcomes[heavier]
+        if HELD in outcome or TURNED in outcome:
             return ""
-        reason = MEANING[next(iter(failing.values()))]
         return (
-            f"outside of what this hand holds in simulation: {1e3 * width:g} mm (object.width) at "
-            f"friction {control.tip_friction:g} (control.tip_friction) and {mass:.2g} kg "
-            f"(control.object_load) with {force:g} N: {reason}; see docs/envelope.md"
+            f"outside of what this hand holds in simulation: {1e3 * settings.object.width:g} mm "
+            f"(object.width) at friction {control.tip_friction:g} (control.tip_friction) and "
+            f"{mass:.2g} kg (control.object_load) with {force:g} N: {MEANING[outcome[0]]}; "
+            "see docs/envelope.md"
         )

@@ -92,6 +92,30 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
     return s.value
 
 
+class PairState(Record):
+    """Of both joints."""
+
+    left: SetpointState
+    right: SetpointState
+
+
+@kernel
+def _step_both(
+    pairs: Records[PairState],
+    first: FloatArray,
+    second: FloatArray,
+    targets: tuple[float, float],
+    rate: float,
+) -> tuple[bool, float, float]:
+    left = pairs[0].left
+    right = pairs[0].right
+    left.target = targets[0]
+    right.target = targets[1]
+    q1 = advance(left, first, rate)
+    q2 = advance(right, second, rate)
+    return arrived(left) and arrived(right), q1, q2
+
+
 @kernel
 def _reset(setpoints: Records[SetpointState], windows: FloatArray, value: float) -> None:
     reset(setpoints[0], windows, value)
@@ -150,3 +174,28 @@ class Setpoint:
     def speed(self) -> float:
         """How fast it moves [1/s]."""
         return self.state.speed
+
+
+class JointSetpoints:
+    """Of both joints, moved by one call."""
+
+    def __init__(self, dt: float, window: float) -> None:
+        """As `Setpoint`."""
+        self._state = state = PairState()
+        self._windows = [Setpoint(dt, window, one).windows for one in (state.left, state.right)]
+        self._arrays = state.left.array, state.right.array
+        self.targets = [0.0, 0.0]  # where they go; may be set at any tick
+        self.values = [0.0, 0.0]  # where they are
+        self.step(0.0)
+
+    def reset(self, joint: int, q: float) -> None:
+        """Let one be at ``q``, at rest."""
+        _reset(self._arrays[joint], self._windows[joint], q)
+        self.targets[joint] = self.values[joint] = q
+
+    def step(self, rate: float) -> bool:
+        """Go on by one tick, at most ``rate`` a second; whether both are at their targets."""
+        first, second = self._windows
+        left, right = self.targets
+        there, *self.values = _step_both(self._state.array, first, second, (left, right), rate)
+        return there

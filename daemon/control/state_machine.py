@@ -11,7 +11,7 @@ import math
 
 from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.control.setpoint import Setpoint
+from softfinger.daemon.control.setpoint import JointSetpoints
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
@@ -45,7 +45,7 @@ class Control:
         self._touched = [state.contacts[index] for index in self._fingers]
         self._held = grasp
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
-        self._setpoints = [Setpoint(dt, smooth), Setpoint(dt, smooth)]  # of the joints
+        self._joints = JointSetpoints(dt, smooth)
         self._next_angle: float | None = None  # rad to turn to once the grip holds
         self._raised = False  # the grip is firmer than was asked for
         self._touching = [False, False]
@@ -86,7 +86,7 @@ class Control:
         if self.mode is not Mode.MOVING:
             self._hold_here()
         for name, q in angles.items():
-            self._setpoints[FINGERS.index(name)].target = q
+            self._joints.targets[FINGERS.index(name)] = q
         self._enter(Mode.MOVING)
 
     def grasp(self, force: float) -> None:
@@ -146,7 +146,7 @@ class Control:
         """Open to the hand's open angles."""
         self._hold_here()
         for index in self._fingers:
-            self._setpoints[index].target = self._settings.hand.open_angle[index]
+            self._joints.targets[index] = self._settings.hand.open_angle[index]
         self._gripping = False
         self._enter(Mode.RELEASING)
 
@@ -164,8 +164,8 @@ class Control:
             self._gripping = False
 
     def _hold_here(self) -> None:
-        for setpoint, q in zip(self._setpoints, self._reading.q, strict=True):
-            setpoint.reset(q)
+        for index, q in enumerate(self._reading.q):
+            self._joints.reset(index, q)
 
     # One tick
 
@@ -202,43 +202,37 @@ class Control:
     def _rest(self, goal: Goal, current: float) -> None:
         """Joints follow their setpoints, with at most ``current`` [A]."""
         for index in self._fingers:
-            goal.q[index] = self._setpoints[index].value
+            goal.q[index] = self._joints.values[index]
             goal.current[index] = current
 
     def _travel(self, dt: float) -> None:
-        if not self._advance_setpoints(self._settings.control.move_speed):
+        if not self._joints.step(self._settings.control.move_speed):
             return
         self._waiting += dt
-        off = max(abs(self._reading.q[i] - self._setpoints[i].target) for i in self._fingers)
+        off = max(abs(self._reading.q[i] - self._joints.targets[i]) for i in self._fingers)
         if off < _ARRIVED or self._waiting > _GRACE:
             if off >= _ARRIVED:
                 text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
                 self.events.append(("warning", "short", text))
             self._enter(Mode.ARMED)
 
-    def _advance_setpoints(self, speed: float) -> bool:
-        """One tick of the joints' setpoints; True when all have arrived."""
-        arrived = True
-        for index in self._fingers:
-            arrived = self._setpoints[index].step(speed) and arrived
-        return arrived
-
     def _approach(self, dt: float) -> None:
         """Close until every finger touches; a finger that touches waits for the other."""
-        law = self._settings.control
+        law, awaited = self._settings.control, False
         for index in self._fingers:
             contact = self._contacts[index]
             touches = contact.valid and contact.contact and contact.force > law.contact_force
             if touches and not self._touching[index]:
-                self._setpoints[index].reset(self._reading.q[index])
+                self._joints.reset(index, self._reading.q[index])
             self._touching[index] = touches
             if not touches:
-                self._setpoints[index].target = self._settings.hand.q_max[index]
-        if all(self._touching[index] for index in self._fingers):
+                self._joints.targets[index] = self._settings.hand.q_max[index]
+                awaited = True
+        if not awaited:
             if not self._is_empty(dt):
                 self._gripping = True
                 self._grip.start(self._felt(), self._force)
-        elif self._advance_setpoints(law.approach_speed):
+        elif self._joints.step(law.approach_speed):
             self._waiting += dt
             if self._waiting > _GRACE:
                 text = "nothing to grasp within the joints' limits"

@@ -8,7 +8,7 @@ heard in which mode stands in `control.modes`; what it makes the hand do, in
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
@@ -39,8 +39,6 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     name = request["command"]
     if name not in COMMANDS:
         raise Refused(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
-    if name == "stop":  # whatever else the message holds
-        return Command(name, {}, "")
     client = request.get("client", "")
     if not isinstance(client, str) or len(client) > 64:
         raise Refused("client: expected a text of at most 64 characters")
@@ -123,7 +121,6 @@ class Requests:
             "rotate": control.rotate,
             "release": control.release,
             "set": control.set,
-            "stop": control.stop,
             "clear": control.disarm,
             "status": lambda: None,
         }
@@ -133,13 +130,16 @@ class Requests:
     def carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
         """Do what is asked at the present tick; the reply. Raises Refused with the reason."""
         state, control = self._state, self._control
+        if request["command"] == "stop":  # in every mode, from everyone, whatever else it says
+            control.stop()
+            return {"mode": control.mode.value, "torque_off": self._torque.off()}
         command = name, numbers, _ = parse(request, control.mode)
         self._lease.check(command, state.t)
         if name == "clear":
             self._reconnect()
         if name in ("clear", "arm"):
             self._reopen(name)
-        for reason in self._against(name, numbers):
+        if reason := self._against(name, numbers):
             raise Refused(f"{name}: {reason}")
         queued = name == "rotate" and control.mode is Mode.GRASPING
         self._handlers[name](**numbers)
@@ -150,64 +150,67 @@ class Requests:
         elif name == "grasp" and (warning := self._envelope.warning(numbers["force"])):
             reply["warning"] = warning
             self._emit("warning", "grasp", warning)
-        elif name in ("stop", "disarm"):
-            reply["torque_off"] = "confirmed" if self._torque.off() else "unconfirmed"
+        elif name == "disarm":
+            reply["torque_off"] = self._torque.off()
         elif name == "status":
             reply |= self._status()
         return reply
 
-    def _against(self, name: str, numbers: dict[str, float]) -> Iterator[str]:
-        """What the state, the scene and the limits have against a command that is heard."""
+    def _against(self, name: str, numbers: dict[str, float]) -> str:
+        """What the state, the scene or the limits have against a command that is heard."""
         state, settings = self._state, self._settings
         if name in ("arm", "clear") and state.torque and not self._control.torque:
-            yield "the servos have not confirmed torque off yet: check their cable and their power"
+            return "the servos have not confirmed torque off yet: check their cable and their power"
         judged = name in ("arm", "clear", "grasp")
         if judged and (cause := self._safety.cause(state, gripping=name != "arm")):
-            yield cause
+            return cause
         if name == "arm":
             if self._torque.servos is None:
-                yield "this scene has no servos"
+                return "this scene has no servos"
             elif not state.reading.valid:
-                yield "the servos were not read at this tick"
+                return "the servos were not read at this tick"
         elif name == "tare":
             if not self._perception.fingers:
-                yield "this scene has no tactile sensors"
+                return "this scene has no tactile sensors"
             if any(contact.contact for contact in state.contacts):
-                yield "something touches a tip"
+                return "something touches a tip"
         elif name == "move":
-            yield from self._against_move(numbers)
+            return self._against_move(numbers)
         elif name == "grasp":
-            if any(perception.taring for perception in self._perception.fingers):
-                yield "tare is still at work"
+            for perception in self._perception.fingers:
+                if perception.taring:
+                    return "tare is still at work"
             if not self._perception.fingers:
-                yield "each finger needs a tactile sensor in this scene"
+                return "each finger needs a tactile sensor in this scene"
             if settings.servos.mode == "position":
-                yield 'nothing bounds the current while servos.mode is "position"'
+                return 'nothing bounds the current while servos.mode is "position"'
             force = numbers.setdefault("force", settings.control.force_default)
             low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
             if not low < force <= high:
-                yield f"force: found {force:g} N, expected above {low:g} to {high:g}"
+                return f"force: found {force:g} N, expected above {low:g} to {high:g}"
         elif name == "rotate":
             if len(settings.scene.fingers) < 2 or not settings.scene.object_model:
-                yield "needs both fingers and the object model in the scene"
+                return "needs both fingers and the object model in the scene"
             now = self._control.mode is not Mode.GRASPING
             if now and (reason := self._control.why_not_turn(numbers["angle"])):
-                yield reason
+                return reason
         elif name == "set":
             compliance, (low, high) = numbers["compliance"], _COMPLIANCE
             if not low <= compliance <= high:
-                yield f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
+                return f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
+        return ""
 
-    def _against_move(self, numbers: dict[str, float]) -> Iterator[str]:
+    def _against_move(self, numbers: dict[str, float]) -> str:
         if not numbers:
-            yield "left or right is missing"
+            return "left or right is missing"
         for name, q in numbers.items():
             hand, index = self._settings.hand, FINGERS.index(name)
             if name not in self._settings.scene.fingers:
-                yield f"this scene has no {name} finger"
+                return f"this scene has no {name} finger"
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
-                yield f"{name}: found {q:g} rad, expected {low:g} to {high:g}"
+                return f"{name}: found {q:g} rad, expected {low:g} to {high:g}"
+        return ""
 
     def _tare(self) -> None:
         for perception in self._perception.fingers:

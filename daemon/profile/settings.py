@@ -259,6 +259,7 @@ class ControlSettings(Section):
     slip_margin: Fraction = 0.2  # share of that friction which is kept unused
     object_load: NonNegative = 0.0  # N along the tips' faces, the object's weight as a rule
     grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin
+    envelope: str = ""  # what the hand holds, by `softfinger envelope --keep`; "": the built-in's
 
 
 GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself

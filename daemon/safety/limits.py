@@ -34,6 +34,7 @@ _OFF = 0.05  # rad off its goal from which on a joint must be pulled there …
 _PULL = 2.0  # … with so much current [A/rad]: less than any model's own loop gives
 _FELT = 0.04  # A that must be expected for that to be judged
 _PULLED = 0.25  # of what is expected
+_SURE = 4.0  # standard deviations of both tips' tilts that they must be apart
 _NEAR = 0.9  # of a fault's bound: warned from there on
 
 
@@ -242,9 +243,10 @@ def _hand_angle(view: View, state: State, share: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
     left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames alone
-    bound = share * view.limits.residual_angle
-    if not (left.contact and right.contact) or left.tilt_x_std + right.tilt_x_std > 0.25 * bound:
+    if not (left.contact and right.contact):
         return ""
+    unsure = _SURE * (left.tilt_x_std + right.tilt_x_std)
+    bound = max(share * view.limits.residual_angle, unsure)
     q = state.reading.q
     apart = (left.tilt_x - q[0]) - (right.tilt_x + q[1]) + view.settings.object.taper
     if abs(apart) <= bound:

@@ -92,24 +92,25 @@ class TorqueState:
             except ServoError as error:
                 self._fall(error)
 
-    def off(self) -> bool:
-        """Ask for torque off now, whatever the state says; whether the servos have confirmed it.
+    def off(self) -> str:
+        """Ask for torque off now, whatever the state says; "confirmed" by the servos, or not.
 
         It waits for one reply at most. Where that does not come, each tick tries again.
         """
         state, servos = self._state, self.servos
         if servos is None:
-            return True
-        if not self.pending:
+            return "confirmed"
+        first = not self.pending
+        if first:
             state.torque = True  # as far as is known: another program may have put it on
             self._first = self._tried_since = state.t
             self._silent_until = -math.inf
-        if self._last_try != state.seq and not self._is_silent():
+        if self._last_try != state.seq and (first or not self._is_silent()):
             try:
                 self._try(servos, self._unused)
             except ServoError as error:
                 state.write_error = str(error)
-        return not state.torque
+        return "unconfirmed" if state.torque else "confirmed"
 
     def end(self) -> None:
         """Turn torque off now if it may be on; where that fails, the end is the bus's silence."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.wire.loop_link import Ask, Link
+from softfinger.daemon.wire.loop_link import Link
 
 if TYPE_CHECKING:  # the gateway has no use for it
     from softfinger.daemon.wire.local_stop import LocalStop
@@ -58,18 +58,18 @@ class CommandServer:
         link.look()
         if self._local is not None and (link.called or self._stopped is not None):
             self._serve_local(self._local, handler)
-        if not link.asked:
-            return
-        for ask in [ask for ask in link.asked if ask.stop]:
-            link.asked.remove(ask)
-            link.begin_epoch()
-            self._answer(ask, handler)
+        while link.stops:
+            stop = link.stops.popleft()
+            reply = _carry_out(msgpack.unpackb(stop.packed), handler)
+            link.begin_epoch()  # before the answer, after which its client may go on
+            link.reply(stop.number, reply)
         for _ in range(_A_TICK):
             while link.asked and link.asked[0].epoch != link.epoch:
                 link.reply(link.asked.popleft().number, _refusal(PASSED))
             if not link.asked:
                 return
-            self._answer(link.asked.popleft(), handler)
+            ask = link.asked.popleft()
+            link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
 
     def begin_epoch(self) -> None:
         """What has arrived until now is refused: a stop, or the loop could not act."""
@@ -78,17 +78,14 @@ class CommandServer:
     def _serve_local(self, local: LocalStop, handler: Handler) -> None:
         self._link.called = False
         if local.take():
-            self._link.begin_epoch()
             self._stopped = _carry_out({"command": "stop"}, handler)
+            self._link.begin_epoch()
             self._answer_by = time.monotonic() + _BEGUN_WITHIN
         if self._stopped is not None and (
             self._link.begun == self._link.epoch or time.monotonic() > self._answer_by
         ):
             local.answer(self._stopped)
             self._stopped = None
-
-    def _answer(self, ask: Ask, handler: Handler) -> None:
-        self._link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
 
 
 def _carry_out(request: dict[str, Any], handler: Handler) -> bytes:

@@ -75,7 +75,6 @@ class Topics:
 class Ask(NamedTuple):
     """A request that the gateway has checked."""
 
-    stop: bool
     epoch: int
     number: int
     packed: bytes
@@ -120,6 +119,7 @@ class Link:
         self.refused = 0  # requests that the gateway refused because too many came
         self.lost = 0  # messages of the stream that found no room
         self.asked: deque[Ask] = deque()
+        self.stops: deque[Ask] = deque()
         self.notices: deque[str] = deque(maxlen=_NOTICES)  # the gateway's warnings
         self.lasting: list[bytes] = []  # packets that every gateway is sent before it is offered
         self._socket: socket.socket | None = None
@@ -176,7 +176,8 @@ class Link:
         kind = packet[:1]
         if kind in (ASK, STOP):
             epoch, number = ASKED.unpack_from(packet, 1)
-            self.asked.append(Ask(kind == STOP, epoch, number, packet[1 + ASKED.size :]))
+            ask = Ask(epoch, number, packet[1 + ASKED.size :])
+            (self.stops if kind == STOP else self.asked).append(ask)
         elif kind == BEGUN:
             (self.begun,) = EPOCHS.unpack_from(packet, 1)
         elif kind == NOTICE:
@@ -201,6 +202,7 @@ class Link:
             self._polled[_OURS].fd = -1
         self.wanted = 0
         self.asked.clear()
+        self.stops.clear()
         self._waiting.clear()
 
     def begin_epoch(self) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.control.envelope import Envelope
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
 from softfinger.tools.watched import Watched
@@ -27,10 +28,12 @@ def test_outside_of_it_the_reply_says_what_and_why() -> None:
     text = Envelope(settings(0.002)).warning(10.0)
     assert "2 mm (object.width) at friction 0.6 (control.tip_friction) and 0 kg" in text
     assert "no grip comes about" in text
-    # 1 kg at a friction of 0.2 with 10 N, or half of it with 5 N.
-    for load, force in ((9.5, 10.0), (4.5, 5.0)):
-        found = Envelope(settings(0.040, tip_friction=0.25, object_load=load)).warning(force)
-        assert "slips out" in found
+    # 1 kg at a friction of 0.2 with 10 N raised to 20, or as much less as it may be raised less.
+    for load, force, more in ((9.5, 10.0, 10.0), (7.3, 5.0, 10.0), (5.0, 10.0, 0.0)):
+        control = {"tip_friction": 0.25, "object_load": load, "grip_raise_max": more}
+        assert "slips out" in Envelope(settings(0.040, **control)).warning(force)
+    held = settings(0.040, tip_friction=0.25, object_load=4.8)
+    assert Envelope(held).warning(10.0) == ""
     # Another hand, and another law: nothing is known.
     assert Envelope(settings(0.002, law="position")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
@@ -59,6 +62,14 @@ def test_a_map_is_found_printed_drawn_and_read_back(
     rows = [line.split()[-2:] for line in capsys.readouterr().out.splitlines()[3:]]
     assert rows == [["r", "l"], ["r", "h"]]
     assert picture.stat().st_size > 1000
-    assert "no grip" in Envelope(settings(0.002), kept).warning(10.0)
-    assert "slips out" in Envelope(settings(0.04, tip_friction=0.2), kept).warning(10.0)
-    assert Envelope(settings(0.04), kept).warning(10.0) == ""
+    own = str(kept)
+    assert "no grip" in Envelope(settings(0.002, envelope=own)).warning(10.0)
+    slippery = settings(0.04, envelope=own, tip_friction=0.2)
+    assert "slips out" in Envelope(slippery).warning(10.0)
+    assert Envelope(settings(0.04, envelope=own)).warning(10.0) == ""
+    with pytest.raises(
+        SettingsError, match=r"another hand's: control\.law: found energy, expected"
+    ):
+        Envelope(settings(envelope=own, law="position"))
+    with pytest.raises(SettingsError, match=r"control.envelope: .*none.toml: no map"):
+        Envelope(settings(envelope=str(tmp_path / "none.toml")))

@@ -19,11 +19,6 @@ def test_stop_and_status_are_heard_in_every_mode() -> None:
     assert all({"stop", "status"} <= heard(mode) for mode in Mode)
 
 
-@pytest.mark.parametrize("more", [{"why": "smoke"}, {"client": 5}, {"client": "x" * 65}])
-def test_a_stop_stops_whatever_else_it_says(more: dict[str, Any]) -> None:
-    assert parse({"command": "stop", **more}, Mode.HOLDING) == Command("stop", {}, "")
-
-
 def test_nothing_moves_the_hand_before_it_is_armed_or_in_a_fault() -> None:
     assert heard(Mode.DISARMED) == {"arm", "disarm", "tare", "stop", "status"}
     assert heard(Mode.FAULT) == {"clear", "stop", "status"}
@@ -76,7 +71,6 @@ def test_one_commander_at_a_time() -> None:
     take(lease, Command("arm", {}, "a"), 0.0)
     with pytest.raises(Refused, match=r"grasp: a commands the hand \(1\.0 s\)"):
         take(lease, Command("grasp", {}, "b"), 1.0)
-    take(lease, Command("stop", {}, "b"), 1.0)
     take(lease, Command("disarm", {}, "b"), 1.0)
     take(lease, Command("status", {}, ""), 1.0)
     take(lease, Command("grasp", {}, "a"), 1.0)

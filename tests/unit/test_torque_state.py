@@ -158,12 +158,12 @@ def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(
     assert daemon.hand.q.tolist() == pytest.approx([-0.1, -0.1], abs=0.04)
 
 
-def test_stop_and_disarm_turn_torque_off_whatever_the_state_says(make: Make) -> None:
+def test_stop_and_disarm_turn_torque_off_whatever_the_state_and_a_stop_say(make: Make) -> None:
     daemon = make()
     assert daemon.loop.servos is not None
-    for name in ("stop", "disarm"):
+    for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
         daemon.loop.servos.torque_on()  # as another program may have done
-        assert command(daemon, name)["torque_off"] == "confirmed"
+        assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert daemon.hand is not None
         assert not torque_of(daemon).any()

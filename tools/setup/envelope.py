@@ -9,7 +9,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from softfinger.daemon.control.envelope import HELD, LOST, MEANING, REFUSED, TURNED, identity
+from softfinger.daemon.control.envelope import (
+    HELD,
+    LOST,
+    MEANING,
+    REFUSED,
+    TURNED,
+    identity,
+    raised,
+)
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, number, profile
@@ -159,6 +167,7 @@ def _keep(
         "# What the hand holds, by `softfinger envelope --keep`; a row for each friction and mass,",
         "# a letter for each size: " + ", ".join(f"{k} {text}" for k, text in MEANING.items()),
         f"force = {force!r}",
+        f"raised = {raised(settings, force)!r}",
         f"friction = {json.dumps([float(each) for each in frictions])}",
         f"mass = {json.dumps([float(each) for each in masses])}",
         f"size = {json.dumps([round(1e-3 * each, 6) for each in sizes])}",
@@ -168,11 +177,8 @@ def _keep(
         texts = ",\n".join(f'    "{"".join(cell.outcome for cell in row)}"' for row in rows)
         lines.append(f"{shape} = [\n{texts},\n]")
     for name, section in identity(settings).items():
-        if name == "law":
-            lines.insert(2, f"identity.law = {json.dumps(section)}")
-        else:
-            lines += [f"[identity.{name}]"]
-            lines += [f"{key} = {json.dumps(value)}" for key, value in section.items()]
+        lines += [f"[identity.{name}]"]
+        lines += [f"{key} = {json.dumps(value)}" for key, value in section.items()]
     with write_text(path) as file:
         file.write("\n".join(lines) + "\n")
 
