@@ -26,7 +26,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 def make_tip(settings: Settings) -> Fingertip:
     """The fingertip."""
     tip = settings.tip
-    return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base)
+    return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base, tip.face)
 
 
 SHALLOWEST = 0.05  # d over the radius from which a law's misfit of its points is judged

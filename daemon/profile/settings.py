@@ -97,6 +97,7 @@ class TipSettings(Section):
     physics: Literal["springs", "solid"] = "springs"
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
+    face: Literal["frictionless", "sticking"] = "frictionless"  # a solid tip on the object
 
 
 class MaterialSettings(Section):

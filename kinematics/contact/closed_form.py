@@ -31,6 +31,7 @@ POISSON = (0.45, 0.4995)  # of a solid tip: what its data cover
 
 Physics = Literal["springs", "solid"]
 Base = Literal["bonded", "lying"]
+Face = Literal["frictionless", "sticking"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,9 @@ class Fingertip:
     """A hemispherical soft tip of ``radius`` a [m].
 
     ``physics`` says how it gives way: as independent "springs", or as "solid" rubber, linear
-    elastic with the ratio ``poisson``, its ``base`` "bonded" to the sensor or "lying" on it; the
-    last two are for solid tips alone. Raises ValueError for values out of their range; a radius is
+    elastic with the ratio ``poisson``, its ``base`` "bonded" to the sensor or "lying" on it, its
+    ``face`` "frictionless" or "sticking" to what it touches; the last three are for solid tips
+    alone. Raises ValueError for values out of their range; a radius is
     at most 1 m.
     """
 
@@ -47,9 +49,11 @@ class Fingertip:
     physics: Physics = "springs"
     poisson: float = 0.49
     base: Base = "bonded"
+    face: Face = "frictionless"
 
     def __post_init__(self) -> None:
-        for name, known in (("physics", get_args(Physics)), ("base", get_args(Base))):
+        for name, kind in (("physics", Physics), ("base", Base), ("face", Face)):
+            known = get_args(kind)
             if getattr(self, name) not in known:
                 expected = " or ".join(map(repr, known))
                 raise ValueError(f"{name} must be {expected}, not {getattr(self, name)!r}")

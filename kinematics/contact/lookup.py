@@ -27,6 +27,7 @@ from softfinger.kinematics.contact.closed_form import theta_limit
 
 FloatArray = NDArray[np.float64]
 Ratios: TypeAlias = tuple[float, float, float, float, float]
+Triple: TypeAlias = tuple[float, float, float]
 Six: TypeAlias = tuple[float, float, float, float, float, float, bool]
 
 HALF_PI = math.pi / 2
@@ -319,6 +320,16 @@ def lookup_at(p: Pointer, d: float, theta: float) -> Six:
             return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
         d, h, s, c, gap, inside = _slowly(p, d, theta)
     return _at(p, d, h, s, c, gap, inside)
+
+
+@inlined_kernel
+def push_at(
+    p: Pointer, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
+) -> Triple:
+    """N = ∂U/∂d in the domain, ∂N/∂d and ∂N/∂θ, for ``forces``: F, ∂F/∂d and ∂F/∂θ there."""
+    force, force_d, force_theta = forces
+    more = force_theta + force * tangent
+    return force * inverse_cosine, force_d * inverse_cosine, more * inverse_cosine
 
 
 @kernel

@@ -3,9 +3,14 @@
 The file has them as polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, with Young's modulus E
 and the radius a taken out; its ``notes`` say how it was made and how far off it is. Here ν is put
 in. The energy is U = E a³ t⁵ g(t, sin² θ), whose partials are the push along the face's normal
-N = ∂U/∂d and the moment ∂U/∂θ. The face is frictionless, so the force on the base is N cos θ, and
+N = ∂U/∂d and the moment ∂U/∂θ. With the force F on the base,
 
-    p(r, φ) = N/a² [cos θ B_0(r) + Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r)].
+    p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
+
+Without friction F = N cos θ. A face that sticks holds each point of the tip where it touched, the
+plane coming straight along its normal from first touch on. Then N = ∂U/∂d still, ∂U/∂θ compares
+such presses, a shear T = −N sin θ cos θ q_0 pulls the tip up the slope, and
+F = N cos θ (1 − sin² θ q_0).
 
 A shear force T on the face, towards φ_T, adds T/a² B_T(r) cos(φ − φ_T), where T counts as if it
 were at the height a: its moment about the base's middle is T a.
@@ -40,7 +45,8 @@ class SolidData:
     square: float  # largest sin² θ
     energy: FloatArray  # g, and its partials by t, t twice, sin² θ, and both [5, i, j]
     harmonics: NDArray[np.int64]  # m of each mode [k]; 0 of the first
-    shares: FloatArray  # q [k, i, j]; none of the first
+    shares: FloatArray  # q [k, i, j]
+    stick: FloatArray  # q_0, and its partials by t and sin² θ [3, i, j]
     edges: FloatArray  # of the rings in r/a [rings + 1]
     modes: FloatArray  # B [k, rings], means over the rings
     shear: FloatArray  # B_T [rings]
@@ -49,12 +55,13 @@ class SolidData:
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """The data of a solid ``tip``'s ν and base."""
+    """The data of a solid ``tip``'s ν, base and face."""
+    block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
         kept: dict[str, Any] = {
-            name.removeprefix(f"{tip.base}."): file[name]
+            name.removeprefix(f"{block}."): file[name]
             for name in file.files
-            if "." not in name or name.startswith(f"{tip.base}.")
+            if "." not in name or name.startswith(f"{block}.")
         }
     low, high = kept["nu_range"]
     at = (2.0 * tip.poisson - low - high) / (high - low)
@@ -74,6 +81,8 @@ def solid_data(tip: Fingertip) -> SolidData:
     energy = powers(ratio * 8.0 / (15.0 * (1.0 - tip.poisson**2)))
     by_t = 2.0 / root * _slope(energy)
     by_both = 2.0 / square * _slope(by_t.T).T
+    shares = np.stack([powers(by_poisson(each)) for each in kept["coef"]])
+    stick = shares[0]
     return SolidData(
         root,
         square,
@@ -81,11 +90,12 @@ def solid_data(tip: Fingertip) -> SolidData:
             [energy, by_t, 2.0 / root * _slope(by_t), 2.0 / square * _slope(energy.T).T, by_both]
         ),
         kept["m"].astype(np.int64),
-        np.stack([powers(by_poisson(each)) for each in kept["coef"]]),
+        shares,
+        np.stack([stick, 2.0 / root * _slope(stick), 2.0 / square * _slope(stick.T).T]),
         kept["ring_edges"],
         kept["basis"],
         by_poisson(kept["shear"]),
-        float(kept.get("error", 0.0)),
+        float(kept["force_error"]),
     )
 
 

@@ -1,7 +1,8 @@
 """The lookup kernel of a solid tip's contact table, and the record that it reads.
 
 One polynomial g(t, sin² θ), t = √(d/a), and its partials give all six outputs from one energy
-U = E a³ t⁵ g (see `solid_data`), so that they agree with each other to rounding.
+U = E a³ t⁵ g (see `solid_data`), so that they agree with each other to rounding. What a sticking
+face takes off the force on the base is a second one, q_0.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from softfinger.kinematics.compiled.simd import (
     polynomials,
 )
 from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
-from softfinger.kinematics.contact.lookup import Six, lookup_at, stiffness_ahead
+from softfinger.kinematics.contact.lookup import Six, Triple, lookup_at, push_at, stiffness_ahead
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
-from softfinger.kinematics.contact.solid_data import FloatArray, SolidData, solid_data
+from softfinger.kinematics.contact.solid_data import FloatArray, solid_data
 
 _SHAPE = 9
 
@@ -51,7 +52,9 @@ class SolidTable(Record):
     max_error: float  # of the data, relative
     worst_d: float
     worst_theta: float
+    sticks: bool
     coefficients: Annotated[FloatArray, SIZES[_SHAPE]]
+    stick: Annotated[FloatArray, SIZES[_SHAPE]]  # q_0 and its partials by t, sin² θ
 
 
 def solid_table(tip: Fingertip, material: Material) -> SolidTable:
@@ -66,16 +69,18 @@ def solid_table(tip: Fingertip, material: Material) -> SolidTable:
     table.by_root, table.by_square = 2.0 / data.root, 2.0 / data.square
     table.at_first = 8.0 / (15.0 * (1.0 - tip.poisson**2))
     table.max_error = data.error
-    table.coefficients = _numbers(data)
+    table.sticks = tip.face == "sticking"
+    table.coefficients = _numbers(data.energy)
+    table.stick = _numbers(data.stick)
     return table
 
 
-def _numbers(data: SolidData) -> FloatArray:
-    """g and its partials as the numbers that `compiled.simd` evaluates."""
+def _numbers(powers: FloatArray) -> FloatArray:
+    """Polynomials [lanes, i, j] as the numbers that `compiled.simd` evaluates."""
     terms, rows = SHAPES[_SHAPE][0], len(SHAPES[_SHAPE])
     out = np.zeros((rows, terms, STRIDE))
-    lanes, i, j = data.energy.shape
-    out[:j, terms - i :, :lanes] = data.energy[:, ::-1].T
+    lanes, i, j = powers.shape
+    out[:j, terms - i :, :lanes] = powers[:, ::-1].T
     return out.reshape(-1)
 
 
@@ -100,6 +105,17 @@ def energy_lanes(table: SolidTable, t: float, square: float) -> Lanes:
     y = square * table.by_square - 1.0
     lanes: Lanes = polynomials(address(table.coefficients), 0, 9, x, y)
     return lanes
+
+
+@inlined_kernel
+def _held(table: SolidTable, t: float, square: float) -> Triple:
+    """F over N cos θ, which is 1 − sin² θ q_0, and its partials by t and sin² θ."""
+    if not table.sticks:
+        return 1.0, 0.0, 0.0
+    x = t * table.by_root - 1.0
+    y = square * table.by_square - 1.0
+    q, q_t, q_s, _, _ = polynomials(address(table.stick), 0, 9, x, y)
+    return 1.0 - square * q, -square * q_t, -q - square * q_s
 
 
 @inner_kernel
@@ -130,11 +146,12 @@ def _solid_lookup_at(p: Pointer, d: float, theta: float) -> Six:
     push = size * (2.5 * g + 0.5 * t * g_t)
     stiffness = 0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
     push_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
+    held, held_t, held_s = _held(table, t, square)
     return (
-        c * push,
+        c * push * held,
         size * depth * g,
-        c * stiffness,
-        c * push_theta - s * push,
+        c * (stiffness * held + push * held_t * 0.5 / (a * t)),
+        (c * push_theta - s * push) * held + c * push * chain * held_s,
         push,
         chain * size * depth * g_s,
         inside,
@@ -147,6 +164,30 @@ def _solid_stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
     table = solid_at(p)
     stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
     return stiffness * math.sqrt(reach * table.radius)
+
+
+@inner_kernel
+def _solid_push_at(
+    p: Pointer, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
+) -> Triple:
+    """As `lookup.push_at`."""
+    table = solid_at(p)
+    if not table.sticks:
+        force, force_d, force_theta = forces
+        more = force_theta + force * tangent
+        return force * inverse_cosine, force_d * inverse_cosine, more * inverse_cosine
+    within = abs(theta) <= table.tilt
+    s = math.sin(theta)
+    t = math.sqrt(d * table.inverse_radius)
+    g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, s * s if within else 2.0 / table.by_square)
+    chain = 2.0 * s * math.cos(theta) if within else 0.0
+    a = table.radius
+    size = table.modulus * a * a * t * t * t
+    return (
+        size * (2.5 * g + 0.5 * t * g_t),
+        0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt)),
+        chain * size * (2.5 * g_s + 0.5 * t * g_ts),
+    )
 
 
 @kernel
@@ -166,4 +207,5 @@ def _is_solid(start: Any) -> bool:
 
 
 cast(Any, lookup_at).also(_solid_lookup_at, _is_solid)
+cast(Any, push_at).also(_solid_push_at, _is_solid)
 cast(Any, stiffness_ahead).also(_solid_stiffness_ahead, _is_solid)

@@ -43,7 +43,9 @@ class ContactForces(NamedTuple):
     energy: FloatArray  # U [J]
     force_d: FloatArray  # ∂F/∂d [N/m]
     force_theta: FloatArray  # ∂F/∂θ [N/rad]
-    energy_d: FloatArray  # ∂U/∂d = F/cos θ [N], the push along the face's normal
+    energy_d: (
+        FloatArray  # ∂U/∂d [N], F/cos θ unless the face sticks: the push along the face's normal
+    )
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
     inside: NDArray[np.bool_]  # False where d or θ was clamped to the domain
     max_error: float  # bound of the relative error of any of the six, see Certificate

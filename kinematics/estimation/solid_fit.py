@@ -23,7 +23,7 @@ from softfinger.kinematics.estimation.solid_projection import (
     set_model,
 )
 from softfinger.kinematics.estimation.state import EstimatorState
-from softfinger.kinematics.sensing.solid_pressure import PICTURES
+from softfinger.kinematics.sensing.solid_pressure import PICTURES, own_shear
 
 _PASSES = 24  # projections of a frame
 _LIMITED = 4  # of them that may end where the data do, one after the other
@@ -207,8 +207,12 @@ def _finish(state: EstimatorState, solid: SolidFit, arena: Pointer, iterations: 
     area = state.grid.radius * state.grid.radius
     along = area * math.cos(state.options.rotation)
     across = area * math.sin(state.options.rotation)
-    estimate.shear_x = along * solid.shear[0] - across * solid.shear[1]
-    estimate.shear_y = across * solid.shear[0] + along * solid.shear[1]
+    square = solid.n_x * solid.n_x + solid.n_y * solid.n_y
+    own = fit.gain * own_shear(solid.weights, solid.d, square)
+    x = solid.shear[0] + own * solid.n_x
+    y = solid.shear[1] + own * solid.n_y
+    estimate.shear_x = along * x - across * y
+    estimate.shear_y = across * x + along * y
     estimate.d = solid.d
     estimate.n_x = solid.n_x
     estimate.n_y = solid.n_y

@@ -131,12 +131,16 @@ def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     by_d = weights.by_d
     by_x = weights.by_x
     by_y = weights.by_y
-    value[0] = push * cosine
-    by_d[0] = push_t * t_d * cosine
-    both = 2.0 * push_s * cosine - push / cosine
+    _evaluate_shares(weights, x, y)
+    # F over N cos θ is not 1 where the face sticks.
+    held = 1.0 - square * weights.q[0]
+    held_t = -square * weights.q_x[0] * table.by_root
+    held_s = -weights.q[0] - square * weights.q_y[0] * table.by_square
+    value[0] = push * cosine * held
+    by_d[0] = (push_t * held + push * held_t) * t_d * cosine
+    both = 2.0 * (push_s * held + push * held_s) * cosine - push * held / cosine
     by_x[0] = n_x * both
     by_y[0] = n_y * both
-    _evaluate_shares(weights, x, y)
     # (n_x + i n_y)^m and its derivative over m; modes stand in the order of m.
     m = 0
     power = 1.0 + 0.0j
@@ -164,6 +168,18 @@ def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
             by_x[at] = share_s * n_x * power.imag + share * m * below.imag
             by_y[at] = share_s * n_y * power.imag + share * m * below.real
             at += 1
+
+
+@inner_kernel
+def own_shear(weights: Weights, d: float, square: float) -> float:
+    """The shear over sin θ and a² [Pa] of a press straight on a sticking face, at the height a.
+
+    The modes have it already. ``weights`` are those of the contact.
+    """
+    q = weights.q[0]
+    push = weights.value[0] / (1.0 - square * q)
+    shear: float = -push * q * (1.0 - d * weights.table.inverse_radius)
+    return shear
 
 
 @fast_inner_kernel
@@ -204,15 +220,15 @@ def render_solid(
     shown: FloatArray,
     contact: tuple[float, float, float],
     shear: tuple[float, float],
+    whole: bool,
     gain: float,
     out: FloatArray,
 ) -> None:
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
 
-    ``shear`` [N] is the force along x and y on the face, as at the height a.
-
-    ``shown`` are the grid's pictures. d ≤ 0 gives zeros; beyond what the data cover the deepest
-    and the most tilted contact of that azimuth.
+    ``shear`` [N] is the force along x and y on the face, as at the height a: the ``whole``, or what
+    is more than a press straight has. ``shown`` are the grid's pictures. d ≤ 0 gives zeros; beyond
+    what the data cover the deepest and the most tilted contact of that azimuth.
     """
     each = weights[0]
     table = each.table
@@ -225,16 +241,20 @@ def render_solid(
     if tilt > most:
         n_x *= most / tilt
         n_y *= most / tilt
-    weigh(each, min(d, table.deepest), n_x, n_y)
+    d = min(d, table.deepest)
+    weigh(each, d, n_x, n_y)
+    own = own_shear(each, d, n_x * n_x + n_y * n_y) if whole else 0.0
     cells = out.size
     start = address(out)
     for k in range(each.pictures):
         picture = further(address(shown), k * cells)
         add_picture(picture, gain * each.value[k], 0, cells, start)
     area = table.radius * table.radius
-    for k in range(2):
-        picture = further(address(shown), (each.pictures + k) * cells)
-        add_picture(picture, gain * shear[k] / area, 0, cells, start)
+    x = shear[0] / area - own * n_x
+    y = shear[1] / area - own * n_y
+    picture = further(address(shown), each.pictures * cells)
+    add_picture(picture, gain * x, 0, cells, start)
+    add_picture(further(picture, cells), gain * y, 0, cells, start)
     for k in range(cells):
         start[k] = max(start[k], 0.0)
 
@@ -251,7 +271,8 @@ class SolidPressure:
         contact: tuple[float, float, float],
         gain: float,
         out: FloatArray,
-        shear: tuple[float, float] = (0.0, 0.0),
+        shear: tuple[float, float] | None = None,
     ) -> None:
-        """As :func:`render_solid`."""
-        render_solid(self._weights, self._shown, contact, shear, gain, out)
+        """As :func:`render_solid`; the whole ``shear``, that of a press straight if not given."""
+        whole = shear is not None
+        render_solid(self._weights, self._shown, contact, shear or (0.0, 0.0), whole, gain, out)

@@ -1,9 +1,10 @@
 """Reference frames of a solid tip, by finite elements that share nothing with the tool's.
 
 Half of the hemisphere (y ≥ 0) in curved tetrahedra with Taylor-Hood elements; contact by its dual
-problem: a pressure ≥ 0 on each triangle of the surface, minimised with bounds by L-BFGS-B. Lengths
-in tip radii, stresses in E. Needs scikit-fem, gmsh and pypardiso, some 2 GB and half an hour:
-``python -m tests.harness.solid_reference tests/golden/solid_frames.npz``.
+problem: a pressure ≥ 0 on each triangle of the surface, minimised with bounds by L-BFGS-B. A face
+that sticks is pressed in small steps, each triangle held where it was in the middle of the step
+that brought it to touch. Lengths in tip radii, stresses in E. Needs scikit-fem, gmsh and pypardiso,
+some 2 GB and an hour: ``python -m tests.harness.solid_reference tests/golden/solid_frames.npz``.
 """
 
 from __future__ import annotations
@@ -26,7 +27,18 @@ POINTS = {  # ν, d [mm], θ [°]
         (0.49, 0.5, 25), (0.49, 3, 5), (0.49, 6, 15), (0.495, 1, 25), (0.495, 4, 0), (0.495, 7, 25),
     ),
     "lying": ((0.47, 2, 10), (0.49, 5, 20), (0.495, 1, 25)),
+    "bonded-sticking": ((0.49, 2, 20), (0.49, 5, 20)),
+    "lying-sticking": ((0.47, 4, 15),),
 }  # fmt: skip
+STEPS = 60
+
+
+def dual_energy(
+    load: np.ndarray, compliance: np.ndarray, need: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Of a contact's forces, and its slope."""
+    moved = compliance @ load
+    return load @ moved / 2 - load @ need, moved - need
 
 
 def on_base(x: np.ndarray) -> np.ndarray:
@@ -109,6 +121,18 @@ class SolidTip:
         self.solver = PyPardisoSolver(mtype=-2)
         self.solver.factorize(self.held)
 
+    def along(self, axis: np.ndarray, near: np.ndarray) -> sparse.csr_matrix:
+        """Motion of the chosen triangles along ``axis``: its integral over the root of the area."""
+        surface = self.surface
+        facets = np.arange(near.size)
+        shape = (near.size, self.matrix.shape[0])
+        rows = sparse.csr_matrix(shape)
+        for k in range(surface.Nbfun):
+            share = np.einsum("i,ifq->fq", axis, surface.basis[k][0].value) * surface.dx
+            rows += sparse.csr_matrix((share.sum(1), (facets, surface.element_dofs[k])), shape)
+        root = np.sqrt(surface.dx.sum(axis=1)[near])
+        return (sparse.diags(1 / root) @ rows[near][:, self.free]).tocsr()
+
     def press(self, d: float, theta: float) -> tuple[float, float, np.ndarray]:
         """Push along the plane's normal, energy, and all degrees of freedom."""
         normal = np.array([np.sin(theta), 0.0, np.cos(theta)])
@@ -116,18 +140,7 @@ class SolidTip:
         overlap = np.einsum("i,ifq->fq", normal, surface.global_coordinates()) - (1 - d)
         near = overlap.max(axis=1) > -0.02
         root = np.sqrt(surface.dx.sum(axis=1)[near])
-        facets = np.arange(len(overlap))
-        rows = sum(
-            sparse.csr_matrix(
-                (
-                    (np.einsum("i,ifq->fq", normal, surface.basis[k][0].value) * surface.dx).sum(1),
-                    (facets, surface.element_dofs[k]),
-                ),
-                (len(overlap), self.matrix.shape[0]),
-            )
-            for k in range(surface.Nbfun)
-        )
-        rows = sparse.diags(1 / root) @ rows[near][:, self.free]
+        rows = self.along(normal, near)
         columns = rows.T.tocsr()
         need = (overlap * surface.dx).sum(axis=1)[near] / root
 
@@ -148,6 +161,55 @@ class SolidTip:
         every = np.zeros(self.matrix.shape[0])
         every[self.free] = -self.solver.solve(self.held, columns @ found.x)
         return 2 * float(found.x @ root), -2 * float(found.fun), every
+
+    def stick(self, d: float, theta: float) -> tuple[float, float, np.ndarray]:
+        """As `press`, with a face that sticks."""
+        sine, cosine = np.sin(theta), np.cos(theta)
+        axes = np.array([[sine, 0.0, cosine], [cosine, 0.0, -sine], [0.0, 1.0, 0.0]])
+        surface = self.surface
+        height = np.einsum("i,ifq->fq", axes[0], surface.global_coordinates())
+        near = height.max(axis=1) > 1 - d - 0.02
+        root = np.sqrt(surface.dx.sum(axis=1)[near])
+        count = root.size
+        rows = sparse.vstack([self.along(axis, near) for axis in axes]).tocsr()
+        compliance = np.empty((3 * count, 3 * count))
+        for low in range(0, 3 * count, 60):
+            loads = np.asarray(rows[low : low + 60].todense()).T
+            compliance[:, low : low + 60] = rows @ self.solver.solve(self.held, loads)
+        print("compliance of", count, "triangles", flush=True)
+        stuck, held = np.zeros(count, dtype=bool), np.zeros(3 * count)
+        moved, load = np.zeros(3 * count), np.zeros(3 * count)
+        for depth in np.linspace(0, np.sqrt(d), STEPS + 1)[1:] ** 2:
+            need = held.copy()
+            need[:count] = ((height - (1 - depth)) * surface.dx).sum(axis=1)[near] / root
+            free = np.concatenate([np.ones(count, dtype=bool), stuck, stuck])
+            bounds = [(0, None)] * count + [(None, None)] * int(2 * stuck.sum())
+            found = minimize(
+                dual_energy,
+                load[free],
+                args=(compliance[np.ix_(free, free)], need[free]),
+                jac=True,
+                method="L-BFGS-B",
+                bounds=bounds,
+                options={
+                    "maxiter": 3000,
+                    "maxfun": 5000,
+                    "maxcor": 50,
+                    "ftol": 1e-14,
+                    "gtol": 1e-8,
+                },
+            )
+            load = np.zeros(3 * count)
+            load[free] = found.x
+            now = compliance @ load
+            touching = load[:count] > 0
+            new = np.concatenate([np.zeros(count, dtype=bool), *[touching & ~stuck] * 2])
+            held[new] = (moved[new] + now[new]) / 2
+            stuck, moved = touching, now
+        energy = float(load @ moved) / 2
+        every = np.zeros(self.matrix.shape[0])
+        every[self.free] = -self.solver.solve(self.held, rows.T @ load)
+        return 2 * float(load[:count] @ root), 2 * energy, every
 
     def frame(self, every: np.ndarray) -> tuple[float, np.ndarray]:
         """Force on the base, and its pressure averaged over the sensor's cells, rows along y."""
@@ -188,9 +250,10 @@ def main() -> None:
     found: dict[str, list[object]] = {}
     for base in arguments.base or POINTS:
         for poisson in sorted({point[0] for point in POINTS[base]}):
-            tip = SolidTip(mesh, poisson, base == "bonded")
+            tip = SolidTip(mesh, poisson, base.startswith("bonded"))
             for _, d, degrees in (point for point in POINTS[base] if point[0] == poisson):
-                push, energy, every = tip.press(d / RADIUS, np.radians(degrees))
+                way = tip.stick if base.endswith("sticking") else tip.press
+                push, energy, every = way(d / RADIUS, np.radians(degrees))
                 force, frame = tip.frame(every)
                 row = {
                     "base": base,

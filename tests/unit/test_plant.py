@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from softfinger import ContactTable, Fingertip, Material
 from softfinger.daemon.simulation.physics.forces import place_finger
 from softfinger.daemon.simulation.physics.plant_state import TipContact
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -71,6 +72,15 @@ def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContac
     ],
 )
 def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
+    gradient_of_one_energy(table, depth, scene)
+
+
+def test_forces_of_a_solid_tip_that_sticks_are_the_gradient_of_one_energy():
+    tip = Fingertip(0.020, "solid", 0.48, "lying", "sticking")
+    gradient_of_one_energy(ContactTable.build(tip, Material.constant(MODULUS)), (1e-3, 0.01), {})
+
+
+def gradient_of_one_energy(table, depth, scene):
     hand = make(table, tip_friction=500.0, **scene)
     generator = np.random.default_rng(3)
     step = 1e-7

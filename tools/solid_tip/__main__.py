@@ -27,7 +27,7 @@ NOTES = """Hemisphere of linear elastic rubber pressed by a rigid plane, by fini
 python -m softfinger.tools.solid_tip, {rings} elements along the arc ({sticking} where the face
 sticks), {nodes} values of ν. The plane is without friction, or (…-sticking) holds each point where
 it touched, coming straight along its normal from first touch on: T = N sin θ cos θ P[coef_0] is
-the force along (cos θ, 0, −sin θ) against the tip; so it is held back.
+the force along (cos θ, 0, −sin θ) against the tip. It is negative.
 Lengths in a, stresses in E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = √(d/a), P a product of
 Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1, and ν on nu_range:
 N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]);
@@ -36,8 +36,8 @@ F = N cos θ (1 − sin² θ P[coef_0]), with coef_0 = 0 unless the face sticks.
 A shear force T on the face adds T B_T(r) cos(φ − φ_T); shear holds B_T's means over the rings
 (for a force at the pole), as Chebyshev coefficients in ν.
 Base bonded: u = 0. Lying: u_z = 0 (held down: it may pull), free to slide but for a uniform shear
-that carries N sin θ. error, force_error, pressure_error: largest differences in N and in a sensor's
-frame from a file of a coarser mesh. Largest and rms differences between file and presses:
+that carries the tip's own. force_error, pressure_error: largest differences in N and in a sensor's
+frame from a coarser mesh. Largest and rms differences between file and presses:
 {errors}"""
 
 
@@ -147,7 +147,6 @@ def main() -> None:
                 rows.append(
                     f"{block}, {rings} elements, ν {poisson:.4f}{told}: {differences(tip, each)}"
                 )
-    arrays["error"] = np.array(max(arrays[f"{block}.force_error"] for block in BLOCKS))
     notes = NOTES.format(
         rings=arguments.rings,
         sticking=arguments.sticking,

@@ -59,7 +59,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.contact.lookup import lookup_at, stiffness_ahead
+from softfinger.kinematics.contact.lookup import lookup_at, push_at, stiffness_ahead
 
 D_MIN = 1e-9  # m, less is no contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
@@ -169,19 +169,21 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
             d_soft_d = 0.0
             d_soft_theta = 0.0
         force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(table, d_soft, tip.theta)
+        slope, slope_d, slope_theta = push_at(
+            table, d_soft, tip.theta, (force, force_d, force_theta), tangent, inverse_cosine
+        )
         scale = p.scale
         force *= scale
         force_d *= scale
         force_theta *= scale
-        # ∂U₀/∂d = F/cos θ for every material; beyond the range U₀ goes on along that slope.
+        slope *= scale
+        slope_d *= scale
+        slope_theta *= scale
+        # Beyond the range U₀ goes on along its slope ∂U₀/∂d.
         inverse_d = 1.0 / d_soft
-        slope = force * inverse_cosine
         over = d - d_soft
         soft = scale * soft + slope * over
-        soft_theta = (
-            scale * soft_theta
-            + (force_theta + force * tangent + force_d * d_soft_theta) * inverse_cosine * over
-        )
+        soft_theta = scale * soft_theta + (slope_theta + slope_d * d_soft_theta) * over
 
         # T and N are polynomials of the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
         firm = p.shear_stiffness
