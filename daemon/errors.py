@@ -16,6 +16,7 @@ __all__ = [
     "NoDescriptor",
     "NoStream",
     "NotInTime",
+    "PluginError",
     "RecordingError",
     "Refused",
     "ServoError",
@@ -27,6 +28,10 @@ __all__ = [
 
 class SettingsError(SoftfingerError):
     """The settings can't be used. The message lists every error: file, key, found, expected."""
+
+
+class PluginError(SoftfingerError):
+    """A backend of an installed package can't be used. The message names both and the reason."""
 
 
 class AddressError(SoftfingerError):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 import softfinger
+from softfinger.daemon.backends import KINDS, used
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
@@ -55,7 +56,7 @@ def load(
         found = [_line(details) for details in error.errors()]
     if directory is not None:
         settings = _with_directory(settings, directory)
-    found += problems(settings, wrong)
+    found += [*problems(settings, wrong), *_plugin_problems(settings, wrong)]
     if found:
         raise SettingsError(
             "\n".join(
@@ -104,17 +105,21 @@ def _read(path: Path, name: str) -> dict[str, Any]:
 def _change(data: dict[str, Any], change: str) -> str:
     """Put one ``section.key=value`` into ``data`` and return its key. Raises SettingsError."""
     key, equals, text = change.partition("=")
-    section, dot, inner = key.strip().partition(".")
-    if not (equals and dot and section and inner):
+    *sections, inner = key.strip().split(".")
+    if not (equals and sections and all(sections) and inner):
         raise SettingsError(f"--set: found {change!r}, expected section.key=value")
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
         value = text.strip()  # a text needs no quotes of its own: the shell has taken them
-    held = data.setdefault(section, {})
-    if isinstance(held, dict):
+    held = data
+    for section in sections:
+        held = held.setdefault(section, {})
+        if not isinstance(held, dict):
+            break
+    else:
         held[inner] = value
-    return f"{section}.{inner}"
+    return key.strip()
 
 
 def _tuples(value: Any, depth: int = 0) -> Any:
@@ -140,26 +145,53 @@ def _sound_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
     return Settings(**sound), wrong
 
 
-def _line(details: ErrorDetails) -> str:
-    location = [str(part) for part in details["loc"]]
+def _plugin_problems(settings: Settings, wrong: Collection[str]) -> Iterator[str]:
+    """What is wrong with the tables of plugins, and with a plugin's shape as it is set."""
+    tables = dict(settings.plugins.model_extra or {})
+    for key, backend in used(settings).items():
+        if not backend.source or key.partition(".")[0] in wrong:
+            continue
+        name = backend.name
+        table = tables.pop(name, None)
+        if table is not None and backend.section is None:
+            yield f"plugins.{name}: found settings, but {backend.source} has none"
+        try:
+            options = backend.options(settings)
+        except ValidationError as error:
+            section = backend.section
+            yield from (_line(each, ["plugins", name], section) for each in error.errors())
+            continue
+        if backend.shape:
+            try:
+                backend.load()(settings.simulation, *options)
+            except Exception as error:  # whatever a stranger's function does
+                yield f"{key}: {backend.source}: {type(error).__name__}: {error}"
+    for name in tables:
+        if not any(name in kind for kind in KINDS):
+            yield f"plugins.{name}: found settings of a plugin that is not installed"
+
+
+def _line(
+    details: ErrorDetails, above: Sequence[str] = (), model: type[BaseModel] | None = Settings
+) -> str:
+    """One error; ``above`` is the place of ``model``'s table in the profile."""
+    inside = [str(part) for part in details["loc"]]
+    location = [*above, *inside]
     key = shown(".".join(location))[1:-1]
     if details["type"] == "extra_forbidden":
-        known = _known_keys(location[:-1])
+        known = list(_model(inside[:-1], model).model_fields)
         near = difflib.get_close_matches(location[-1][:80], known, n=1, cutoff=0.0)
-        return f"{key}: found an unknown key, expected a known one; nearest: {near[0]}"
+        nearest = f"; nearest: {near[0]}" if near else ""
+        return f"{key}: found an unknown key, expected a known one{nearest}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
     expected = details["msg"]
     for old, new in _EXPECTED:
         expected = expected.replace(old, new, 1)
-    if details["type"] == "less_than_equal" and _is_length(location):
+    if details["type"] == "less_than_equal" and not above and _is_length(location):
         metres = 1e-3 * float(details["input"])
         expected += f" m; {details['input']:g} mm are {metres:g}" if metres < 1.0 else " m"
     return f"{key}: found {shown(details['input'])}, expected {expected}"
-
-
-def _known_keys(location: list[str]) -> list[str]:
-    return list(_model(location).model_fields)
 
 
 def _is_length(location: list[str]) -> bool:
@@ -167,13 +199,11 @@ def _is_length(location: list[str]) -> bool:
     return isinstance(extra, dict) and extra.get("unit") == "m"
 
 
-def _model(location: list[str]) -> type[BaseModel]:
-    model: type[BaseModel] = Settings
+def _model(location: list[str], model: Any = Settings) -> Any:
+    """The section at that place within ``model``."""
     for part in location:
-        inner = model.model_fields[part].annotation
-        assert isinstance(inner, type)
-        assert issubclass(inner, BaseModel)
-        model = inner
+        model = model.model_fields[part].annotation
+        assert issubclass(model, BaseModel)
     return model
 
 

@@ -7,13 +7,13 @@ rates Hz; pairs are (left, right).
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from softfinger.daemon.backends import SERVOS, SHAPES, TACTILE, known_servo_models
+from softfinger.daemon.backends import SERVOS, SHAPES, TACTILE, Backends, known_servo_models
+from softfinger.daemon.errors import PluginError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
 # Every number has an end on both sides: implausible values are typing errors, and must not reach
@@ -41,14 +41,19 @@ LawName = Literal["energy", "two_phase", "upright", "blind", "position"]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
-def _one_of(names: Collection[str]) -> AfterValidator:
-    """A text that is one of ``names``, in pydantic's words for a Literal."""
+def _one_of(names: Backends) -> AfterValidator:
+    """A text that names one of these, in pydantic's words for a Literal."""
 
     def check(name: str) -> str:
-        if name not in names:
+        try:
+            known = name in names
+        except PluginError as error:
+            why = {"why": str(error)}
+            raise PydanticCustomError("plugin", "a plugin that works: {why}", why) from None
+        if not known:
             *most, last = map(repr, names)
-            known = f"{', '.join(most)} or {last}"
-            raise PydanticCustomError("one_of", "Input should be {known}", {"known": known})
+            listed = {"known": f"{', '.join(most)} or {last}"}
+            raise PydanticCustomError("one_of", "Input should be {known}", listed)
         return name
 
     return AfterValidator(check)
@@ -359,6 +364,16 @@ class TaskSettings(Section):
     angle: Angle = 0.14
 
 
+class PluginSettings(Section):
+    """A table for each plugin that has settings of its own, ``[plugins.NAME]``."""
+
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+
+    def of(self, name: str) -> Any:
+        """The plugin's table, as it stands in the profile."""
+        return (self.model_extra or {}).get(name, {})
+
+
 class Settings(Section):
     """All sections. ``Settings()`` is the built-in simulated hand."""
 
@@ -380,6 +395,7 @@ class Settings(Section):
     object: ObjectSettings = ObjectSettings()
     simulation: SimulationSettings = SimulationSettings()
     task: TaskSettings = TaskSettings()
+    plugins: PluginSettings = PluginSettings()
 
     @property
     def simulated(self) -> bool:

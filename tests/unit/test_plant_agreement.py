@@ -63,7 +63,7 @@ def start(scene: Scene, loss: float, count: int):
 def compared(hand, scene: Scene) -> np.ndarray:
     """The state in the reference's order."""
     state = hand.plant.state
-    shears = state.extra_shear[4:] if scene.contacts[0].mutual else state.shear
+    shears = state.extra_shear[-2:] if scene.contacts[0].mutual else state.shear
     palm = state.extra_shear[: 0 if scene.corners is None else 2]
     return np.concatenate((state.position, state.velocity, shears, palm))
 

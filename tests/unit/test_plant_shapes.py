@@ -32,7 +32,7 @@ HAND = ReferenceHand()
 
 
 def shape(**simulation):
-    return shape_of(SimulationSettings(**simulation))
+    return shape_of(Settings(simulation=SimulationSettings(**simulation)))
 
 
 # Shapes.
@@ -226,7 +226,7 @@ def test_mutual_forces_are_the_gradient_of_both_tips_energy():
     step = 1e-7
 
     def at(q, shears):
-        hand.plant.state.extra_shear[4:] = shears
+        hand.plant.state.extra_shear[-2:] = shears
         place(hand, q, (0.0, 0.08, 0.0))
         by_shear = [tip.rows[2, :2].copy() for tip in hand.plant.stages[0].on_tip]
         return hand.energy(), hand.plant.forces[:2].copy(), by_shear

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 
-from softfinger.daemon.backends import SERVOS, TACTILE
+from softfinger.daemon.backends import KINDS, SERVOS, TACTILE, installed, source
 from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
 from softfinger.daemon.diagnosis.devices import (
     check_board,
@@ -58,6 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
 def results(settings: Settings, fix: bool) -> Iterator[Result]:
     """All checks in the order of what needs what, with what was repaired before them."""
     ports = _ports(settings)
+    for kind in KINDS:
+        for entries in installed(kind.group).values():
+            yield from (Result("note", kind.group, source(entry)) for entry in entries)
     yield note_ports()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
     free = {}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.plant_state import Plant
+from softfinger.daemon.simulation.physics.plant_state import SHEARS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 LOSSLESS_TOLERANCE = 1e-3  # of the energy, what smooth steps may gain in all without losses
@@ -123,7 +123,7 @@ def shorten(plant: Plant, share: float) -> None:
         now.position[j] = before.position[j] + share * (now.position[j] - before.position[j])
     for j in range(2):
         now.shear[j] = before.shear[j] + share * (now.shear[j] - before.shear[j])
-    for j in range(6):
+    for j in range(SHEARS):
         way = now.extra_shear[j] - before.extra_shear[j]
         now.extra_shear[j] = before.extra_shear[j] + share * way
 

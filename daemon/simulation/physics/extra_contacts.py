@@ -81,7 +81,7 @@ def touch_palm(
     turn_rate = now.velocity[4]
     round_ = p.shape == DISC
     energy = 0.0
-    for corner in range(1 if round_ else CORNERS):
+    for corner in range(1 if round_ else p.corners):
         lever_x = 0.0
         lever_y = -p.roundness
         if not round_:

@@ -1,6 +1,6 @@
 """The object's outline as a tip sees it: the nearest point, and the rim of the tip's backing plate.
 
-The object is rigid and convex: a rectangle, a polygon of four edges (the wedge) or a disc.
+The object is rigid and convex: a rectangle, a polygon or a disc.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.simulation.physics.plant_state import (
-    CORNERS,
     POLYGON,
     RECTANGLE,
     Parameters,
@@ -48,7 +47,7 @@ def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float,
     """As :func:`nearest_on_rectangle`, for the edges of the outline."""
     best = -math.inf
     face = 0
-    for k in range(CORNERS):
+    for k in range(p.corners):
         edge = p.outline[k]
         out = (u - edge.x) * edge.normal_x
         out += (v - edge.y) * edge.normal_y
@@ -68,7 +67,7 @@ def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float,
             distance = math.inf
             to_u = 0.0
             to_v = 0.0
-            for k in range(CORNERS):
+            for k in range(p.corners):
                 way_u = p.outline[k].x - u
                 way_v = p.outline[k].y - v
                 way = math.sqrt(way_u * way_u + way_v * way_v)

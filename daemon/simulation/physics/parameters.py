@@ -47,7 +47,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     c = table(d, 0.0)
     # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
-    shape = shape_of(simulation)
+    shape = shape_of(settings)
     if shape.kind == NO_OBJECT:
         fastest = geometry_of(settings).reach * math.sqrt(stiffness / simulation.joint_inertia)
     else:
@@ -87,7 +87,7 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
 
 def _object(p: Parameters, settings: Settings) -> None:
     simulation = settings.simulation
-    shape, mass = shape_of(simulation), simulation.object_mass
+    shape, mass = shape_of(settings), simulation.object_mass
     p.palm = simulation.palm
     p.palm_friction = simulation.palm_friction
     p.shape = shape.kind
@@ -95,6 +95,7 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.half_height = 0.5 * simulation.object_height
     p.roundness = shape.roundness
     p.extent = shape.extent
+    p.corners = len(shape.corners)
     for k, values in enumerate(shape.edges().tolist()):
         edge = p.outline[k]
         edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
@@ -149,7 +150,7 @@ def _script(p: Parameters, settings: Settings) -> None:
         return
     p.script_speed = simulation.compression_speed
     pose = (*simulation.object_position, simulation.object_angle)
-    width = 2.0 * shape_of(simulation).half_width
+    width = 2.0 * shape_of(settings).half_width
     contacts = geometry_of(settings).contacts(settings.hand.open_angle, pose, width)
     ways = COMPRESSION_DEPTH * settings.tip.radius - contacts.d
     ways = np.maximum(ways / max(math.cos(simulation.object_angle), 0.1), 0.0)

@@ -38,6 +38,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_SHEAR,
     CORNERS,
     NO_OBJECT,
+    SHEARS,
     FloatArray,
     Motion,
     Plant,
@@ -115,7 +116,7 @@ def first_stage(plant: Plant, g: float) -> None:
     for j in range(2):
         k.shear[j] = stage.on_object[j].shear_rate
         k.current[j] = 0.0
-    for j in range(6):
+    for j in range(SHEARS):
         k.extra_shear[j] = stage.extra_rate[j] if plant.coupled else 0.0
     set_motor_slopes(plant, g)
     load_motors(plant, state, k, g)
@@ -138,7 +139,7 @@ def go_to_second_stage(plant: Plant, h: float) -> None:
     for j in range(2):
         later.shear[j] = state.shear[j] + h * k.shear[j]
         later.current[j] = state.current[j] + h * k.current[j]
-    for j in range(6):
+    for j in range(SHEARS):
         later.extra_shear[j] = state.extra_shear[j] + h * k.extra_shear[j]
 
 
@@ -153,7 +154,7 @@ def second_stage(plant: Plant, g: float) -> None:
     for j in range(2):
         k.shear[j] = stage.on_object[j].shear_rate - 2.0 * first.shear[j]
         k.current[j] = first.current[j]
-    for j in range(6):
+    for j in range(SHEARS):
         rate = stage.extra_rate[j] - 2.0 * first.extra_shear[j]
         k.extra_shear[j] = rate if plant.coupled else 0.0
     load_motors(plant, plant.later, k, g)
@@ -171,7 +172,7 @@ def go_on(plant: Plant, h: float) -> None:
         state.shear[j] += h * (1.5 * first.shear[j] + 0.5 * second.shear[j])
         change = 1.5 * first.current[j] + 0.5 * second.current[j]
         state.current[j] = bounded(state.current[j] + h * change, 2.0 * p.stall_current)
-    for j in range(6):
+    for j in range(SHEARS):
         state.extra_shear[j] += h * (1.5 * first.extra_shear[j] + 0.5 * second.extra_shear[j])
     for j in range(5):
         if p.joints_held if j < 2 else p.object_held:

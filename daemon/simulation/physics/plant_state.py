@@ -16,13 +16,12 @@ FloatArray = NDArray[np.float64]
 
 Three = Annotated[FloatArray, 3]
 Five = Annotated[FloatArray, 5]
-Six = Annotated[FloatArray, 6]
 Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 for each finger
 
 # Shapes of the object.
 NO_OBJECT = 0
 RECTANGLE = 1
-POLYGON = 2  # four edges
+POLYGON = 2  # convex
 DISC = 3
 
 # Operating modes, by the servos' own numbers.
@@ -36,9 +35,12 @@ ALONG_THETA = 1
 ALONG_SHEAR = 2
 
 LAYERS = 8  # of a footprint, from its edge inwards, that slip one after the other
-CORNERS = 4  # of the object, which may lie on the palm
-PALM_ROWS = 8  # of the extra ones: height and slide of each corner
-EXTRA_ROWS = 14  # and d, θ and d_t of each tip on the other
+CORNERS = 8  # that an object may have
+SHEARS = CORNERS + 2  # of the palm under each corner, then of each tip on the other
+PALM_ROWS = 2 * CORNERS  # of the extra ones: height and slide of each corner
+EXTRA_ROWS = PALM_ROWS + 6  # and d, θ and d_t of each tip on the other
+
+Shears = Annotated[FloatArray, SHEARS]
 
 
 class Motion(Record):
@@ -47,7 +49,7 @@ class Motion(Record):
     position: Five  # [rad], [rad], [m], [m], [rad]
     velocity: Five
     shear: Pair  # d_t of the tips on the object [m]
-    extra_shear: Six  # of the palm under each corner, then of each tip on the other [m]
+    extra_shear: Shears  # [m]
     current: Pair  # [A]
 
 
@@ -113,6 +115,7 @@ class Parameters(Record):
     roundness: float  # radius of a disc [m]
     share: float  # stiffness of a tip on the object over that on a plane
     extent: float  # farthest point from the object's centre [m]
+    corners: int  # that it has
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
     mass: float  # of the object [kg]
     inertia: float  # of the object [kg·m²]
@@ -205,7 +208,7 @@ class Stage(Record):
 
     on_object: Annotated[Records[TipContact], 2]
     on_tip: Annotated[Records[TipContact], 2]
-    extra_rate: Six  # stick rates of the extra shears [m/s]
+    extra_rate: Shears  # stick rates of the extra shears [m/s]
 
 
 class ExtraRow(Record):

@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.backends import SHAPES
-from softfinger.daemon.profile.settings import SimulationSettings
+from softfinger.daemon.profile.settings import Settings, SimulationSettings
 from softfinger.daemon.simulation.physics.plant_state import (
+    CORNERS,
     DISC,
     NO_OBJECT,
     POLYGON,
@@ -25,7 +26,7 @@ class Shape:
     """One object's outline, round its centre of mass. Lengths are m."""
 
     kind: int  # by plant_state's numbers
-    corners: FloatArray  # (4, 2), counter-clockwise; of a disc: those of the square round it
+    corners: FloatArray  # [n, 2], counter-clockwise; of a disc: those of the square round it
     roundness: float  # radius of a disc, else 0
     gyration: float  # radius of gyration
     lever: float  # mean distance of its points from the centre: what spinning friction acts on
@@ -38,29 +39,64 @@ class Shape:
     @property
     def half_width(self) -> float:
         """Half the width at the height of the centre."""
-        (left, bottom), (right, top) = self.corners.min(axis=0), self.corners.max(axis=0)
-        if self.kind != POLYGON:
-            return float(0.5 * (right - left))
-        low, high = self.corners[1, 0], self.corners[2, 0]
-        return float(low + (high - low) * -bottom / (top - bottom))
+        x, y = np.vstack((self.corners, self.corners[:1])).T
+        across = [
+            x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k])
+            for k in range(len(self.corners))
+            if y[k] * y[k + 1] <= 0.0 and y[k] != y[k + 1]
+        ]
+        return float(0.5 * (max(across) - min(across)))
 
     def edges(self) -> FloatArray:
-        """The four edges, float64 [4, 5]: start x, y, outward normal x, y, length."""
+        """The edges, float64 [n, 5]: start x, y, outward normal x, y, length."""
         way = np.roll(self.corners, -1, axis=0) - self.corners
         length = np.hypot(*way.T)
         normal = np.stack((way[:, 1], -way[:, 0]), axis=1) / length[:, None]
         return np.column_stack((self.corners, normal, length))
 
 
-def shape_of(simulation: SimulationSettings) -> Shape:
+def shape_of(settings: Settings) -> Shape:
     """The object of the settings, made by the function that `daemon.backends` names for it."""
-    shape: Shape = SHAPES[simulation.object_shape].load()(simulation)
+    simulation = settings.simulation
+    backend = SHAPES[simulation.object_shape]
+    shape: Shape = backend.load()(simulation, *backend.options(settings))
     return shape
+
+
+def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
+    """A convex outline of 3 to 8 ``corners`` [n, 2] m, counter-clockwise; the object's shape.
+
+    It turns about its centre of mass, wherever the corners' origin lies. The integrals over it are
+    closed forms of the triangles between the centre and each edge. Raises ValueError for an
+    outline that is none of this kind.
+    """
+    points = np.array(corners, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
+        raise ValueError(f"found corners {points.shape}, expected 3 to {CORNERS} pairs")
+    if not np.isfinite(points).all():
+        raise ValueError("found a corner that is no number")
+    along = np.roll(points, -1, axis=0) - points
+    turns = _cross(along, np.roll(along, -1, axis=0))
+    whole = np.arctan2(turns, (along * np.roll(along, -1, axis=0)).sum(axis=1)).sum()
+    if not ((turns > 0.0).all() and whole < 3.0 * math.pi):
+        raise ValueError("found corners that aren't convex and counter-clockwise")
+    areas = _cross(points, np.roll(points, -1, axis=0))
+    points -= ((points + np.roll(points, -1, axis=0)) * areas[:, None]).sum(axis=0) / (
+        3.0 * areas.sum()
+    )
+    length = np.hypot(*along.T)
+    height = _cross(points, along) / length  # of the centre over each edge, inwards
+    begin = (points * along).sum(axis=1) / length / height
+    end = begin + length / height
+    area = (0.5 * height**2 * (end - begin)).sum()
+    mean = (height**3 * (_secants(end) - _secants(begin))).sum() / (6.0 * area)
+    squared = (height**4 * (end - begin + (end**3 - begin**3) / 3.0)).sum() / (4.0 * area)
+    return Shape(kind, points, 0.0, math.sqrt(squared), float(mean))
 
 
 def rectangle(simulation: SimulationSettings) -> Shape:
     """A box of the settings' width and height."""
-    return _polygon(RECTANGLE, simulation, 0.0)
+    return polygon(_trapezoid(simulation, 0.0), RECTANGLE)
 
 
 def wedge(simulation: SimulationSettings) -> Shape:
@@ -75,43 +111,33 @@ def wedge(simulation: SimulationSettings) -> Shape:
             f"a wedge's faces meet: found simulation.object_width {width:g} m, expected above "
             f"{2.0 * abs(leaning):.3g} m at its object_taper and object_height"
         )
-    return _polygon(POLYGON, simulation, leaning)
+    return polygon(_trapezoid(simulation, leaning))
 
 
 def disc(simulation: SimulationSettings) -> Shape:
     """A disc of the settings' radius."""
     radius = simulation.object_radius
-    square = _trapezoid(radius, radius, radius)
+    square = radius * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
 
 
 def nothing(simulation: SimulationSettings) -> Shape:
     """No object; its outline is the rectangle's."""
-    return _polygon(NO_OBJECT, simulation, 0.0)
+    return polygon(_trapezoid(simulation, 0.0), NO_OBJECT)
 
 
-def _polygon(kind: int, simulation: SimulationSettings, leaning: float) -> Shape:
-    half, height = 0.5 * simulation.object_width, simulation.object_height
-    corners = _trapezoid(half + leaning, half - leaning, 0.5 * height)
-    lever, squared = _mean_distances(corners)
-    return Shape(kind, corners, 0.0, math.sqrt(squared), lever)
+def _trapezoid(simulation: SimulationSettings, leaning: float) -> FloatArray:
+    half, height = 0.5 * simulation.object_width, 0.5 * simulation.object_height
+    low, high = half + leaning, half - leaning
+    return np.array([(-low, -height), (low, -height), (high, height), (-high, height)])
 
 
-def _trapezoid(low: float, high: float, half_height: float) -> FloatArray:
-    """Corners round the centre of mass, for half widths at the bottom and at the top."""
-    centre = half_height * (high - low) / (3.0 * (low + high))
-    bottom, top = -half_height - centre, half_height - centre
-    return np.array([[-low, bottom], [low, bottom], [high, top], [-high, top]])
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    product: FloatArray = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return product
 
 
-def _mean_distances(corners: FloatArray) -> tuple[float, float]:
-    """Mean distance [m] and mean squared distance [m²] of a trapezoid's points from the centre."""
-    nodes, weights = np.polynomial.legendre.leggauss(32)
-    share = 0.5 * (nodes + 1.0)
-    half = corners[1, 0] + share * (corners[2, 0] - corners[1, 0])
-    y = corners[0, 1] + share * (corners[2, 1] - corners[0, 1])
-    x = half[:, None] * share
-    weight = weights[:, None] * weights * half[:, None]
-    squared = x * x + y[:, None] ** 2
-    mean = (weight * np.sqrt(squared)).sum() / weight.sum()
-    return float(mean), float((weight * squared).sum() / weight.sum())
+def _secants(t: FloatArray) -> FloatArray:
+    """Twice the integral of sec³ to the angle whose tangent is ``t``."""
+    integral: FloatArray = t * np.sqrt(1.0 + t * t) + np.arcsinh(t)
+    return integral

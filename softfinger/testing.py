@@ -1,0 +1,129 @@
+"""What a backend of one's own has to do, as checks that its author runs.
+
+Each takes a profile's settings that name the backend, as
+``check_tactile(load(Path("profile.toml")))``, makes it as the daemon would, and raises
+AssertionError with what was found and expected.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from softfinger.daemon.backends import make_sensor, make_servos
+from softfinger.daemon.clock import make_clock
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.simulation.physics.plant_state import DISC
+from softfinger.daemon.simulation.physics.shapes import Shape, polygon, shape_of
+from softfinger.daemon.tactile.base import TactileSensor
+from softfinger.daemon.types import FINGERS, Frame, Goal, Reading
+
+__all__ = ["check_servos", "check_shape", "check_tactile", "load"]
+
+_POLL = 1e-3  # s, as a tick
+
+
+def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
+    """Open the board under each finger, twice, and look at so many frames of it.
+
+    ``patience`` [s] bounds the wait for them. No object is needed.
+    """
+    clock = make_clock(settings)
+    for name in settings.scene.fingers:
+        sensor = make_sensor(settings, clock, None, FINGERS.index(name))
+        assert sensor is not None, "tactile.backend: found none, expected a board"
+        for _ in range(2):  # a board is opened again when its port was lost
+            sensor.open()
+            try:
+                _check_frames(settings, sensor, frames, time.monotonic() + patience)
+                _check_counters(sensor)
+            finally:
+                sensor.close()
+            sensor.latest()  # raises nothing
+        sensor.close()
+
+
+def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadline: float) -> None:
+    shape = (settings.tactile.rows, settings.tactile.cols)
+    last: Frame | None = None
+    kept = np.zeros(shape, np.uint16)
+    for count in range(frames):
+        while (frame := sensor.latest()) is last or frame is None:
+            assert time.monotonic() < deadline, f"found {count} frames, expected {frames} in time"
+            time.sleep(_POLL)
+        assert isinstance(frame, Frame), f"found {type(frame).__name__}, expected a Frame"
+        found = f"{frame.data.dtype} {frame.data.shape}"
+        assert found == f"uint16 {shape}", f"found data {found}, expected uint16 {shape}"
+        assert frame.t_sample <= frame.t_arrival, "found a frame that came before its scan"
+        assert frame.t_arrival <= time.monotonic(), "found a frame that comes in the future"
+        if last is not None:
+            assert frame.seq > last.seq, f"found seq {frame.seq} after {last.seq}"
+            assert frame.t_arrival >= last.t_arrival, "found a frame that came before the last"
+            assert (last.data == kept).all(), "found a frame written to after it was handed over"
+        last, kept = frame, frame.data.copy()
+
+
+def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0) -> None:
+    """Connect to the servos, twice, and read them.
+
+    With ``torque`` they are also stiffened where they stand and let go again: the joints must not
+    move by more than 0.05 rad. ``patience`` [s] bounds each wait.
+    """
+    servos = make_servos(settings, make_clock(settings), None)
+    assert servos is not None, "servos.backend: found none, expected servos"
+    for _ in range(2):  # they are connected again when they had gone silent
+        servos.connect()
+        try:
+            reading = Reading()
+            _read(servos, reading, patience)
+            first, seq = list(reading.q), reading.seq
+            _read(servos, reading, patience)
+            assert reading.seq > seq, f"found seq {reading.seq} after {seq}"
+            assert reading.t <= time.monotonic(), "found a reading of the future"
+            assert np.isfinite([*reading.q, *reading.dq, *reading.current]).all(), "found NaN"
+            _check_counters(servos)
+            if torque:
+                servos.torque_on()
+                servos.write(Goal(q=list(reading.q), current=[0.1, 0.1], valid=True))
+                _read(servos, reading, patience)
+                moved = np.abs(np.subtract(reading.q, first)).max()
+                assert moved < 0.05, f"found joints that moved by {moved:.3g} rad when stiffened"
+            deadline = time.monotonic() + patience
+            while not servos.torque_off(reading):
+                assert time.monotonic() < deadline, "torque off is not confirmed in time"
+        finally:
+            servos.close()
+    servos.close()
+
+
+def _read(servos: Servos, reading: Reading, patience: float) -> None:
+    deadline = time.monotonic() + patience
+    reading.valid = False
+    while not reading.valid:
+        assert time.monotonic() < deadline, "no valid reading in time"
+        time.sleep(_POLL)
+        servos.read(reading)
+
+
+def _check_counters(backend: Servos | TactileSensor) -> None:
+    counters = backend.counters()
+    wrong = {k: v for k, v in counters.items() if not (isinstance(k, str) and type(v) is int)}
+    assert not wrong, f"found counters {wrong}, expected names and whole numbers"
+
+
+def check_shape(settings: Settings) -> None:
+    """Make the object's shape, and compare its facts with what its corners say."""
+    shape = shape_of(settings)
+    assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
+    if shape.kind == DISC:
+        assert shape.roundness > 0.0, "found a disc without radius"
+        return
+    sound = polygon(shape.corners)
+    away = float(np.abs(sound.corners - shape.corners).max())
+    assert away <= 1e-9, f"found a centre of mass {away:.3g} m off the origin"
+    for name in ("gyration", "lever"):
+        found, expected = getattr(shape, name), getattr(sound, name)
+        assert abs(found - expected) <= 1e-6 * expected, f"{name}: {found:g}, not {expected:g} m"

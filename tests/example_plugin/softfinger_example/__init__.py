@@ -1,0 +1,1 @@
+"""Backends of another package, as small as they can be."""

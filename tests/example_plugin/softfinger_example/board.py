@@ -1,0 +1,55 @@
+"""A board whose cells all read the same, up and down in turn."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from softfinger.daemon.clock import Clock
+from softfinger.daemon.profile.settings import Section, TactileSettings
+from softfinger.daemon.types import Frame
+
+
+class PulseSettings(Section):
+    """``[plugins.pulsing]``."""
+
+    height: int = Field(default=3, ge=0, le=1000)  # counts
+
+
+class PulsingBoard:
+    """A frame every 1/rate s, made when it is asked for."""
+
+    Settings = PulseSettings
+
+    def __init__(
+        self, tactile: TactileSettings, clock: Clock, finger: int, own: PulseSettings
+    ) -> None:
+        self._shape = tactile.rows, tactile.cols
+        self._period = 1.0 / tactile.rate
+        self._height = own.height
+        self._clock = clock
+        self._frame: Frame | None = None
+
+    def open(self) -> None:
+        """Start with a frame of zeros."""
+        self._start = self._clock.now()
+        self._frame = Frame(1, self._start, self._start, True, np.zeros(self._shape, np.uint16))
+
+    def latest(self) -> Frame | None:
+        """The frame that is due."""
+        frame = self._frame
+        if frame is not None:
+            number = 1 + int((self._clock.now() - self._start) / self._period)
+            if number > frame.seq:
+                t = self._start + (number - 1) * self._period
+                data = np.full(self._shape, self._height * (number % 2), np.uint16)
+                self._frame = Frame(number, t, t, True, data)
+        return self._frame
+
+    def counters(self) -> dict[str, int]:
+        """How many frames there were."""
+        return {"frames": 0 if self._frame is None else self._frame.seq}
+
+    def close(self) -> None:
+        """Deliver nothing more."""
+        self._frame = None

@@ -1,0 +1,126 @@
+"""Backends of an installed package: found, checked, guarded, and run by a real daemon."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from softfinger.daemon import backends
+from softfinger.daemon.client.hand import Hand
+from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.errors import PluginError, SettingsError, TactileError
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.types import Frame
+from softfinger.testing import check_servos, check_shape, check_tactile
+from tests.conftest import until
+from tests.harness.daemon_process import Running
+
+EXAMPLE = Path(__file__).parents[1] / "example_plugin"
+METAL = ("tactile.backend=pulsing", "servos.backend=following")
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, installed as pip installs it, into a folder of its own."""
+    site = tmp_path_factory.mktemp("site")
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(site))
+    pip = (sys.executable, "-m", "pip", "install")
+    source = tmp_path_factory.mktemp("source") / "example"
+    subprocess.run(["cp", "-r", str(EXAMPLE), str(source)], check=True)  # builds leave files
+    subprocess.run([*pip, *options, str(source)], check=True, capture_output=True)
+    return site
+
+
+@pytest.fixture
+def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example in this process's way, and what was found of it forgotten afterwards."""
+    monkeypatch.syspath_prepend(installed)
+    for kind in backends.KINDS:
+        monkeypatch.setattr(kind, "_known", dict(kind._known))
+
+
+@pytest.mark.usefixtures("here")
+def test_the_example_does_what_a_backend_has_to() -> None:
+    settings = load(changes=METAL)
+    check_tactile(settings)
+    check_servos(settings, torque=True)
+    check_shape(load(changes=["simulation.object_shape=hexagon"]))
+
+
+@pytest.mark.usefixtures("here")
+def test_one_report_has_the_plugins_errors_with_all_others() -> None:
+    wrong = (
+        *METAL,
+        "plugins.pulsing.height=-1",
+        "plugins.pulsing.hight=1",
+        "plugins.following.speed=1",
+        "plugins.nobody.key=1",
+        "simulation.object_shape=hexagonal",
+        "loop.rate=1",
+    )
+    with pytest.raises(SettingsError) as caught:
+        load(changes=wrong)
+    report = str(caught.value)
+    for part in (
+        "plugins.pulsing.height: found -1",
+        "plugins.pulsing.hight: found an unknown key, expected a known one; nearest: height",
+        "plugins.following: found settings, but following of softfinger-example 1.0 has none",
+        "plugins.nobody: found settings of a plugin that is not installed",
+        "'disc', 'wedge', 'none' or 'hexagon'",
+        "loop.rate",
+    ):
+        assert part in report
+
+
+@pytest.mark.usefixtures("here")
+def test_a_broken_plugin_is_named_and_the_others_work() -> None:
+    with pytest.raises(SettingsError, match=r"broken of softfinger-example 1\.0 fails to load"):
+        load(changes=["tactile.backend=broken"])
+    with pytest.raises(PluginError):
+        backends.TACTILE["broken"]
+    assert load(changes=METAL).tactile.backend == "pulsing"
+
+
+@pytest.mark.usefixtures("here")
+def test_what_a_board_raises_in_the_tick_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = load(changes=METAL)
+    sensor = backends.make_sensor(settings, VirtualClock(), None, 0)
+    assert sensor is not None
+    sensor.open()
+    sound = sensor.latest()
+    assert sound is not None
+    board = type(sensor._made)  # type: ignore[attr-defined]
+    small = Frame(9, 0.0, 0.0, True, sound.data[:2])
+    monkeypatch.setattr(board, "latest", lambda _: small)
+    assert sensor.latest() is sound
+    monkeypatch.setattr(board, "latest", lambda _: 1 / 0)
+    assert sensor.latest() is sound
+    assert sensor.counters()["refused"] == 2
+    monkeypatch.setattr(board, "open", lambda _: 1 / 0)
+    with pytest.raises(TactileError, match="pulsing of softfinger-example"):
+        sensor.open()
+
+
+def test_a_daemon_runs_on_them(
+    installed: Path,
+    start: Callable[..., Running],
+    profile: Callable[..., Path],
+    addresses: tuple[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = os.pathsep.join((str(installed), os.environ.get("PYTHONPATH", "")))
+    monkeypatch.setenv("PYTHONPATH", path)
+    changes = [word for each in METAL for word in ("--set", each)]
+    file = str(profile("[plugins.pulsing]\nheight = 5\n"))
+    running = start("--config", file, *changes)
+    with Hand(*addresses, timeout=60.0) as hand:
+        hand.arm()
+        hand.move(left=0.3, right=0.2)
+        until(lambda: abs(hand.state().left.q - 0.3) < 1e-3)
+        hand.disarm()
+    assert running.end() == 0
