@@ -111,9 +111,9 @@ def test_frames_of_a_board_are_what_it_would_send() -> None:
 
 
 def test_growth_has_slopes_and_bounds() -> None:
-    cells, errors = growth.cells((16, 32), 1)
+    cells, errors = growth.cells((16, 24, 32), 1)
     assert all("∝ (cells a side)^" in note for note in cells.notes)
-    assert len(cells.rows) == 14
+    assert len(cells.rows) == 21
     for row in errors.rows:
         assert 0.5 < row["median"] / row["Cramér-Rao bound"] < 2.0
     lookups, sizes, builds = growth.tolerances((1e-3, 1e-9), 1)

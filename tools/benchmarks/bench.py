@@ -24,7 +24,7 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys; wake-ups beside cyclictest",
     "servos": "read + write of two servos over a pty, beside the plain SDK",
     "startup": "start to the first published state, memory",
-    "control": "what each grip law reaches on the simulated hand",
+    "control": "what each grip law leaves of an object's angle",
     "reflex": "from a slip's onset to the servos' bytes",
     "scenes": "what each thing that a scene skips saves, a tick and at the first start",
     "growth": "cost and error against cells, tolerance, subscribers, sensors, rate",

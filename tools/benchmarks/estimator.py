@@ -199,8 +199,8 @@ def decode(framing: str, frames: FloatArray) -> Subject:
     """A framing's bytes, as a board sends them, to counts."""
     encode = ENCODERS[framing].encode
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
-    packets = [encode(each, number, 0.01 * number) for number, each in enumerate(counts)]
-    return each(_DECODERS[framing](*frames.shape[1:]).feed, [(packet, 0.0) for packet in packets])
+    packets = [(encode(frame, k, 0.01 * k), 0.0) for k, frame in enumerate(counts)]
+    return each(_DECODERS[framing](*frames.shape[1:]).feed, packets)
 
 
 # What a user would otherwise take: each gives centroid and variances in cells, (x, y, v_x, v_y),

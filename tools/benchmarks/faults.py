@@ -17,23 +17,22 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import msgpack
 import numpy as np
-import zmq
 
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.benchmarks.measuring import Report, Row
 from softfinger.tools.benchmarks.rigs import Rig, RigError, stopped
 
-Inject = Callable[[Rig, random.Random], AbstractContextManager[None]]
+# Begins a fault; what it returns ends the fault.
+End = Callable[[], object]
+Inject = Callable[[Rig, random.Random], End]
 # works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints
 # stay where they are, without a fault. dies: the daemon is gone, the servos stop by themselves.
 # stops: `stop` is sent, and no motor is driven in time, with a fault or without.
@@ -64,8 +63,6 @@ _FRAMES = _SETTINGS.safety.frame_age_fault / 100.0 + 0.01 + _AT_ONCE  # of a boa
 _FROZEN = _SETTINGS.safety.frozen_after + 0.05  # judged in turn
 _STOP = 0.2  # s from a stop to no motor driven, whatever gets lost
 _SAME = 0.3  # s in which a hand that holds may send the same goal, of which none is missed
-_FLOODERS = 4
-_HARMLESS = ("status", "status", "clear", "arm", "tare")  # none moves a hand that holds
 _ROOM = 1 << 18  # bytes that a daemon without memory may still take
 _JUDGED = 0.1  # s: a row that is judged in turn and must stand for half of that
 
@@ -86,15 +83,10 @@ class FaultCase:
 def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
     """Words for the emulated hand that begin the fault and end it; ``{}`` is one of ``places``."""
 
-    @contextlib.contextmanager
-    def inject(rig: Rig, chance: random.Random) -> Iterator[None]:
+    def inject(rig: Rig, chance: random.Random) -> End:
         place = chance.choice(places)
         rig.send(begin.format(place))
-        try:
-            yield
-        finally:
-            if end:
-                rig.send(end.format(place))
+        return lambda: rig.send(end.format(place)) if end else None
 
     return inject
 
@@ -106,76 +98,35 @@ def _board(begin: str, end: str = "{}:well") -> Inject:
     return _sent(begin, end, places=("left", "right"))
 
 
-@contextlib.contextmanager
-def _killed(rig: Rig, chance: random.Random) -> Iterator[None]:
+def _killed(rig: Rig, chance: random.Random) -> End:
     rig.end_daemon(signal.SIGKILL)
-    try:
-        yield
-    finally:
-        rig.start_daemon()
+    return rig.start_daemon
 
 
 def _stood_still(seconds: float) -> Inject:
     """The daemon's process is stopped for so long, then goes on."""
 
-    @contextlib.contextmanager
-    def inject(rig: Rig, chance: random.Random) -> Iterator[None]:
+    def inject(rig: Rig, chance: random.Random) -> End:
         assert rig.daemon is not None
         rig.daemon.send_signal(signal.SIGSTOP)
         timer = threading.Timer(seconds, rig.daemon.send_signal, (signal.SIGCONT,))
         timer.start()
-        try:
-            yield
-        finally:
-            timer.join()
+        return timer.join
 
     return inject
 
 
-@contextlib.contextmanager
-def _flooded(rig: Rig, chance: random.Random) -> Iterator[None]:
-    """Clients send as fast as they can what doesn't move a hand that holds; none reads a reply."""
-    ending = threading.Event()
-    packed = [msgpack.packb({"command": chance.choice(_HARMLESS)}) for _ in range(64)]
-
-    def send() -> None:
-        sockets = [rig.context.socket(zmq.DEALER) for _ in range(_FLOODERS)]
-        for each in sockets:
-            each.setsockopt(zmq.LINGER, 0)
-            each.connect(rig.commands)
-        while not ending.wait(0.001):  # the interpreter is shared with the trial's own looks
-            for each in sockets:
-                with contextlib.suppress(zmq.Again):
-                    for payload in packed:
-                        each.send_multipart([b"", payload], zmq.NOBLOCK)
-        for each in sockets:
-            each.close()
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        yield
-    finally:
-        ending.set()
-        sender.join()
-
-
-@contextlib.contextmanager
-def _without_memory(rig: Rig, chance: random.Random) -> Iterator[None]:
+def _without_memory(rig: Rig, chance: random.Random) -> End:
     """The daemon may take next to no address space any more, and is asked meanwhile."""
     assert rig.daemon is not None
     process = rig.daemon.pid
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[0])
-    resource.prlimit(process, resource.RLIMIT_AS, (pages * resource.getpagesize() + _ROOM, hard))
-    try:
-        for _ in range(5):
-            rig.status()
-            time.sleep(chance.uniform(0.0, 0.02))
-        yield
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            resource.prlimit(process, resource.RLIMIT_AS, (hard, hard))
+    size = int(Path(f"/proc/{process}/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.prlimit(process, resource.RLIMIT_AS, (size + _ROOM, hard))
+    for _ in range(5):
+        rig.status()
+        time.sleep(chance.uniform(0.0, 0.02))
+    return lambda: rig.alive and resource.prlimit(process, resource.RLIMIT_AS, (hard, hard))
 
 
 _works = partial(FaultCase, expect="works", lasts=0.3)
@@ -238,7 +189,6 @@ CASES: tuple[FaultCase, ...] = (
               _SILENT, 0.3),
     _fault("daemon stood still for 2 s", inject=_stood_still(2.0),
            names=("servos.bus", "servos.silent", "tactile.silent"), within=_WATCHDOG, lasts=4.0),
-    _works("command flood", inject=_flooded),
     _works("daemon without memory", inject=_without_memory),
 )  # fmt: skip
 NAMES = tuple(case.name for case in CASES)
@@ -351,8 +301,11 @@ def trial(rig: Rig, case: FaultCase, seed: int) -> Trial:
     found = Trial(seed)
     rig.start()
     _grip(rig, case, chance, found)
-    with case.inject(rig, chance):
+    end = case.inject(rig, chance)
+    try:
         _look(rig, case, found)
+    finally:
+        end()
     judge_wire(rig, found)
     if not rig.alive:
         status = None if rig.daemon is None else rig.daemon.returncode

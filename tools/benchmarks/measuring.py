@@ -142,16 +142,19 @@ def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
     """How the median of each kind of row grows with its ``x``: a note for each.
 
     The exponent of a power law, over all points and between the last two, which shows where it
-    bends; time for each more of ``x`` where that begins at 0.
+    bends; where ``x`` begins at 0, the cost of the first and then of each more.
     """
     notes = []
     for name, chosen in by_kind(rows).items():
         at, median = (np.array([row[key] for row in chosen], float) for key in (x, "median"))
-        if len(chosen) < 2:
+        if len(chosen) < 3:
             continue
-        if at.min() <= 0.0:
-            slope = np.polyfit(at, median, 1)[0]
-            notes.append(f"  {name}: {slope:+.3g} {chosen[0]['unit']} for each more of {x}")
+        if at[0] == 0.0:
+            first, unit = median[1] - median[0], chosen[0]["unit"]
+            more = np.polyfit(at[1:], median[1:], 1)[0]
+            notes.append(
+                f"  {name}: {first:+.3g} {unit} for {at[1]:g} {x}, {more:+.3g} for each more"
+            )
         else:
             at, median = np.log(at), np.log(median)
             whole, last = np.polyfit(at, median, 1)[0], np.polyfit(at[-2:], median[-2:], 1)[0]

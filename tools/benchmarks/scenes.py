@@ -148,7 +148,9 @@ def measure(brief: bool = False, rounds: int = 1000) -> list[Report]:
         scenes |= {f"with {name}": base, f"without {name}": without}
     same = {id(scene): name for name, scene in scenes.items()}  # each is measured once
     with contextlib.ExitStack() as stack:
-        subjects = {name: ticking(scenes[name], stack) for name in dict.fromkeys(same.values())}
+        subjects = {
+            name: ticking(standing(scenes[name], stack)) for name in dict.fromkeys(same.values())
+        }
         times = interleave(subjects, 100 if brief else rounds)
     taken = {name: 1e-3 * times[same[id(scene)]] for name, scene in scenes.items()}
     costs = [figure(name, "µs", taken[name]) for name in SCENES]
@@ -171,12 +173,12 @@ def measure(brief: bool = False, rounds: int = 1000) -> list[Report]:
     return tables
 
 
-def ticking(scene: TimedScene, stack: contextlib.ExitStack) -> Subject:
-    """The ticks of a daemon that stands until ``stack`` is closed. Raises RigError."""
+def standing(scene: TimedScene, stack: contextlib.ExitStack) -> Daemon:
+    """A daemon of this scene until ``stack`` is closed. Raises RigError."""
     daemon = stack.enter_context(
         virtual_daemon(scene.sections, *scene.topics, subscribers=scene.subscribers)
     )
-    loop, clock = daemon.loop, daemon.clock
+    loop = daemon.loop
     if scene.holds:
         hold(daemon)
     elif daemon.settings.servos.backend == "none":
@@ -186,7 +188,12 @@ def ticking(scene: TimedScene, stack: contextlib.ExitStack) -> Subject:
     else:
         loop.advance(1.0)
     scene.alter(daemon)
-    mode = loop.state.mode
+    return daemon
+
+
+def ticking(daemon: Daemon) -> Subject:
+    """A daemon's ticks back to back, as long as its mode stays. They raise RigError."""
+    loop, clock, mode = daemon.loop, daemon.clock, daemon.loop.state.mode
 
     def run(repeat: int) -> None:
         for _ in range(repeat * _TICKS):

@@ -82,7 +82,7 @@ def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) ->
             "back to back": partial(ticks, quiet, 200),
             "back to back, state and frames subscribed": partial(ticks, heard, 200),
         }
-        turns |= {f"in place at {rate:g} Hz": partial(_in_place, quiet, rate) for rate in rates}
+        turns |= {f"in place at {rate:g} Hz": partial(in_place, quiet, rate) for rate in rates}
         with RealTime(Settings()):
             for _ in range(rounds):
                 for name, turn in turns.items():
@@ -109,11 +109,11 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
     return samples
 
 
-def _in_place(daemon: Daemon, rate: float, seconds: float = 0.15) -> list[float]:
-    """Times of ticks [µs] that each wake at a deadline of the machine's time."""
+def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
+    """Times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
-    for _ in range(round(seconds * rate)):
+    for _ in range(count or round(0.15 * rate)):
         deadline += 1.0 / rate
         machine.sleep_until(deadline)
         samples += ticks(daemon, 1)
