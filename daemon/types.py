@@ -73,6 +73,8 @@ class Contact:
     force: float = 0.0  # gain · F(d, total tilt of theta and tilt_y) by the contact table [N]
     energy: float = 0.0  # gain · U(d, total tilt) [J]
     force_std: float = 0.0  # standard deviation of force [N], with the table's and the law's error
+    shear_x: float = 0.0  # force on the tip's face [N] along x and y, of a solid tip's newest frame
+    shear_y: float = 0.0
     inside: bool = True  # (d, θ) lies inside the model's domain
 
 

@@ -117,6 +117,7 @@ class ContactFilter:
         contact.t_sound = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
+        contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
         # Before a first reading nothing is known of the joints: the frame stands for itself.
         live = self._live[finger] = estimate.contact and self._read
         if not live:

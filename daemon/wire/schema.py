@@ -86,6 +86,11 @@ class FingerState:
     d_std: float = field("m", "standard deviation of d")
     theta_std: float = field("rad", "standard deviation of theta")
     force_std: float = field("N", "standard deviation of force, with that of the tip's law")
+    shear_x: float = field(
+        "N",
+        "force along a solid tip's face, in the hand's plane, by the newest frame; 0 with springs",
+    )
+    shear_y: float = field("N", "and across the plane")
     gain: float = field("", "measured over modelled pressure")
     misfit: bool = field("", "the frame fits no contact of the model: d, theta may be biased")
     contact: bool = field("", "something touches the tip")

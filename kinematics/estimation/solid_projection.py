@@ -33,6 +33,7 @@ from softfinger.kinematics.sensing.solid_pressure import (
 )
 
 _LOST = 0.01  # squared noise floor that a picture may count to be left out
+_KEPT = 0.5  # of the level for a first contact: one that is just felt doesn't flicker
 _NEAR = 0.03  # rad round a contact for which that holds
 
 Sums = Annotated[FloatArray, PICTURES]
@@ -168,6 +169,7 @@ def presses(
         total += readings[k]
     shown = dot(further(arena, solid.packed), readings, solid.cells)
     level = state.options.patch_level * state.signal.noise * solid.spread
+    level *= _KEPT if state.estimate.warm else 1.0
     return bool(shown - solid.first * total > level)
 
 

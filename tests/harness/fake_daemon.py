@@ -33,6 +33,8 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "d_std": 0.02e-3,
         "theta_std": math.radians(0.1),
         "force_std": 0.05,
+        "shear_x": 0.0,
+        "shear_y": 0.0,
         "tilt_y": 0.0,
         "gain": 1.0,
         "misfit": False,

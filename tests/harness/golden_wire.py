@@ -47,6 +47,7 @@ def sample_state() -> State:
         contact.d, contact.theta, contact.tilt_y = 0.004, 0.1 * sign, 0.01 * sign
         contact.d_std, contact.theta_std, contact.gain = 2e-5, 1e-3, 1.01
         contact.force_std = 0.03
+        contact.shear_x, contact.shear_y = 0.75 * sign, 0.03125 * sign
         contact.force, contact.energy = 10.5 + finger, 0.0125 + finger
     state.goal.force, state.goal.angle = 11.25, 0.0625
     state.object.valid, state.object.angle, state.object.width = True, 0.05, 0.04

@@ -35,7 +35,7 @@ FINGER_FLOATS = (
         "force",
         "energy",
     ),
-    *("d_std", "theta_std", "force_std", "gain", "frame_age_s"),
+    *("d_std", "theta_std", "force_std", "shear_x", "shear_y", "gain", "frame_age_s"),
 )
 
 
