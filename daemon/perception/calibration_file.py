@@ -20,11 +20,12 @@ from softfinger.daemon.errors import TactileError
 from softfinger.daemon.own_files import write_whole
 from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Settings
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
 
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
-_STEPS = ("tare", "equilibrate", "curve", "centre", "modulus")
+_STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
 _TABLE_STEPS = 8192  # of a curve's table: 64 KB
@@ -54,7 +55,8 @@ class TareStep(_StepModel):
     """Mean count of each unloaded cell, and their typical standard deviation [counts].
 
     ``correlation`` of two cells' noise by their distance in rows and columns, empty for none;
-    ``drift``: standard deviation of what all cells do together [counts].
+    ``drift``: standard deviation of what all cells do together; ``excess``: mean reading over the
+    zero, as none is below [counts].
     """
 
     date: str
@@ -63,6 +65,7 @@ class TareStep(_StepModel):
     frames: int
     correlation: list[list[Finite]] = []
     drift: NonNegative = 0.0
+    excess: NonNegative = 0.0
 
 
 class EquilibrateStep(_StepModel):
@@ -123,6 +126,7 @@ class Calibration(_StepModel):
     curve: CurveStep | None = None
     centre: CentreStep | None = None
     modulus: ModulusStep | None = None
+    law: TipCurves | None = None
 
     @property
     def identity(self) -> str:

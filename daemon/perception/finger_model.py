@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,12 @@ from softfinger.daemon.profile.factory import (
 )
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
+from softfinger.kinematics.estimation.measured import MeasuredEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
@@ -54,6 +56,8 @@ def make_models(
     `profile.factory.make_table` and `calibration_file.calibration_for`.
     """
     made: list[FingerModel] = []
+    if settings.tip.physics == "measured":
+        return _measured_models(settings, on_event)
     common: tuple[Material, ContactTable] | None = None
     for finger, name in enumerate(FINGERS):
         calibration = None
@@ -83,8 +87,50 @@ def make_models(
     return made[0], made[1]
 
 
+def _measured_models(
+    settings: Settings, on_event: Callable[[str, str, str], None] | None
+) -> tuple[FingerModel, FingerModel]:
+    """Those of tips with curves of their own; a finger that takes no part has the other's."""
+    material, made = Material.constant(1.0), {}
+    for name in settings.scene.fingers:
+        finger = FINGERS.index(name)
+        calibration = calibration_for(settings, finger)
+        tip = _measured_tip(settings, finger, calibration)
+        table = make_table(settings, material, None, tip=tip)
+        grid = calibrated_grid(settings, finger, calibration)
+        made[finger] = FingerModel(finger, material, table, grid, calibration)
+        if calibration is not None and on_event is not None:
+            on_event("info", "calibration", f"{name}: {calibration.summary()}")
+    left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))
+    return left, right
+
+
+def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:
+    """The tip by the curves of its file. Raises SettingsError where they don't serve."""
+    law = None if calibration is None else calibration.law
+    file = settings.tactile.calibration[finger]
+    if law is None:
+        raise SettingsError(
+            f'tip.physics: found "measured", but {file or "tactile.calibration"} has no curves of '
+            f"{FINGERS[finger]}; `softfinger calibrate law` measures them"
+        )
+    if law.radius != settings.tip.radius:
+        raise SettingsError(
+            f"tip.radius: found {settings.tip.radius:g} m, expected {law.radius:g} m, as when "
+            f"{file} was measured"
+        )
+    if settings.safety.d_max > law.deepest:
+        raise SettingsError(
+            f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {law.deepest:g} m, "
+            f"the deepest press of {file}"
+        )
+    return Fingertip(law.radius, "measured", law=law)
+
+
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
     """The sensor's cells, at the calibrated centre if there is one."""
+    if settings.tip.physics == "measured" and calibration is not None and calibration.law:
+        return make_grid(settings, finger, calibration.law.centre, calibration.law.rotation)
     if calibration is None or calibration.centre is None:
         return make_grid(settings, finger)
     return make_grid(settings, finger, calibration.centre.centre, calibration.centre.rotation)
@@ -96,7 +142,7 @@ def make_estimator(
     finger: int = 0,
     live: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
-) -> ContactEstimator:
+) -> ContactEstimator | MeasuredEstimator:
     """An estimator of its own for each finger, since it starts from its last estimate.
 
     ``live``: cells that exist, less the settings' dead ones. With a ``calibration``
@@ -113,6 +159,13 @@ def make_estimator(
         saturation, quantum = converter.saturation, converter.quantum
         # The estimator takes half a count off a threshold, in the frame's unit.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
+    if settings.tip.physics == "measured":
+        return MeasuredEstimator(
+            _measured_tip(settings, finger, calibration),
+            calibrated_grid(settings, finger, calibration),
+            alive,
+            uncertainty(settings, calibration),
+        )
     free_gain = settings.estimator.free_gain
     return ContactEstimator(
         make_tip(settings),

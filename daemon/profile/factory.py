@@ -24,8 +24,12 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
 def make_tip(settings: Settings) -> Fingertip:
-    """The fingertip."""
+    """The fingertip. Raises SettingsError for a measured one, which each finger has of its own."""
     tip = settings.tip
+    if tip.physics == "measured":
+        raise SettingsError(
+            'tip.physics: found "measured", expected "springs" or "solid" for what needs a model'
+        )
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base, tip.face)
 
 
@@ -65,17 +69,18 @@ def make_table(
     material: Material,
     cache: Path | None,
     on_event: Callable[[str, str, str], None] | None = None,
+    tip: Fingertip | None = None,
 ) -> ContactTable:
-    """The contact table, from its file in ``cache`` where one fits.
+    """The contact table, from its file in ``cache`` where one fits; ``tip``: not the settings'.
 
     ``on_event`` takes a warning where that file can't be used. Raises SettingsError when no table
     of this material reaches the tolerance.
     """
-    tip = make_tip(settings)
+    tip = tip or make_tip(settings)
     tolerance = settings.table.tolerance
     warn = warnings.warn if on_event is None else partial(on_event, "warning", "table")
     try:
-        if cache is None or tip.physics == "solid":  # which takes no time to make
+        if cache is None or tip.physics != "springs":  # which takes no time to make
             return ContactTable.build(tip, material, tolerance=tolerance)
         return load_or_build(cache, tip, material, tolerance, warn)
     except TableError as error:

@@ -96,10 +96,13 @@ class GeometrySettings(Section):
 
 
 class TipSettings(Section):
-    """The soft hemispherical fingertip: the paper's springs, or solid rubber."""
+    """The soft hemispherical fingertip: the paper's springs, solid rubber, or curves of its own.
+
+    Those are measured by `calibrate law` and stand in the files of ``tactile.calibration``.
+    """
 
     radius: Length = 0.020
-    physics: Literal["springs", "solid"] = "springs"
+    physics: Literal["springs", "solid", "measured"] = "springs"
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
     face: Literal["frictionless", "sticking"] = "frictionless"  # a solid tip on the object

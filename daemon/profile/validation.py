@@ -86,6 +86,24 @@ def _timing(settings: Settings) -> Iterator[str]:
             yield f"servos.{key}: found {value:g} s, expected above two ticks, {2.0 * period:g} s"
 
 
+def _measured_tip(settings: Settings) -> Iterator[str]:
+    if settings.tip.physics != "measured":
+        return
+    backend = settings.tactile.backend
+    if backend in ("simulated", "none"):
+        yield (
+            f'tip.physics: found "measured" with tactile.backend = "{backend}", expected "springs" '
+            'or "solid": measured curves are of frames that a board sends'
+        )
+        return
+    for name in settings.scene.fingers:
+        if not settings.tactile.calibration[FINGERS.index(name)]:
+            yield (
+                f'tactile.calibration: found "" for {name}, expected the file of `softfinger '
+                'calibrate law` with tip.physics = "measured"'
+            )
+
+
 def _solid_tip(settings: Settings) -> Iterator[str]:
     if settings.tip.physics != "solid":
         return
@@ -293,6 +311,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...]
     (("servos", "loop"), _timing),
     (("material",), _material),
     (("tip", "material", "estimator", "safety", "tactile"), _solid_tip),
+    (("tip", "tactile", "scene"), _measured_tip),
     (("simulation",), _wedge),
     (("control", "safety", "loop"), _dither),
     (("tactile",), _cells),

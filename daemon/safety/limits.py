@@ -179,6 +179,9 @@ def _hot(_: View, state: State, i: int, __: float) -> str:
 
 def _tip_tilt(view: View, state: State, i: int, share: float) -> str:
     contact, radius = state.contacts[i], view.settings.tip.radius
+    if not contact.inside and view.settings.tip.physics != "springs":
+        tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
+        return f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°: its law ends before"
     reach = math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0))
     limit = share * (reach - view.limits.theta_margin)
     return (

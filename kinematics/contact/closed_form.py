@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.contact.tip_curves import TipCurves
 
 FloatArray = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ LARGEST = 1.0  # m of radius; a larger number is one of millimetres
 POISSON = (0.45, 0.4995)  # of a solid tip: what its data cover
 
 
-Physics = Literal["springs", "solid"]
+Physics = Literal["springs", "solid", "measured"]
 Base = Literal["bonded", "lying"]
 Face = Literal["frictionless", "sticking"]
 
@@ -41,8 +42,8 @@ class Fingertip:
     ``physics`` says how it gives way: as independent "springs", or as "solid" rubber, linear
     elastic with the ratio ``poisson``, its ``base`` "bonded" to the sensor or "lying" on it, its
     ``face`` "frictionless" or "sticking" to what it touches; the last three are for solid tips
-    alone. Raises ValueError for values out of their range; a radius is
-    at most 1 m.
+    alone; or as its ``law`` says, as "measured". Raises ValueError for values out of their range; a
+    radius is at most 1 m.
     """
 
     radius: float
@@ -50,6 +51,7 @@ class Fingertip:
     poisson: float = 0.49
     base: Base = "bonded"
     face: Face = "frictionless"
+    law: TipCurves | None = None
 
     def __post_init__(self) -> None:
         for name, kind in (("physics", Physics), ("base", Base), ("face", Face)):
@@ -60,6 +62,8 @@ class Fingertip:
         if not POISSON[0] <= self.poisson <= POISSON[1]:
             low, high = POISSON
             raise ValueError(f"poisson must be {low} to {high}, not {self.poisson!r}")
+        if (self.physics == "measured") != (self.law is not None):
+            raise ValueError(f"a measured tip, and no other, has a law; physics: {self.physics!r}")
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
             raise ValueError(f"the tip's radius must be positive and finite, not {self.radius!r}")

@@ -79,16 +79,12 @@ def solid_data(tip: Fingertip) -> SolidData:
     ratio[0, 0] += 1.0
     square = float(np.sin(kept["theta_max"]) ** 2)
     energy = powers(ratio * 8.0 / (15.0 * (1.0 - tip.poisson**2)))
-    by_t = 2.0 / root * _slope(energy)
-    by_both = 2.0 / square * _slope(by_t.T).T
     shares = np.stack([powers(by_poisson(each)) for each in kept["coef"]])
     stick = shares[0]
     return SolidData(
         root,
         square,
-        np.stack(
-            [energy, by_t, 2.0 / root * _slope(by_t), 2.0 / square * _slope(energy.T).T, by_both]
-        ),
+        with_partials(energy, root, square),
         kept["m"].astype(np.int64),
         shares,
         np.stack([stick, 2.0 / root * _slope(stick), 2.0 / square * _slope(stick.T).T]),
@@ -97,6 +93,14 @@ def solid_data(tip: Fingertip) -> SolidData:
         by_poisson(kept["shear"]),
         float(kept["force_error"]),
     )
+
+
+def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
+    """g [i, j] and its partials, as `SolidData.energy` has them."""
+    by_t = 2.0 / root * _slope(energy)
+    by_square = 2.0 / square * _slope(energy.T).T
+    by_both = 2.0 / square * _slope(by_t.T).T
+    return np.stack([energy, by_t, 2.0 / root * _slope(by_t), by_square, by_both])
 
 
 def powers(terms: FloatArray) -> FloatArray:

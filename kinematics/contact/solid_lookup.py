@@ -1,4 +1,4 @@
-"""The lookup kernel of a solid tip's contact table, and the record that it reads.
+"""The lookup kernel of a solid or measured tip's contact table, and the record that it reads.
 
 One polynomial g(t, sin² θ), t = √(d/a), and its partials give all six outputs from one energy
 U = E a³ t⁵ g (see `solid_data`), so that they agree with each other to rounding. What a sticking
@@ -30,7 +30,8 @@ from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
 from softfinger.kinematics.contact.lookup import Six, Triple, lookup_at, push_at, stiffness_ahead
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
-from softfinger.kinematics.contact.solid_data import FloatArray, solid_data
+from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
+from softfinger.kinematics.contact.tip_curves import TipCurves
 
 _SHAPE = 9
 
@@ -58,20 +59,40 @@ class SolidTable(Record):
 
 
 def solid_table(tip: Fingertip, material: Material) -> SolidTable:
-    """The table of a solid ``tip``. Raises MaterialError unless the material is linear."""
+    """The table of a solid ``tip``, or of a measured one, whose material says nothing.
+
+    Raises MaterialError unless a solid tip's is linear.
+    """
+    if tip.law is not None:
+        return _measured_table(tip.law)
     if not material.is_linear:
         raise MaterialError("a solid tip's material must have a constant modulus")
-    data, table = solid_data(tip), SolidTable()
-    table.radius, table.inverse_radius = tip.radius, 1.0 / tip.radius
+    data = solid_data(tip)
+    table = _table(tip.radius, data.root, data.square, data.energy)
     table.modulus = material.reference_modulus
-    table.deepest = data.root**2 * tip.radius
-    table.tilt = math.asin(math.sqrt(data.square))
-    table.by_root, table.by_square = 2.0 / data.root, 2.0 / data.square
     table.at_first = 8.0 / (15.0 * (1.0 - tip.poisson**2))
     table.max_error = data.error
     table.sticks = tip.face == "sticking"
-    table.coefficients = _numbers(data.energy)
     table.stick = _numbers(data.stick)
+    return table
+
+
+def _measured_table(law: TipCurves) -> SolidTable:
+    """That of measured curves, for a modulus of 1 Pa."""
+    energy = with_partials(law.energy(), law.root, law.square)
+    table = _table(law.radius, law.root, law.square, energy)
+    table.modulus = 1.0
+    table.max_error = law.force_error
+    return table
+
+
+def _table(radius: float, root: float, square: float, energy: FloatArray) -> SolidTable:
+    table = SolidTable()
+    table.radius, table.inverse_radius = radius, 1.0 / radius
+    table.deepest = root**2 * radius
+    table.tilt = math.asin(math.sqrt(square))
+    table.by_root, table.by_square = 2.0 / root, 2.0 / square
+    table.coefficients = _numbers(energy)
     return table
 
 

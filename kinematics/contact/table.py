@@ -110,9 +110,10 @@ class ContactTable:
 
         ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
         with the best that was reached, when the tolerance can't be met within 256 KiB. For a
-        solid tip they say nothing; it raises MaterialError unless the modulus is constant.
+        solid tip they say nothing; it raises MaterialError unless the modulus is constant. A
+        measured tip has its own curves: neither tolerance nor material count.
         """
-        if tip.physics == "solid":
+        if tip.physics != "springs":
             return cls(solid_table(tip, material).array)
         return cls(build(tip, material, tolerance, form))
 

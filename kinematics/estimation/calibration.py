@@ -52,13 +52,14 @@ class Tare:
 
     ``correlation`` [k, m] is that of two cells' noise by their distance in rows and columns, empty
     where the frames show none; ``drift`` [counts] the standard deviation of what all cells do
-    together.
+    together; ``excess`` [counts] the mean of what a reading is over the zero, none being below.
     """
 
     zero: FloatArray
     noise: FloatArray
     correlation: FloatArray
     drift: float
+    excess: float
 
 
 def tare(frames: ArrayLike) -> Tare:
@@ -73,7 +74,9 @@ def tare(frames: ArrayLike) -> Tare:
     restless = np.count_nonzero(noise > _RESTLESS * max(float(np.median(noise)), 0.5))
     if restless >= _FEW_CELLS:
         raise CalibrationError(f"tare: {restless} cells don't rest; does something touch the tip?")
-    return Tare(stack.mean(axis=0), noise, *noise_correlation(stack))
+    zero = stack.mean(axis=0)
+    excess = float(np.maximum(stack - zero, 0.0).mean())
+    return Tare(zero, noise, *noise_correlation(stack), excess)
 
 
 def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:

@@ -61,8 +61,8 @@ class TipFit:
     ``law`` is that of its material for a modulus of 1 at no strain. ``modulus`` [Pa] and the run's
     zero of d ``offset`` [m] are fitted, and a solid tip's ν; ``chi2`` is the squared misfit a cell
     over the noise's. What is left when the estimator takes this tip: rms errors of d [m], θ [rad]
-    and, relative, of the force against the sensor's sum; ``valid`` is the share of frames whose
-    estimate can be used, and they are over those.
+    and of the force against the sensor's sum, over the rms force; ``valid`` is the share of frames
+    whose estimate can be used, and they are over those.
     """
 
     tip: Fingertip
@@ -157,15 +157,15 @@ def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bo
         force = found.gain * float(table(found.d, tilt).force)
         measured = float(frame[used].sum()) * area
         turned = math.hypot(found.tilt_x - theta, found.tilt_y)
-        errors.append([found.d - d, turned, force / measured - 1.0])
+        errors.append([found.d - d, turned, force - measured, measured])
     if not errors:
         return fit
-    d_error, theta_error, force_error = np.sqrt(np.mean(np.square(errors), axis=0))
+    d_error, theta_error, off, forces = np.sqrt(np.mean(np.square(errors), axis=0))
     return replace(
         fit,
         d_error=float(d_error),
         theta_error=float(theta_error),
-        force_error=float(force_error),
+        force_error=float(off / forces),
         valid=len(errors) / len(presses.frames),
     )
 

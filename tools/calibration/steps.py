@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,8 +33,10 @@ from softfinger.daemon.perception.finger_model import calibrated_grid
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.estimation.calibration import (
     CalibrationError,
     cleared,
@@ -46,6 +48,8 @@ from softfinger.kinematics.estimation.calibration import (
     tare,
     without_end,
 )
+from softfinger.kinematics.estimation.measured import MeasuredEstimator
+from softfinger.kinematics.estimation.measured_fit import CurvesError, PressSums, fit_measured
 from softfinger.kinematics.estimation.press_fit import Presses, TipFit, compare_tips
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
@@ -162,6 +166,7 @@ def _tare(step: Step) -> Done:
         noise=noise,
         frames=count,
         correlation=rho.tolist(),
+        excess=found.excess,
         drift=found.drift,
     )
     line = f"{count} frames, zero up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
@@ -187,7 +192,7 @@ def _equilibrate(step: Step) -> Done:
         f"{len(step.loads.frames)} pressures, cells differ by {found.spread:.2%} rms before and "
         f"{found.residual:.2%} after; {dead} dead"
     )
-    calibration = step.result(equilibrate=result, curve=None, modulus=None)
+    calibration = step.result(equilibrate=result, curve=None, modulus=None, law=None)
     return calibration, line, {"gain": found.gain}
 
 
@@ -216,7 +221,7 @@ def _curve(step: Step) -> Done:
     )
     line = f"{found.kind} from {len(force)} loads, forces within {found.residual:.2%} rms"
     picture = {"force": force, "errors": found.errors}
-    return step.result(curve=result, modulus=None), line, picture
+    return step.result(curve=result, modulus=None, law=None), line, picture
 
 
 def _centre(step: Step) -> Done:
@@ -306,24 +311,74 @@ def _law(step: Step) -> Done:
     presses = Presses(signed, d, theta, noise, live & ~full)
     material = make_material(settings.material)
     fits = compare_tips(presses, settings.tip.radius, grid, live, material)
-    best = fits[0]
-    if best.valid == 0.0:
-        raise CalibrationError(f"law: none explains these presses; the best: {_told(best)}")
-    strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
-    result = ModulusStep(
-        date=now(),
-        modulus=best.modulus,
-        strain=strain,
-        stress=[float(best.material.stress(each)) for each in strain],
-        offset=best.offset,
-        residual=best.force_error,
-    )
-    line = "\n  ".join(map(_told, fits))
+    best, lines = fits[0], [_told(each) for each in fits]
+    steps: dict[str, Any] = {}
     wanted = f'tip.physics = "{best.tip.physics}"'
     if best.tip.physics == "solid":
         wanted += f', tip.base = "{best.tip.base}", tip.poisson = {best.tip.poisson:.3f}'
-    line += f"\n  for the profile: {wanted}"
-    return step.result(modulus=result), line, {"fits": fits}
+    if best.valid > 0.0:
+        strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
+        steps["modulus"] = ModulusStep(
+            date=now(),
+            modulus=best.modulus,
+            strain=strain,
+            stress=[float(best.material.stress(each)) for each in strain],
+            offset=best.offset,
+            residual=best.force_error,
+        )
+    try:
+        steps["law"], left = _measured(step, live)
+        d_error, theta_error = left[:2]
+        lines.append(_measured_told(steps["law"], left))
+        if best.valid < 1.0 or (d_error < 0.5 * best.d_error and theta_error < best.theta_error):
+            wanted = 'tip.physics = "measured"'
+    except CurvesError as error:
+        if best.valid == 0.0:
+            raise CalibrationError(
+                f"law: none explains these presses; the best: {lines[0]}; measured: {error}"
+            ) from None
+        lines.append(f"measured: no curves: {error}")
+    lines.append(f"for the profile: {wanted}")
+    return step.result(**steps), "\n  ".join(lines), {"fits": fits}
+
+
+def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
+    """Curves through the presses; rms of what they leave in d [m], θ [rad] and F over its rms.
+
+    Of each press the mean over its frames. Raises CurvesError.
+    """
+    d, theta, frames = step.loads.truths["d"], step.theta, step.loads.frames
+    sensor, converter, tare = step.calibration.sensor, step.converter, step.calibration.tare
+    if any((each >= sensor.full_count).any() for each in frames):
+        raise CurvesError("a press saturates a cell, which hides its force")
+    seen = [np.stack([converter(frame).copy() for frame in each]) for each in frames]
+    pressures = np.stack([converter.pressure(each) for each in step.over])
+    rest = converter.pressure((tare.excess if tare else 0.0) * converter.gain)
+    force, gain = pressures.sum(axis=(1, 2)) * step.cell_area, 1.0
+    if (known := step.loads.truths.get("force")) is not None:
+        gain = float(known @ force / (force @ force))
+    radius = step.settings.tip.radius
+    presses = PressSums(d, theta, seen, pressures, rest, live, gain)
+    law = fit_measured(presses, radius, step.plain_grid)
+    placed = replace(step.plain_grid, centre=law.centre, rotation=law.rotation)
+    estimator = MeasuredEstimator(Fingertip(radius, "measured", law=law), placed, live)
+    errors = []
+    for k in np.flatnonzero(d > 0.0):
+        found = [estimator(frame) for frame in seen[k]]
+        depth, tilt = (np.array([getattr(e, name) for e in found]) for name in ("d", "tilt_x"))
+        f = law.at(law.push, depth, tilt) * np.cos(tilt) - gain * force[k]
+        errors.append([np.mean(depth) - d[k], np.mean(tilt) - theta[k], np.mean(f)])
+    left = np.sqrt(np.mean(np.square(errors), axis=0))
+    return law, left / (1.0, 1.0, gain * np.sqrt(np.mean(force[d > 0.0] ** 2)))
+
+
+def _measured_told(law: TipCurves, left: FloatArray) -> str:
+    d, theta, force = left.tolist()
+    return (
+        f"measured: curves of {law.presses} presses to {law.deepest * 1e3:g} mm and "
+        f"{math.degrees(law.tilt):g}°; errors left: d {d * 1e3:.3f} mm, "
+        f"θ {math.degrees(theta):.2f}°, F {force:.1%}"
+    )
 
 
 def _told(fit: TipFit) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
 from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
 _CLEAR = 1e-3  # m over the tip, where the plate tilts and waits
@@ -107,20 +108,20 @@ def _value(name: str, text: str) -> float:
 
 def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
-    # As far as the tip's law goes at that tilt; by the lookup that the plant has compiled, too.
-    most = table.tip.radius * (1.0 - abs(math.sin(theta)))
-    known = [(float(x), table(float(x), theta)) for x in np.linspace(0.0, 0.75 * most, 1001)]
-    depths = [x for x, contact in known if contact.inside]
-    forces = [scale * float(contact.force) for _, contact in known if contact.inside]
+    # As far as the tip's law goes at that tilt.
+    most = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
+    known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, most, 1001)]
+    depths = [x for x, (*_, inside) in known if inside]
+    forces = [scale * float(force) for _, (force, *_, inside) in known if inside]
     if "force" in values:
         d = float(np.interp(values["force"], forces, depths, right=math.inf))
-    if d > depths[-1]:
+    force, *_, inside = lookup(table.data, d, theta)
+    if d > most or not inside:
         raise PlateError(
             f"press: at {math.degrees(theta):g}° this tip takes {depths[-1] * 1e3:.2f} mm or "
             f"{forces[-1]:.1f} N at most"
         )
-    force = scale * float(table(d, theta).force)
-    return PlatePress(d, theta, pressure, force, values["speed"], values["hold"])
+    return PlatePress(d, theta, pressure, scale * float(force), values["speed"], values["hold"])
 
 
 class Plate:

@@ -1,0 +1,200 @@
+"""Calibration presses → the curves of a `TipCurves`."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger import SoftfingerError
+from softfinger.kinematics.contact.tip_curves import (
+    POWERS,
+    SQUARES,
+    Curve,
+    FloatArray,
+    TipCurves,
+    rises,
+)
+from softfinger.kinematics.estimation.measured import sum_weights
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+_FEWEST = 6  # presses
+_UPRIGHT = math.radians(1.0)
+_TILTED = math.radians(5.0)
+_POOR = 0.05  # of the force, and of the radius, that curves may miss by
+_STAGE = 2e-3  # relative, that no stage and sensor do better
+
+
+class CurvesError(SoftfingerError, ValueError):
+    """The presses make no law. The message says what is missing or wrong."""
+
+
+@dataclass(frozen=True)
+class PressSums:
+    """Presses of d [n] m and θ [n] rad in the finger's plane.
+
+    ``frames``: of each press [k, rows, cols] Pa, as the daemon will see them; ``pressures`` their
+    mean without what noise that ends at 0 adds, [n, rows, cols]; ``rest`` [rows, cols] is that
+    addition where nothing presses. ``gain``: true force over the sensor's.
+    """
+
+    d: FloatArray
+    theta: FloatArray
+    frames: Sequence[FloatArray]
+    pressures: FloatArray
+    rest: FloatArray
+    live: NDArray[np.bool_]
+    gain: float = 1.0
+
+
+def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
+    """The law of a tip of ``radius``, whose place on the ``grid`` is found along.
+
+    Raises CurvesError.
+    """
+    used = presses.d > 0.0
+    d, theta = presses.d[used], presses.theta[used]
+    tilted = np.abs(theta) > _TILTED
+    if (
+        len(d) < _FEWEST
+        or len(np.unique(d)) < 3
+        or tilted.sum() < 2
+        or not (np.abs(theta) < _UPRIGHT).any()
+    ):
+        raise CurvesError(
+            f"found {len(d)} presses of {len(np.unique(d))} depths, {tilted.sum()} of them tilted; "
+            f"expected at least {_FEWEST} of 3 depths, upright ones, and 2 tilted by 5° or more"
+        )
+    frames = [each for each, kept in zip(presses.frames, used, strict=True) if kept]
+    first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
+    centre, rotation = _place(
+        _sums(frames, sum_weights(first, radius, presses.live), presses.rest), theta
+    )
+    placed = replace(grid, centre=centre, rotation=rotation)
+    weights = sum_weights(placed, radius, presses.live)
+    sums = _sums(frames, weights, presses.rest)
+    noise = _noise(frames, weights)
+    force = presses.gain * (presses.pressures[used].reshape(len(d), -1) @ weights[0])
+    t, s = np.sqrt(d / radius), np.sin(theta)
+    q, root, square = s * s, float(t.max()), float(np.max(s * s))
+    number = len({round(float(x), 3) for x in np.abs(theta)})
+    squares = min(number, SQUARES)
+    scatter = np.sqrt(noise.diagonal()[:, None] / [len(each) for each in frames])
+
+    def curve(
+        y: FloatArray, sigma: FloatArray, powers: Sequence[int], times: FloatArray, name: str
+    ) -> Curve:
+        def sound(found: FloatArray) -> bool:
+            if name == "lever":
+                found = np.concatenate([np.zeros((1, SQUARES)), found[:-1]])  # t · lever rises
+            return name == "extent" or rises(found, root, square)
+
+        best = _best((t, q, times), y, np.hypot(sigma, _STAGE * np.abs(y)), powers, squares, sound)
+        if best is None:
+            raise CurvesError(f"no smooth curve that rises goes through the presses' {name}")
+        return tuple(map(tuple, best.tolist()))
+
+    one = np.ones(len(d))
+    push = curve(force / np.cos(theta), scatter[0], (3, 4, 5), one, "push")
+    shown = curve(sums[0], scatter[0], (3, 4, 5), one, "shown")
+    lever = curve(sums[1], scatter[1], (0, 1, 2, 3), s * sums[0], "lever")
+    extent = curve(sums[3], scatter[3], (0, 2, 4), sums[0], "extent")
+    law = TipCurves(
+        radius=radius,
+        deepest=float(d.max()),
+        tilt=float(np.abs(theta).max()),
+        push=push,
+        shown=shown,
+        lever=lever,
+        extent=extent,
+        centre=centre,
+        rotation=rotation,
+        rest=tuple((presses.rest.ravel() @ weights.T).tolist()),
+        noise=tuple(map(tuple, noise.tolist())),
+        force_error=0.0,
+        lever_error=0.0,
+        presses=len(d),
+    )
+    misses = np.stack(
+        [
+            law.at(push, d, theta) * np.cos(theta) - force,
+            law.at(shown, d, theta) - sums[0],
+            s * law.at(lever, d, theta) * sums[0] - sums[1],
+            -sums[2],
+        ]
+    )
+    missed = [
+        _beyond(misses[k] / sums[0], scatter[m] / sums[0], _STAGE * least)
+        for k, m, least in ((0, 0, 1.0), (1, 0, 1.0), (2, 1, radius), (3, 2, radius))
+    ]
+    force_error, lever_error = max(missed[:2]), max(missed[2:])
+    if max(force_error, lever_error / radius) > _POOR:
+        raise CurvesError(
+            f"every smooth curve that rises misses the presses' force by {force_error:.1%} or "
+            f"their centroid by {lever_error * 1e3:.2f} mm"
+        )
+    return replace(law, force_error=force_error, lever_error=lever_error)
+
+
+def _beyond(misses: FloatArray, noise: FloatArray, least: float) -> float:
+    """Standard deviation of what misses beyond its noise; those that are least noisy count most."""
+    weight = 1.0 / (noise**2 + least**2)
+    return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
+
+
+def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -> FloatArray:
+    """Each press' sums over the rest's, [4, presses]."""
+    means = np.stack([each.mean(axis=0) for each in frames]) - rest
+    return np.asarray(weights @ means.reshape(len(frames), -1).T)
+
+
+def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
+    """Covariance of one frame's sums [4, 4], from the frames of each press."""
+    if min(map(len, frames)) < 5:
+        raise CurvesError("expected at least five frames of each press: their noise counts")
+    each = [weights @ every.reshape(len(every), -1).T for every in frames]
+    return np.asarray(np.mean([np.cov(sums) for sums in each], axis=0))
+
+
+def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], float]:
+    """The tip's centre [m] by upright presses, and the sensor's rotation [rad] by tilted ones."""
+    x, y = sums[1:3] / sums[0]
+    weight = np.where(np.abs(theta) < _UPRIGHT, sums[0], 0.0)
+    weight /= weight.sum()
+    centre = float(weight @ x), float(weight @ y)
+    along = np.sin(theta) * sums[0]
+    # The finger's x axis in the sensor's: (cos, −sin) of the rotation.
+    return centre, math.atan2(-float(along @ (y - centre[1])), float(along @ (x - centre[0])))
+
+
+def _best(
+    places: tuple[FloatArray, FloatArray, FloatArray],
+    y: FloatArray,
+    sigma: FloatArray,
+    powers: Sequence[int],
+    squares: int,
+    sound: Callable[[FloatArray], bool],
+) -> FloatArray | None:
+    """The curve of least χ² + n log presses among the sound ones; y = times · curve(t, q)."""
+    t, q, times = places
+    best, least = None, math.inf
+    for count in range(1, len(powers) + 1):
+        for chosen in itertools.combinations(powers, count):
+            for wide in range(1, squares + 1):
+                terms = [(i, j) for i in chosen for j in range(wide)]
+                if len(terms) > len(y) - 2:
+                    continue
+                rows = np.stack([times * t**i * q**j for i, j in terms], axis=1) / sigma[:, None]
+                found = np.linalg.lstsq(rows, y / sigma, rcond=None)[0]
+                cost = float(np.sum((rows @ found - y / sigma) ** 2)) + len(terms) * math.log(
+                    len(y)
+                )
+                made = np.zeros((POWERS, SQUARES))
+                made[tuple(np.transpose(terms))] = found
+                if cost < least and sound(made):
+                    best, least = made, cost
+    return best
