@@ -396,8 +396,8 @@ class TrueObject:
 )
 @record
 class TrueState(_TickMessage):
-    """One ``hand/truth``."""
+    """One ``hand/truth``, by names of its own: a plot of all topics keeps them apart."""
 
-    left: TrueFinger = part("", "left finger: ", i=0)
-    right: TrueFinger = part("", "right finger: ", i=1)
-    object: TrueObject = part("")
+    true_left: TrueFinger = part("", "left finger: ", i=0)
+    true_right: TrueFinger = part("", "right finger: ", i=1)
+    true_object: TrueObject = part("")

@@ -165,7 +165,8 @@ def load_run(
 ) -> RecordedRun:
     """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
     states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT})
-    truth = _Columns(("seq", "mono_ns"), {**dict.fromkeys(FINGERS, _TRUE), "object": _TRUE_OBJECT})
+    true_fingers = {f"true_{name}": _TRUE for name in FINGERS}
+    truth = _Columns(("seq", "mono_ns"), {**true_fingers, "true_object": _TRUE_OBJECT})
     modes, faults, commands = array("q"), [], []
     stats: dict[str, Any] | None = None
     fault = ""

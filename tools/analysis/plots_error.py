@@ -32,7 +32,8 @@ def draw_error(run: RecordedRun) -> Figure:
         raise Missing("no hand/truth in it: only simulated hands publish it")
     at, true = run.matched()
     both = {
-        name: run.touching(name)[at] & (run.truth[f"{name}.d"][true] > 0.0) for name in run.fingers
+        name: run.touching(name)[at] & (run.truth[f"true_{name}.d"][true] > 0.0)
+        for name in run.fingers
     }
     if not any(each.any() for each in both.values()):
         raise Missing("no contact in it")
@@ -43,11 +44,11 @@ def draw_error(run: RecordedRun) -> Figure:
         entries = []
         for name, sound in both.items():
             key = f"{name}.{field}"
-            error = (run.states[key][at] - run.truth[key][true]) * factor
+            error = (run.states[key][at] - run.truth[f"true_{key}"][true]) * factor
             entries.append((name, error, _spread(run, name, field)[at] * factor, sound))
         _row(panels, t, entries)
         panels[0].set_ylabel(f"error of {title} [{unit}]")
-    error = (run.states["object.angle"][at] - run.truth["object.angle"][true]) * DEGREES
+    error = (run.states["object.angle"][at] - run.truth["true_object.angle"][true]) * DEGREES
     sound = (run.states["object.valid"][at] > 0.0) & np.all(list(both.values()), axis=0)
     _row(axes[3], t, [("object", error, np.full(t.size, np.nan), sound)])
     axes[3, 0].set_ylabel("error of φ [°]")

@@ -180,8 +180,8 @@ class Drawing:
 
     def truth(self, truth: dict[str, Any]) -> None:
         """Draw the simulated object's true pose."""
-        x, y = number(truth, "object", "x"), number(truth, "object", "y")
-        angle = number(truth, "object", "angle")
+        x, y = number(truth, "true_object", "x"), number(truth, "true_object", "y")
+        angle = number(truth, "true_object", "angle")
         simulated = self._hand.settings.simulation
         outline = _outline(simulated.object_shape, simulated, x, y, angle)
         strips = [] if outline is None or not np.isfinite(outline).all() else [_view(outline)]
