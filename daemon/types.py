@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:  # a command's client needs no NumPy
+    import numpy as np
+    from numpy.typing import NDArray
 
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # unless settings or a client say otherwise
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
+GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
 Event = tuple[str, str, str]  # level, kind, text
 
 

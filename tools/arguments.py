@@ -1,4 +1,7 @@
-"""Command-line arguments that several subcommands share."""
+"""Command-line arguments that several subcommands share.
+
+The settings are imported where a profile is taken: the clients of a running hand need none.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import require_own, runtime_folder
-from softfinger.daemon.profile.load import load, names
-from softfinger.daemon.profile.settings import Settings
 
 if TYPE_CHECKING:
+    from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
 PATIENCE = 5.0  # s that `--no-wait` gives a stream to arrive
@@ -33,6 +35,8 @@ def add_profile(parser: argparse.ArgumentParser) -> None:
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """``--config`` and ``--set``, for a subcommand whose ``--dir`` is its own."""
+    from softfinger.daemon.profile.load import names
+
     parser.add_argument(
         "--config",
         type=Path,
@@ -50,6 +54,8 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 def profile(arguments: argparse.Namespace) -> Settings:
     """The settings that `add_profile`'s arguments name. Raises SettingsError with the report."""
+    from softfinger.daemon.profile.load import load
+
     return load(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
 
 

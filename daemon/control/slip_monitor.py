@@ -32,7 +32,8 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
-from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import GRIP_SHARE
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.external_load import load_of

@@ -16,10 +16,10 @@ from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
-from softfinger.daemon.types import FINGERS, State
+from softfinger.daemon.types import FINGERS, GRIP_SHARE, State
 
 _COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE = frozenset({"command", "client"})

@@ -271,9 +271,6 @@ class ControlSettings(Section):
     envelope: str = ""  # what the hand holds, by `softfinger envelope --keep`; "": the built-in's
 
 
-GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
-
-
 class SafetySettings(Section):
     """Limits. The goal is bounded by them; crossing a hard one latches a fault."""
 

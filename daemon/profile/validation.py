@@ -12,8 +12,8 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 from softfinger.daemon.backends import SERVOS, TACTILE
-from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS, GRIP_SHARE
 
 _LONGEST = 60  # characters of a value that are shown
 _DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own

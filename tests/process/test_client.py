@@ -264,12 +264,24 @@ def test_fingers_by_name() -> None:
         state.finger("thumb")
 
 
-def test_importing_the_client_loads_nothing_of_the_daemon() -> None:
-    code = "import softfinger, sys; softfinger.Hand; softfinger.AsyncHand; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("import softfinger; softfinger.Hand; softfinger.AsyncHand", {"pydantic"}),
+        ("import softfinger.tools.terminal.monitor", {"pydantic", "asyncio"}),
+        ("import softfinger.tools.terminal.send", {"pydantic", "asyncio", "numpy"}),
+    ],
+)
+def test_clients_load_nothing_of_the_daemon(code: str, absent: set[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; {code}; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     loaded = set(done.stdout.split())
-    assert "softfinger.daemon.client.hand" in loaded
-    assert not loaded & {"numba", "pydantic", "softfinger.kinematics", "softfinger.daemon.loop"}
+    assert "softfinger.daemon.client.command_client" in loaded
+    assert not loaded & {"numba", "softfinger.kinematics", "softfinger.daemon.loop", *absent}
 
 
 def _face(cls: type) -> dict[str, object]:

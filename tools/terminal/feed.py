@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.client.connection import unpack
 from softfinger.daemon.client.records import read
 from softfinger.daemon.control.modes import UNLEASED
-from softfinger.daemon.profile.settings import GRIP_SHARE
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.types import FINGERS, GRIP_SHARE
 from softfinger.daemon.wire.schema import (
     COMMAND,
     EVENT,
