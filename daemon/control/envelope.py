@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.settings import GRIP_SHARE, Settings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import GRIP_SHARE
 
 KEPT = Path(__file__).with_name("envelope.toml")
 HELD, TURNED, LOST, REFUSED = "htlr"
