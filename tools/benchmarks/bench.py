@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the files that were asked for."""
-    from softfinger.tools.benchmarks.measuring import Report, figure, slower, yardstick
+    from softfinger.tools.benchmarks.measuring import Report, slower
 
     campaign = arguments.names[:1] == [_CAMPAIGN]
     texts = CAMPAIGNS if campaign else MEASUREMENTS
@@ -83,64 +83,77 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     load = [os.getloadavg()[0]]
     rows: list[Row] = []
-    drawn: list[Report] = []
-    page: list[Row] = []
+    tables: list[Report] = []
     status = 0
     for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        before = yardstick()
-        try:
-            if campaign:
-                tables = _module(name).measure(arguments.trials, arguments.only)
-            else:
-                tables = _module(name).measure(brief=arguments.brief or not arguments.names)
-        except RuntimeError as error:  # on a busy machine a hand may let go
-            print(f"bench: {name}: {error}", file=sys.stderr)
+        found, stick = _measured(name, campaign, arguments)
+        rows += _kept(name, [*found, stick])
+        if any(table.failed for table in found) or not found:
             status = FAILED
-            continue
-        stick = Report("", [figure("yardstick", "µs", before + yardstick())])
-        for table in [*tables, stick]:
-            head = {"measurement": name, "table": table.title}
-            # JSON knows no NaN, which alone differs from itself.
-            rows += [
-                head | {key: None if value != value else value for key, value in row.items()}
-                for row in table.rows
-            ]
-            if table.failed:
-                status = FAILED
-                print(*table.notes, sep="\n", file=sys.stderr)
         if arguments.names:
-            print(*tables, sep="\n\n", end="\n\n")
-        drawn += tables
-        page += [
-            {"name": f"{table.title}: {row['name']}"}
-            | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.x) if key}
-            for table in tables
-            for row in table.on_page
-        ]
+            print(*found, sep="\n\n", end="\n\n")
+        tables += found
     load.append(os.getloadavg()[0])
     if not arguments.names:
         title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
-        print(Report(title, page))
-        shown = [table for table in drawn if table.on_page]
-        drawn = [table if table.x else replace(table, rows=table.on_page) for table in shown]
+        print(Report(title, _page(tables)))
+        tables = [
+            table if table.x else replace(table, rows=table.on_page)
+            for table in tables
+            if table.on_page
+        ]
     if arguments.json:
-        content = {
-            "machine": _processor(),
-            "cores": os.cpu_count(),
-            "python": platform.python_version(),
-            "load": load,
-            "rows": rows,
-        }
+        about = {"machine": _processor(), "cores": os.cpu_count(), "load": load}
+        content = about | {"python": platform.python_version(), "rows": rows}
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
     if arguments.plot:
-        _draw(drawn, arguments.plot)
+        _draw(tables, arguments.plot)
     if old:
-        found = slower(old, rows)
-        print(found)
-        status = status or (SLOWER if found.rows else 0)
+        comparison = slower(old, rows)
+        print(comparison)
+        status = status or (SLOWER if comparison.rows else 0)
     return status
+
+
+def _measured(
+    name: str, campaign: bool, arguments: argparse.Namespace
+) -> tuple[list[Report], Report]:
+    """A measurement's tables, none where it failed, and the yardstick before and after it."""
+    from softfinger.tools.benchmarks.measuring import Report, figure, yardstick
+
+    before, tables = yardstick(), []
+    try:
+        if campaign:
+            tables = _module(name).measure(arguments.trials, arguments.only)
+        else:
+            tables = _module(name).measure(brief=arguments.brief or not arguments.names)
+    except RuntimeError as error:  # on a busy machine a hand may let go
+        print(f"bench: {name}: {error}", file=sys.stderr)
+    for table in tables:
+        if table.failed:
+            print(*table.notes, sep="\n", file=sys.stderr)
+    return tables, Report("", [figure("yardstick", "µs", before + yardstick())])
+
+
+def _kept(name: str, tables: list[Report]) -> list[Row]:
+    """Rows as JSON has them, which knows no NaN."""
+    return [
+        {"measurement": name, "table": table.title}
+        | {key: None if value != value else value for key, value in row.items()}
+        for table in tables
+        for row in table.rows
+    ]
+
+
+def _page(tables: list[Report]) -> list[Row]:
+    return [
+        {"name": f"{table.title}: {row['name']}"}
+        | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.x) if key}
+        for table in tables
+        for row in table.on_page
+    ]
 
 
 def _module(name: str) -> ModuleType:

@@ -267,7 +267,6 @@ def summary(case: FaultCase, found: list[Trial], disturbed: int) -> Row:
         "expected": case.expect,
         "passed": passed,
         "trials": count,
-        "failures, 95 % below": min(upper_bound(count - passed, count), 1.0),
         "disturbed": disturbed,
     }
     for key, times in (
@@ -281,18 +280,6 @@ def summary(case: FaultCase, found: list[Trial], disturbed: int) -> Row:
     counts = Counter(each.fault for each in found if each.fault)
     row["faults"] = ", ".join(f"{fault} {count}" for fault, count in counts.items())
     return row
-
-
-def upper_bound(count: int, trials: int) -> float:
-    """The rate at which ``count`` events or fewer in ``trials`` are 5 % likely.
-
-    Poisson's bound by the χ² quantile in Wilson and Hilferty's form: within 1 % from one event on,
-    and −ln 0.05 events for none.
-    """
-    if count == 0:
-        return -math.log(0.05) / trials
-    k = count + 1.0
-    return k * (1.0 - 1.0 / (9.0 * k) + 1.6449 / (3.0 * math.sqrt(k))) ** 3 / trials
 
 
 def trial(rig: Rig, case: FaultCase, seed: int) -> Trial:
