@@ -162,7 +162,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Paths over U(d, θ) with its minimum over θ, and their height above it over time."""
+    """Paths over U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(groups))
@@ -182,8 +182,8 @@ def draw_landscape(run: RecordedRun) -> Figure:
         for marker, what in (("^", "begins"), ("s", "ends")):
             panel.plot([], [], marker, color=style.GREY, markersize=4, label=what)
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
-    above.set_ylabel("U above its minimum\nat the same d [mJ]")
-    above.set_ylim(bottom=0.0)
+    above.axhline(0.0, color=style.GREY, linewidth=0.6)
+    above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
     time_axis(above, run.t)
     titled(figure, run, "path on the energy landscape")
     return figure
@@ -222,13 +222,15 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     low = [level for level in levels[1:-1] if level < 0.65 * most]  # others run out of the frame
     panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
     least = theta[np.argmin(energy, axis=1)]
-    panel.plot(
-        least * DEGREES,
-        d * 1e3,
-        color=style.INK,
-        linestyle=(0, (1, 1.2)),
-        label="local minimum over θ",
-    )
+    local = np.abs(least) < 0.99 * widest  # a bonded solid tip's energy falls to the sides
+    if local.any():
+        panel.plot(
+            np.where(local, least, np.nan) * DEGREES,
+            d * 1e3,
+            color=style.INK,
+            linestyle=(0, (1, 1.2)),
+            label="local minimum over θ",
+        )
     shown = limit < widest
     for side in (-1.0, 1.0):
         if shown.any():
