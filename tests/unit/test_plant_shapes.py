@@ -132,7 +132,7 @@ def springs_on_a_cylinder(d, theta, curved):
 
 
 @pytest.mark.parametrize(
-    ("curved", "upright", "tilted"), [(10.0, 1e-3, 1e-3), (0.04, 0.02, 0.023), (0.02, 0.01, 0.045)]
+    ("curved", "upright", "tilted"), [(1.0, 1.5e-3, 1e-3), (0.04, 0.02, 0.023), (0.02, 0.01, 0.045)]
 )
 def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upright, tilted):
     share = make(object_shape="disc", object_radius=curved).plant.parameters.share
