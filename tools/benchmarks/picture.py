@@ -58,8 +58,9 @@ def _points(axes: Axes, report: Report, looks: dict[str, int]) -> None:
             ms=4,
             label=kind,
         )
-    scale = "linear" if any(row.get(x) == 0.0 for row in report.rows) else "log"
-    axes.set(xscale=scale, yscale=scale, xlabel=x, ylabel=f"[{report.rows[0]['unit']}]")
+    shown = [row for row in report.rows if row.get(x) is not None and "median" in row]
+    axes.set(xscale=_scale([row[x] for row in shown]), xlabel=x)
+    axes.set(yscale=_scale([row["median"] for row in shown]), ylabel=f"[{shown[0]['unit']}]")
     if not report.grows:
         axes.set_xlabel(f"{x} (better →)")
         axes.invert_xaxis()
@@ -79,5 +80,9 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
     axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)
     tails = any(row["n"] >= 100 for row in rows)
     axes.set_xlabel(f"median{' and 99th percentile' if tails else ''} [{rows[0]['unit']}]")
-    if max(row["p99"] for row in rows) > 30.0 * min(row["median"] for row in rows):
-        axes.set_xscale("log")
+    axes.set_xscale(_scale([row[key] for row in rows for key in ("median", "p99")]))
+
+
+def _scale(values: list[float]) -> str:
+    """Logarithmic from a decade on."""
+    return "log" if 0.0 < 10.0 * min(values) < max(values) else "linear"

@@ -222,13 +222,18 @@ def saving(name: str, with_it: NDArray[np.float64], without: NDArray[np.float64]
 
 
 def first_start(*words: str) -> tuple[float, float]:
-    """Seconds that all kernels of a scene take to compile, by the clock and of processors."""
+    """Seconds that all kernels of a scene take to compile, by the clock and of processors.
+
+    Raises RigError.
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = os.environ | {"XDG_CACHE_HOME": folder}
         environment.pop("NUMBA_CACHE_DIR", None)
         spent, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
         command = [*SOFTFINGER, "compile", *words]
-        subprocess.run(command, env=environment, check=True, capture_output=True)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        if done.returncode:
+            raise RigError(f"{' '.join(command[1:])}: {done.stderr.splitlines()[-1:]}")
         wall, total = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     busy = total.ru_utime + total.ru_stime - spent.ru_utime - spent.ru_stime
     return wall, busy
