@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
 from softfinger.tools.benchmarks import accuracy, bench, measuring, servos, tick
 from softfinger.tools.benchmarks.measuring import (
@@ -148,7 +149,7 @@ def test_a_measurement_that_fails_leaves_the_others(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def let_go(brief: bool) -> list[Report]:
-        raise RuntimeError("the hand let go")
+        raise Refused("the hand let go")
 
     monkeypatch.setattr(servos, "measure", let_go)
     assert cli.main(["bench", "servos", "tick"]) == 1

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.own_files import write_text
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def _measured(
             tables = _module(name).measure(arguments.trials, arguments.only)
         else:
             tables = _module(name).measure(brief=arguments.brief or not arguments.names)
-    except RuntimeError as error:  # on a busy machine a hand may let go
+    except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
         if table.failed:

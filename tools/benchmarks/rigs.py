@@ -41,7 +41,7 @@ _STATE_RATE = 250.0  # Hz
 _LOOK = 0.003  # s between two looks at the hand
 
 
-class RigError(SoftfingerError, RuntimeError):
+class RigError(SoftfingerError):
     """The set-up itself does not work: nothing was measured."""
 
 
@@ -91,7 +91,7 @@ def virtual_daemon(
 
 
 def hold(daemon: Daemon, force: float = 8.0) -> None:
-    """Grasp the simulated object. Raises RigError when it is not held within 3 s."""
+    """Grasp the simulated object. Raises RigError when it is not held within 3 s, or Refused."""
     loop = daemon.loop
     loop.advance(0.2)
     loop.command({"command": "arm"})

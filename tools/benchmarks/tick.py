@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.clock import RealClock
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.load import load
@@ -30,7 +31,6 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, Row, figure, timed
 from softfinger.tools.benchmarks.rigs import (
     HIL,
-    RigError,
     can,
     emulator,
     hold,
@@ -61,7 +61,7 @@ def measure(brief: bool = False) -> list[Report]:
     notes: tuple[str, ...] = ()
     try:
         rows.append(_over_ptys(3.0 if brief else 10.0))
-    except RigError as error:  # as on a machine that is busy elsewhere
+    except SoftfingerError as error:  # as on a machine that is busy elsewhere
         notes = (f"over ptys: {error}",)
     return [
         Report("tick", rows, page=("",), notes=notes, failed=bool(notes)),
