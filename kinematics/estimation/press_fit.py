@@ -13,7 +13,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.contact.closed_form import POISSON, Base, Fingertip
+from softfinger.kinematics.contact.closed_form import POISSON, Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
@@ -113,20 +113,23 @@ def compare_tips(
 ) -> list[TipFit]:
     """Springs, and solid rubber on either base at its best ν: the best explanation first.
 
-    Springs of a constant modulus, and of the ``material``'s law where that is another one.
+    With the face frictionless, and on the better base sticking. Springs of a constant modulus, and
+    of the ``material``'s law where that is another one.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:
         law = _scaled(material, 1.0 / material.reference_modulus)
         fits.append(fit_tip(presses, Fingertip(radius), grid, law))
-    for base in ("bonded", "lying"):
-        fits.append(_best_poisson(presses, radius, base, grid))
+    bonded = Fingertip(radius, "solid")
+    both = [_best_poisson(presses, tip, grid) for tip in (bonded, replace(bonded, base="lying"))]
+    better = min(both, key=lambda fit: fit.chi2).tip
+    fits += [*both, _best_poisson(presses, replace(better, face="sticking"), grid)]
     return sorted((_judged(presses, each, grid, live) for each in fits), key=lambda fit: fit.chi2)
 
 
-def _best_poisson(presses: Presses, radius: float, base: Base, grid: SensorGrid) -> TipFit:
+def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     def at(poisson: float) -> TipFit:
-        return fit_tip(presses, Fingertip(radius, "solid", poisson, base), grid)
+        return fit_tip(presses, replace(tip, poisson=poisson), grid)
 
     low, high = POISSON
     inner = [at(high - _GOLDEN * (high - low)), at(low + _GOLDEN * (high - low))]

@@ -264,11 +264,12 @@ def main() -> None:
                     "energy": energy,
                     "force": force,
                     "frame": frame.astype(np.float32),
+                    "dofs": tip.free.size,
                 }
                 for name, value in row.items():
                     found.setdefault(name, []).append(value)
-                print(*list(row.values())[:-1], frame.sum(), flush=True)
-                np.savez_compressed(arguments.out, dofs=tip.free.size, **found)
+                print(*list(row.values())[:-2], frame.sum(), flush=True)
+                np.savez_compressed(arguments.out, **found)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,8 +142,10 @@ def test_frames_of_other_elements_are_estimated_as_what_they_are() -> None:
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
         known = {name: file[name] for name in file.files}
     modulus, squares = 0.304e6, []
-    for k, base in enumerate(known["base"]):
-        tip = Fingertip(0.020, "solid", float(known["nu"][k]), str(base))  # type: ignore[arg-type]
+    for k, block in enumerate(known["base"]):
+        base, _, face = str(block).partition("-")
+        kind: Any = (base, face or "frictionless")
+        tip = Fingertip(0.020, "solid", float(known["nu"][k]), *kind)
         table = ContactTable.build(tip, RUBBER)
         estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
         d, theta = known["d"][k] * tip.radius, float(known["theta"][k])

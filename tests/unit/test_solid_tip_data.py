@@ -14,7 +14,7 @@ from softfinger.tools.solid_tip.fit import NU, THETA_MAX
 
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
-BASES = ("bonded", "lying")
+BASES = ("bonded", "lying", "bonded-sticking", "lying-sticking")
 PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in radii
 
 
@@ -42,8 +42,8 @@ def test_shallow_presses_are_those_of_hertz(arrays: dict[str, np.ndarray]) -> No
             for d in (1e-8, 1e-6):
                 push, energy, _ = tip.press(d, theta)
                 hertz = 4 / 3 / (1 - tip.poisson**2) * d**1.5
-                assert push == pytest.approx(hertz, rel=2 * np.sqrt(d))
-                assert energy == pytest.approx(0.4 * hertz * d, rel=2 * np.sqrt(d))
+                assert push == pytest.approx(hertz, rel=3 * np.sqrt(d))
+                assert energy == pytest.approx(0.4 * hertz * d, rel=3 * np.sqrt(d))
 
 
 def test_the_push_is_the_energy_s_slope_and_the_base_carries_it(
@@ -57,7 +57,8 @@ def test_the_push_is_the_energy_s_slope_and_the_base_carries_it(
                 step = 1e-5 * d
                 slope = (tip.press(d + step, theta)[1] - tip.press(d - step, theta)[1]) / (2 * step)
                 assert push == pytest.approx(slope, rel=1e-7)
-                assert pressure[0] @ areas == pytest.approx(push * np.cos(theta), rel=1e-6)
+                if not tip.coef[0].any():  # without friction
+                    assert pressure[0] @ areas == pytest.approx(push * np.cos(theta), rel=1e-6)
 
 
 def test_a_shear_force_turns_the_base_by_its_height(arrays: dict[str, np.ndarray]) -> None:
@@ -94,17 +95,18 @@ def test_frames_of_three_dimensional_elements(arrays: dict[str, np.ndarray]) -> 
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
         rows = list(zip(*(data[name] for name in names), strict=True))
+    areas = np.pi * np.diff(arrays["ring_edges"] ** 2)
     place = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH
     inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # the rim's stress is singular
-    assert len(rows) == 15
+    assert len(rows) == 18
     for base, poisson, d, theta, push, energy, force, frame in rows:
         tip = SolidTip(arrays, str(base), poisson)
         its_push, its_energy, pressure = tip.press(d, theta)
         assert its_push == pytest.approx(push, rel=0.002)
         assert its_energy == pytest.approx(energy, rel=0.002)
-        assert its_push * np.cos(theta) == pytest.approx(force, rel=0.002)
+        assert pressure[0] @ areas == pytest.approx(force, rel=0.002)
         mine = tip.frame(pressure, PITCH, CELLS)
-        assert rms_difference(mine[inner], frame[inner]) < 0.012
+        assert rms_difference(mine[inner], frame[inner]) < 0.014
         assert rms_difference(mine, frame) < 0.04
         moments = centroid_and_extent(mine, PITCH), centroid_and_extent(frame, PITCH)
         np.testing.assert_allclose(*moments, rtol=0, atol=0.02 * MM)

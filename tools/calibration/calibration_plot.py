@@ -85,7 +85,10 @@ def _modulus(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
 
 def _law(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
     fits = data["fits"]
-    names = [each.tip.base if each.tip.physics == "solid" else "springs" for each in fits]
+    names = [
+        f"{tip.base}, {tip.face}" if tip.physics == "solid" else "springs"
+        for tip in (each.tip for each in fits)
+    ]
     for axes, values, title in (
         (left, [each.chi2 for each in fits], "χ² a cell"),
         (right, [100.0 * each.force_error for each in fits], "error left in F [%]"),

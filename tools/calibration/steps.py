@@ -315,7 +315,8 @@ def _law(step: Step) -> Done:
     steps: dict[str, Any] = {}
     wanted = f'tip.physics = "{best.tip.physics}"'
     if best.tip.physics == "solid":
-        wanted += f', tip.base = "{best.tip.base}", tip.poisson = {best.tip.poisson:.3f}'
+        wanted += f', tip.base = "{best.tip.base}", tip.face = "{best.tip.face}"'
+        wanted += f", tip.poisson = {best.tip.poisson:.3f}"
     if best.valid > 0.0:
         strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
         steps["modulus"] = ModulusStep(
@@ -384,7 +385,7 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
 def _told(fit: TipFit) -> str:
     name = "springs" if fit.law.is_linear else f"springs, law {fit.law.name}"
     if fit.tip.physics == "solid":
-        name = f"solid, {fit.tip.base}, ν {fit.tip.poisson:.3f}"
+        name = f"solid, {fit.tip.base}, {fit.tip.face}, ν {fit.tip.poisson:.3f}"
     words = (
         f"{name}: E = {fit.modulus / 1e6:.4f} MPa, zero of d at {fit.offset * 1e3:.3f} mm, "
         f"χ² {fit.chi2:.2f} a cell; "
