@@ -317,8 +317,10 @@ def fit_centre(
         used = np.broadcast_to(True if live is None else live, stack.shape)
         force = stack.sum(axis=(1, 2)) * math.prod(grid.pitches)
         presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
-        found, moved = fit_place(presses, tip, material, grid, tilted)
-        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved, 0.0)
+        found, moved, std = fit_place(presses, tip, material, grid, tilted)
+        # A press is as upright as it can be told to be: a turn is like a shift by half of it.
+        std = math.hypot(std, 0.5 * tip.radius * _UPRIGHT / math.sqrt(3.0 * len(s)))
+        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved, std)
     centre, rotation, scale, residual, std = grid.centre, None, 1.0, 0.0, 0.0
     for _ in range(4):
         at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)

@@ -175,8 +175,9 @@ def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bo
 
 def fit_place(
     presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, turned: bool
-) -> tuple[SensorGrid, float]:
-    """The grid with the tip's centre, and rotation if ``turned``; the rms step left [m].
+) -> tuple[SensorGrid, float, float]:
+    """The grid with the tip's centre, and rotation if ``turned``; the last step [m]; the centre's
+    standard deviation [m] by what the fit leaves.
 
     Gauss-Newton on place, rotation and each press' own depth, begun at ``presses.d``; the tilts are
     known. For a tip whose centroid hardly moves with tilt, so that only the frames' shape tells.
@@ -206,7 +207,8 @@ def fit_place(
         if turned:
             tried = [*tried, (replace(grid, rotation=grid.rotation + _TURN), _TURN)]
         columns += [(presses.of(tip, each, depths) - now) / step for each, step in tried]
-        found = np.linalg.lstsq(np.stack(columns, axis=1), readings - now, rcond=None)[0]
+        jacobian = np.stack(columns, axis=1)
+        found = np.linalg.lstsq(jacobian, readings - now, rcond=None)[0]
         step, place = found[: len(depths)], found[len(depths) :]
         depths = np.clip(depths + step, 0.3 * depths, 0.95 * tip.radius)
         moved = math.hypot(*np.clip(place[:2], -2e-3, 2e-3))
@@ -215,8 +217,11 @@ def fit_place(
         grid = replace(grid, centre=(x + x_step, y + y_step), rotation=rotation)
         if moved < 1e-7:
             break
+    variance = float(((readings - now) ** 2).mean())
+    x = len(depths)
+    std = math.sqrt(variance * float(np.linalg.inv(jacobian.T @ jacobian)[x, x]))
     turn = (grid.rotation + math.pi) % (2.0 * math.pi) - math.pi
-    return replace(grid, rotation=turn), moved
+    return replace(grid, rotation=turn), moved, std
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:

@@ -55,6 +55,7 @@ def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames() -> None
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)
     found = fit_centre(frames(TIP, true), THETA, TIP, RUBBER, GRID, NOISE)
     assert found.centre == pytest.approx(true.centre, abs=6e-5)  # noise: some 2e-5
+    assert 2e-5 < found.std < 1e-4
     assert found.rotation == pytest.approx(-2.0, abs=0.03)
 
 
