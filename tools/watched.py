@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.load import checked
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Seen:
 
 
 class Watched:
-    """A daemon on virtual time, its hand's truth recorded."""
+    """A daemon on virtual time, its hand's truth recorded. Raises SettingsError."""
 
     def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
-        settings = Settings.model_validate(sections | {"loop": {"clock": "virtual"}})
+        settings = checked(sections | {"loop": {"clock": "virtual"}})
         self._daemon = Daemon(settings, wire=False)
         assert self._daemon.hand is not None
         self.plant = self._daemon.hand

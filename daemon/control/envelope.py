@@ -40,10 +40,14 @@ def raised(settings: Settings, force: float) -> float:
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """The first key of both sections that is not the same, with both values."""
+    """The first key of both sections that is not the same, with both values.
+
+    A setting that came after the map was made had its default.
+    """
+    defaults = identity(Settings())
     for name, section in expected.items():
         for key, value in section.items():
-            if (other := found[name].get(key)) != value:
+            if (other := found[name].get(key, defaults[name][key])) != value:
                 return f"{name}.{key}: found {other}, expected {value}"
     return ""
 

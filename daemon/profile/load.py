@@ -47,6 +47,16 @@ def load(
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}
     changed = {_change(data, change) for change in changes}
+    return checked(data, name, changed, directory)
+
+
+def checked(
+    data: dict[str, Any],
+    name: str = "settings",
+    changed: Collection[str] = (),
+    directory: Path | None = None,
+) -> Settings:
+    """The settings that sections ``data`` of a profile ``name`` make, otherwise as `load`."""
     wrong: list[str] = []
     found: list[str] = []
     try:
