@@ -73,9 +73,10 @@ def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
     assert times["b"].tolist() == [7e6] * 3
 
 
-def rows_of(stick: float, **medians: float) -> list[Row]:
-    """A run's rows: a yardstick, and others of 2 % noise."""
+def rows_of(stick: float, busy: float = 1.0, **medians: float) -> list[Row]:
+    """A run's rows: yardsticks, and others of 2 % noise."""
     rows = [figure("yardstick", "µs", [stick] * 100) | {"table": ""}]
+    rows += [figure("yardstick, long", "µs", [100.0 * stick * busy] * 100) | {"table": ""}]
     for name, median in medians.items():
         samples = [0.99 * median, median, 1.01 * median]
         rows.append(figure(name, "µs", samples) | {"table": "t"})
@@ -88,7 +89,8 @@ def test_what_became_slower_is_told_from_noise_and_from_a_slower_machine() -> No
     assert [row["name"] for row in twice.rows] == ["m: t: worse"]
     assert twice.rows[0]["ratio"] == pytest.approx(1.3)
     none = slower(old, rows_of(100.0, same=4.0, worse=5.1))
-    assert str(none) == "slower than before, over the yardstick: 0 of 2"
+    assert str(none) == "slower than before, over the yardsticks: 0 of 2"
+    assert slower(old, rows_of(100.0, busy=4.0, same=20.0, worse=5.0)).rows == []
 
 
 def test_slopes_are_exponents_or_cost_for_each_more() -> None:
@@ -134,12 +136,13 @@ def test_figures_are_kept_and_compared(
     assert [(row["measurement"], row["name"]) for row in rows] == [
         ("tick", "pipeline alone, nobody subscribed"),
         ("tick", "yardstick"),
+        ("tick", "yardstick, long"),
     ]
     canned(2000.0)
     assert cli.main(["bench", "--against", str(old), "--plot", str(tmp_path / "x.png")]) == 3
     printed = capsys.readouterr().out
     assert "tick: pipeline alone" in printed, "the page"
-    assert "slower than before, over the yardstick: 1 of 1" in printed
+    assert "slower than before, over the yardsticks: 1 of 1" in printed
     assert (tmp_path / "x.png").stat().st_size > 5_000
 
 

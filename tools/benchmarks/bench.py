@@ -88,8 +88,8 @@ def run(arguments: argparse.Namespace) -> int:
     status = 0
     for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        found, stick = _measured(name, campaign, arguments)
-        rows += _kept(name, [*found, stick])
+        found, sticks = _measured(name, campaign, arguments)
+        rows += _kept(name, [*found, sticks])
         if any(table.failed for table in found) or not found:
             status = FAILED
         if arguments.names:
@@ -121,10 +121,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _measured(
     name: str, campaign: bool, arguments: argparse.Namespace
 ) -> tuple[list[Report], Report]:
-    """A measurement's tables, none where it failed, and the yardstick before and after it."""
-    from softfinger.tools.benchmarks.measuring import Report, figure, yardstick
+    """A measurement's tables, none where it failed, and the yardsticks before and after it."""
+    from softfinger.tools.benchmarks.measuring import Report, figure, yardsticks
 
-    before, tables = yardstick(), []
+    before, tables = yardsticks(), []
     try:
         if campaign:
             tables = _module(name).measure(arguments.trials, arguments.only)
@@ -135,7 +135,9 @@ def _measured(
     for table in tables:
         if table.failed:
             print(*table.notes, sep="\n", file=sys.stderr)
-    return tables, Report("", [figure("yardstick", "µs", before + yardstick())])
+    after = yardsticks()
+    sticks = [figure(name, "µs", before[name] + after[name]) for name in before]
+    return tables, Report("", sticks)
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:

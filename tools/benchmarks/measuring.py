@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ _SLICE_NS = 4e5  # of one repetition: short against the machine's hiccups, long 
 _IN_SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
 _SURE = 3.0  # times its noise by which a median has to rise to be called slower
 _LEAST = 0.05  # share below which no rise is of interest
+_YARDSTICKS = {"yardstick": (2_000, 51), "yardstick, long": (200_000, 9)}  # steps, samples
 _SINGLE = 0.1  # noise of a single sample, as a share; of n samples the n-th part at least
 
 
@@ -133,9 +135,18 @@ def timed(call: Callable[[], object], count: int = 1) -> list[float]:
     return samples
 
 
-def yardstick() -> list[float]:
-    """Times [µs] of a fixed piece of work: how fast this machine is just now."""
-    return timed(lambda: sum(i * i for i in range(2000)), 51)
+def yardsticks() -> dict[str, list[float]]:
+    """Times [µs] of fixed pieces of work: how fast this machine is just now.
+
+    A short one, and one so long that on a busy machine others have their turn meanwhile.
+    """
+    return {
+        name: timed(partial(_work, steps), count) for name, (steps, count) in _YARDSTICKS.items()
+    }
+
+
+def _work(steps: int) -> int:
+    return sum(i * i for i in range(steps))
 
 
 def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
@@ -174,8 +185,8 @@ def by_kind(rows: list[Row]) -> dict[str, list[Row]]:
 def slower(old: list[Row], new: list[Row]) -> Report:
     """The times and ratios of ``new`` that rose beyond the noise of both runs.
 
-    Rows are matched by measurement, table and name. Times are taken over their run's own yardstick,
-    so that a slower machine makes nothing slower.
+    Rows are matched by measurement, table and name. Times are taken over the yardstick of their
+    runs that has become slower: neither a slower nor a busier machine makes anything slower.
     """
 
     def by_key(rows: list[Row]) -> dict[tuple[str, str, str], Row]:
@@ -184,19 +195,21 @@ def slower(old: list[Row], new: list[Row]) -> Report:
 
     before, after = by_key(old), by_key(new)
     rows = []
-    common = [key for key in after if key[2] != "yardstick" and key in before]
+    common = [key for key in after if key[2] not in _YARDSTICKS and key in before]
     for key in common:
         ends = [before[key], after[key]]
         if min(end["median"] or 0.0 for end in ends) <= 0.0:
             continue
-        values = [end["median"] * _IN_SECONDS.get(end["unit"], 1.0) for end in ends]
+        ratio = ends[1]["median"] / ends[0]["median"]
         if ends[1]["unit"] != "×":
-            sticks = [run[key[0], "", "yardstick"] for run in (before, after)]
-            values = [value / stick["median"] for value, stick in zip(values, sticks, strict=True)]
-            ends += sticks
+            ratio *= _IN_SECONDS[ends[1]["unit"]] / _IN_SECONDS[ends[0]["unit"]]
+            keys = [(key[0], "", name) for name in _YARDSTICKS]
+            sticks = [(before[each], after[each]) for each in keys if each in before]
+            then, now = max(sticks, key=lambda pair: float(pair[1]["median"] / pair[0]["median"]))
+            ratio *= then["median"] / now["median"]
+            ends += [then, now]
         noise = math.hypot(*(max(end["IQR"] / end["median"], _SINGLE / end["n"]) for end in ends))
-        ratio = values[1] / values[0]
         if ratio > 1.0 + max(_SURE * noise, _LEAST):
             name = ": ".join(part for part in key if part)
             rows.append({"name": name, "ratio": ratio, "noise": noise})
-    return Report(f"slower than before, over the yardstick: {len(rows)} of {len(common)}", rows)
+    return Report(f"slower than before, over the yardsticks: {len(rows)} of {len(common)}", rows)
