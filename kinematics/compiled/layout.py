@@ -36,6 +36,7 @@ class Records(Protocol, Generic[Each]):
     """A structured array of one record class, as kernels index it."""
 
     def __getitem__(self, index: int, /) -> Each: ...
+    def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies
     def __len__(self) -> int: ...
 
 

@@ -53,8 +53,9 @@ def is_sound(plant):
     for j in range(6):
         total += state.extra_shear[j]
     for j in range(2):
-        total += state.shear[j] + state.current[j] + felt.d[j] + felt.theta[j] + felt.force[j]
-        total += felt.normal[j] + felt.tangential[j] + felt.rim[j]
+        each = felt[j]
+        total += state.shear[j] + state.current[j] + each.d + each.theta + each.force
+        total += each.normal + each.tangential + each.rim
     return math.isfinite(total)
 
 
@@ -89,10 +90,9 @@ def carry_out(plants, data, ring, commands):
         if not is_sound(plant):
             return NOT_FINITE, k
         for finger in range(2):
-            least = past_limit(
-                plant.parameters.radius, felt.d[finger], felt.theta[finger], felt.bend[finger]
-            )
-            if felt.force[finger] > 0.0 and least > 1e-9 and not felt.rim[finger] > 0.0:
+            each = felt[finger]
+            least = past_limit(plant.parameters.radius, each.d, each.theta, each.bend)
+            if each.force > 0.0 and least > 1e-9 and not each.rim > 0.0:
                 return UNTOLD, k
             if abs(state.position[finger]) > 1.6:
                 return RUNAWAY, k

@@ -43,7 +43,7 @@ def geometry_of(settings: Settings) -> HandGeometry:
 def stiff_step(settings: Settings, table: ContactTable) -> float:
     """Sub-step [s] from the stiffest oscillation of the object on the tips, deeply grasped."""
     simulation = settings.simulation
-    d = min(settings.safety.d_max, 0.6 * settings.tip.radius)
+    d = min(settings.safety.d_max, 0.6 * settings.tip.radius, _deepest(settings, table))
     c = table(d, 0.0)
     # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
@@ -58,15 +58,19 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
+def _deepest(settings: Settings, table: ContactTable) -> float:
+    """d [m] up to which the tips' law holds."""
+    return float(table.header.deepest) if table.is_solid else settings.tip.radius
+
+
 def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step: float) -> None:
     """Set the plant's parameters. Raises SettingsError for an unknown servo."""
     simulation = settings.simulation
     p.step = step
     p.sample_period = 1.0 / settings.tactile.rate
     p.modulus = float(table.header.modulus) * simulation.modulus_scale
-    p.radius = p.deepest = settings.tip.radius
-    if table.is_solid:
-        p.deepest = float(table.header.deepest)
+    p.radius = settings.tip.radius
+    p.deepest = _deepest(settings, table)
     p.scale = simulation.modulus_scale
     p.friction = simulation.tip_friction
     p.loss = simulation.tip_loss

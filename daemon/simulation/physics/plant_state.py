@@ -53,22 +53,8 @@ class Motion(Record):
     current: Pair  # [A]
 
 
-class Felt(Record):
-    """What each tip feels: of object and other tip the one that presses more."""
-
-    d: Pair  # [m], negative: a gap
-    theta: Pair  # [rad]
-    gain: Pair  # of the force against a plane
-    force: Pair  # on the tip's base [N]
-    normal: Pair  # N [N]
-    tangential: Pair  # T [N]
-    rim: Pair  # how far the backing plate's rim is pressed in [m]
-    bend: Pair  # curvature of what is touched [1/m]
-    on_other_tip: Flags
-
-
 class Sample(Record):
-    """What the tips felt at a frame's instant; fields as in :class:`Felt`."""
+    """What the tips felt at a frame's instant; fields as in :class:`TipContact`."""
 
     number: int  # -1: none
     t: float  # since the start [s]
@@ -244,7 +230,8 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    felt: Felt  # at the state's instant
+    felt: Annotated[Records[TipContact], 2]  # by each tip now, of two contacts the firmer one
+    on_other_tip: Flags  # that is on the other tip
     steps: int  # sub-steps done
     samples: int  # taken
     energy: float  # kinetic, elastic and gravitational [J]

@@ -7,6 +7,7 @@ on when which command came, so that two runs are the same to the bit.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +64,7 @@ class SimulatedHand:
         self.start = start
         self.plant = Plant()
         set_parameters(self.plant.parameters, settings, table, self.step)
-        state, felt, simulation = self.plant.state, self.plant.felt, settings.simulation
+        state, simulation = self.plant.state, settings.simulation
         state.position[:2] = settings.hand.open_angle
         state.position[2:4] = simulation.object_position
         state.position[4] = simulation.object_angle
@@ -83,15 +84,16 @@ class SimulatedHand:
         self.current = state.current  # A
         self.object_pose = state.position[2:]  # x, y, φ
         self.object_velocity = state.velocity[2:]
-        self.d = felt.d  # m, negative: a gap
-        self.theta = felt.theta  # rad
-        self.force = felt.force  # F on the tip's base [N]
-        self.normal = felt.normal  # N [N]
-        self.tangential = felt.tangential  # T [N]
+        felt: Any = self.plant.felt
+        self.d = felt.array["d"]  # m, negative: a gap
+        self.theta = felt.array["theta"]  # rad
+        self.force = felt.array["force"]  # F on the tip's base [N]
+        self.normal = felt.array["normal"]  # N [N]
+        self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
         # How far the backing plate's rim is pressed into the object: > 0 is past the tip's limit.
-        self.rim = felt.rim  # m
-        self.on_other_tip = felt.on_other_tip  # 1 where the other tip is felt, not the object
+        self.rim = felt.array["rim"]  # m
+        self.on_other_tip = self.plant.on_other_tip  # 1: the other tip is felt, not the object
         self.torque_on = goals.torque_on  # 1 where a servo has torque
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
         self._run(0)
