@@ -97,3 +97,14 @@ def test_what_a_solid_tip_explains_of_the_papers_measurements() -> None:
     found = least["angle of the least F"]
     assert found[:4] == pytest.approx([-0.4, -0.3, -7.6, -6.1], abs=0.1)
     assert np.isnan(found[4:]).all()
+
+
+def test_a_sticking_press_stores_the_work_done_on_it_at_every_tilt() -> None:
+    with np.load(solid_pages._WAYS) as file:
+        presses = file["pressed_down"].reshape(len(TILTS), -1, 6)
+    ratios = []
+    for d, theta, _, _, force, energy in presses.transpose(0, 2, 1):
+        root = np.sqrt(d / np.cos(theta))  # of the way along the tip's axis
+        ratios.append(np.trapezoid(2.0 * root * force, root) / (energy[-1] - energy[0]))
+    np.testing.assert_allclose(ratios, 1.0, atol=0.006)
+    assert np.ptp(ratios) < 1e-3
