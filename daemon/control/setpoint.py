@@ -121,12 +121,6 @@ def _reset(setpoints: Records[SetpointState], windows: FloatArray, value: float)
     reset(setpoints[0], windows, value)
 
 
-@kernel
-def _step(setpoints: Records[SetpointState], windows: FloatArray, rate: float) -> bool:
-    advance(setpoints[0], windows, rate)
-    return arrived(setpoints[0])
-
-
 class Setpoint:
     """A ramp of bounded rate, averaged over two windows in turn.
 
@@ -135,26 +129,18 @@ class Setpoint:
     its target 1.5 windows after the ramp is.
     """
 
-    def __init__(self, dt: float, window: float, state: SetpointState | None = None) -> None:
-        """``dt`` is the tick and ``window`` the first mean's length [s].
-
-        ``state`` is where it is kept: a part of a greater record, or one of its own.
-        """
-        self.state = SetpointState() if state is None else state
+    def __init__(self, dt: float, window: float, state: SetpointState) -> None:
+        """``dt`` is the tick and ``window`` the first mean's length [s]; kept in ``state``."""
+        self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
         self.state.second.length = max(round(0.5 * window / dt), 1)
         self.windows = np.zeros(self.state.first.length + self.state.second.length)
         self.reset(0.0)
-        self.step(0.0)  # nothing to do yet, but compiled now and by no tick
 
     def reset(self, value: float) -> None:
         """Be at ``value``, at rest."""
         _reset(self.state.array, self.windows, value)
-
-    def step(self, rate: float) -> bool:
-        """Go on by one tick, at most ``rate`` a second; whether it is at the target, at rest."""
-        return _step(self.state.array, self.windows, rate)
 
     @property
     def target(self) -> float:
@@ -186,7 +172,7 @@ class JointSetpoints:
         self._arrays = state.left.array, state.right.array
         self.targets = [0.0, 0.0]  # where they go; may be set at any tick
         self.values = [0.0, 0.0]  # where they are
-        self.step(0.0)
+        self.step(0.0)  # nothing to do yet, but compiled now and by no tick
 
     def reset(self, joint: int, q: float) -> None:
         """Let one be at ``q``, at rest."""

@@ -20,11 +20,12 @@ What these sensors show, and what they don't:
 - While the grip is built up or the object turns, currents also move the joints: the last load is
   kept. A load that grows by more than about 10 N a second is too fast for that.
 - One that comes at once moves the joints, and their damping shows it before the sensors do: where
-  both joints' torques are off by more than twice their friction and three standard deviations of
-  what they flicker by, it is believed at the same tick. How much is to come is not known: the grip
-  is raised by all of ``control.grip_raise_max``, as fast as ``safety.current_rate`` lets it. Of a
-  load towards the palm the torques show less the greater it is, and at no load more than
-  lever²/4 bow (0.07 N·m at 10 N): a sudden one is seen from 14 N of grip on.
+  both joints' torques are off by more than twice their friction, or by what makes a load of that,
+  and three standard deviations of what they flicker by, it is believed at the same tick. How much
+  is to come is not known: the grip is raised by all of ``control.grip_raise_max``, as fast as
+  ``safety.current_rate`` lets it. Of a load towards the palm the torques show less the greater it
+  is, never more than lever²/4 bow, or 0.07 N·m at 10 N, of which friction hides most: a sudden one
+  is seen in a grip of 20 N, in one of 18 N it is not.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ _TURNED_MORE = 0.5  # share that the grip is raised by when the object turns in 
 _WELL = 1.5  # times what the tips' shear explains: the object turns in the grip
 _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth, creep
 _SIGNS = 3.0  # standard deviations, of the angle and of the torques, more than that
+_BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a sudden load
 _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
 _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
@@ -180,10 +182,14 @@ def _average(s: SlipState, grasp: GraspState, closing: float, judged: bool) -> b
     found2 = grasp.unexplained[1] - known
     off1 = found1 - s.smooth[0]
     off2 = found2 - s.smooth[1]
+    off = 0.5 * (off1 + off2)
     before = _mean(s.smooth) - s.still
-    more = abs(before + 0.5 * (off1 + off2)) - abs(before)
-    both = min(abs(off1), abs(off2), more) if off1 * off2 > 0.0 else 0.0
-    sudden = judged and both > 2.0 * friction + _SIGNS * math.sqrt(s.variance)
+    sudden = False
+    if judged and min(off1 * off, off2 * off) > _BOTH * off * off:
+        more = min(abs(off), abs(before + off) - abs(before))
+        shown = max(more - _SIGNS * math.sqrt(s.variance), 0.0)
+        load, _ = load_of(math.copysign(shown, off), grasp.load_lever, grasp.load_bow)
+        sudden = max(shown, grasp.load_lever * abs(load)) > 2.0 * friction
     # Half of the mean square of a difference, of two joints.
     change = 0.25 * ((found1 - s.last[0]) ** 2 + (found2 - s.last[1]) ** 2)
     s.variance += (change - s.variance) * s.law.dt / _LEARN
