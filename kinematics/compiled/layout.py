@@ -144,4 +144,5 @@ def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
     inner = base.__args__[-1]
     if isinstance(inner, type) and issubclass(inner, Record):
         return inner, inner.dtype, shape
-    return None, inner.__args__[0], shape  # NDArray[...]
+    # Of NDArray[np.float64]: dtype[float64], or float64 itself since NumPy 2.5.
+    return None, getattr(inner, "__args__", (inner,))[0], shape

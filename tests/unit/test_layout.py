@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import types
 from typing import Annotated
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Pair, Record, Records
+from softfinger.kinematics.compiled.layout import Pair, Record, Records, _kind
 
 
 class Tip(Record):
@@ -74,3 +75,9 @@ def test_what_is_no_field_is_an_error() -> None:
         memory.spred = 1.0  # type: ignore[attr-defined]
     with pytest.raises(AttributeError, match="newest is a record: set its fields"):
         memory.newest = Tip()
+
+
+def test_arrays_are_known_by_the_aliases_of_every_numpy() -> None:
+    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] there
+    for alias in (NDArray[np.float64], of_2_5):
+        assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

@@ -38,6 +38,7 @@ _MEMORY_STEP = 1.0  # s between two looks at this process's memory
 _MEMORY_SLACK = 50.0  # MB that it may grow by itself
 _AHEAD = 200  # pictures of a recording that are sent before waiting for the viewer
 _FLUSH_TIME = 60.0  # s for that
+_LATE = 10.0  # MB of the stream, some 30 s, that a page opened late reads before it is up to date
 _REST = 1.0  # s between two pictures at most, where drawing is slow
 _NICE = 5  # everything real-time goes first
 
@@ -93,7 +94,10 @@ class Session:
     def _open(self) -> None:
         arguments = self._arguments
         port = arguments.port or (_PORT if is_free(_PORT) else 0)
-        viewer = self._viewer = Viewer(not arguments.web, arguments.memory, port)
+        memory = arguments.memory
+        if arguments.web and arguments.file is None:
+            memory = min(memory, _LATE)
+        viewer = self._viewer = Viewer(not arguments.web, memory, port)
         if viewer.address:
             print(f"view: {viewer.address} with data from port {viewer.receiver}", flush=True)
             if not arguments.no_browser:
