@@ -8,13 +8,15 @@ import sys
 import numpy as np
 import pytest
 
+from softfinger.daemon.profile.load import checked
 from softfinger.kinematics.contact.closed_form import closed_form
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.benchmarks import accuracy, contact, estimator, growth, scenes
+from softfinger.tools.benchmarks import accuracy, contact, control, estimator, growth, scenes
 from softfinger.tools.benchmarks.contact import LAW, MODULUS, TIP
 from softfinger.tools.benchmarks.estimator import GRID, LINEAR, NOISE, TRUTH
 from softfinger.tools.benchmarks.reflex import reaction
+from softfinger.tools.benchmarks.rigs import merged
 
 
 def test_lookups_have_their_errors() -> None:
@@ -134,6 +136,11 @@ def test_steps_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [row["name"] for row in costs.rows] == [scenes.IDLE]
     assert [row["name"] for row in savings.rows] == list(chosen)
     assert all(row["with"] > 0.0 and row["without"] > 0.0 for row in savings.rows)
+
+
+def test_each_way_to_come_upright_has_settings_that_a_profile_may_have() -> None:
+    for law, tips, _ in control.WAYS.values():
+        assert checked(merged({"control": law}, tips)).control.law == law["law"]
 
 
 def test_a_saving_is_told_from_chance() -> None:

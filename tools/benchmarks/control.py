@@ -28,6 +28,7 @@ _SOLID: Sections = {
     "tip": {"physics": "solid"},
     "material": {"law": "constant", "modulus": 0.15e6},
     "estimator": {"free_gain": False},
+    "safety": {"d_max": 0.008},
 }
 # Law, tips, aim for what is left [°].
 WAYS: dict[str, tuple[dict[str, Any], Sections, float | None]] = {
