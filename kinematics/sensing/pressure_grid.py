@@ -251,7 +251,7 @@ class SensorGrid:
         return (across, along), finer
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)  # two fingers' grids, and those that an uncertain place makes of them
 def _pictures(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     if grid.blur == 0.0:
         return pictures(tip, grid.on(tip))

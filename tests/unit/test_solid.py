@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -202,6 +203,19 @@ def test_another_tips_frame_is_a_misfit() -> None:
     found = estimator(springs)
     assert found.contact
     assert found.misfit or not found.valid
+
+
+def test_a_smooth_misfit_widens_what_it_says() -> None:
+    rng, squares = np.random.default_rng(8), []
+    estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
+    frame = GRID.pressure(replace(TIPS[0], face="sticking"), RUBBER, 0.004, 0.2)
+    for _ in range(20):
+        found = estimator(frame + NOISE * rng.standard_normal(GRID.shape))
+        assert found.misfit
+        assert found.d > 1.03 * 0.004
+        error = [found.d - 0.004, found.tilt_x - 0.2, found.tilt_y]
+        squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
+    assert 0.5 < np.mean(squares) < 2.0
 
 
 def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
