@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,6 +98,7 @@ class Material:
         return cls((Fraction(value),), name="constant")
 
     @classmethod
+    @cache
     def table_i(cls) -> Material:
         """The measured polyurethane of the paper's Table I, as a smooth law.
 

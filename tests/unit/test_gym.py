@@ -1,0 +1,74 @@
+"""Gymnasium's environments: what its own checker says, seeds to the bit, and who gets what."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from softfinger.gym import TASKS, register
+from softfinger.gym.__main__ import at_random, by_law, episode
+from softfinger.gym.environment import SoftFingerEnv
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered() -> None:
+    register()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasiums_checker_has_nothing_to_say(task: str) -> None:
+    env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:
+    env = SoftFingerEnv("push")
+
+    def seen(seed: int) -> list[bytes]:
+        found = [env.reset(seed=seed)[0]]
+        for k in range(20):
+            found.append(env.step(np.array([0.3, 0.1 * (k % 3)], np.float32))[0])
+        return [part.tobytes() for observation in found for part in observation.values()]
+
+    first = seen(1)
+    assert seen(1) == first
+    assert seen(2) != first
+    env.close()
+
+
+def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not() -> None:
+    for task, least, most in (("rotate", 150.0, 150.0), ("grasp", 120.0, 20.0)):
+        name = f"SoftFinger-{task.capitalize()}-v0"
+        by_joints, law = gymnasium.make(name), gymnasium.make(name, control="law")
+        random = [episode(by_joints, at_random(by_joints), seed) for seed in (0, 1)]
+        assert min(episode(law, by_law, seed) for seed in (0, 1)) > least
+        assert np.mean(random) < most
+        by_joints.close()
+        law.close()
+
+
+def test_several_hands_step_beside_each_other_as_each_would_alone() -> None:
+    both = gymnasium.make_vec("SoftFinger-Grasp-v0", 2, vectorization_mode="sync")
+    seen, _ = both.reset(seed=[3, 4])
+    actions = np.full((2, 2), 0.5, np.float32)
+    for _ in range(5):
+        seen, *_ = both.step(actions)
+    both.close()
+    alone = SoftFingerEnv("grasp")
+    alone.reset(seed=4)
+    for _ in range(5):
+        mine, *_ = alone.step(actions[1])
+    alone.close()
+    for key, part in mine.items():
+        assert (seen[key][1] == part).all()
+
+
+@pytest.mark.parametrize("wrong", [{"task": "juggle"}, {"control": "mind"}])
+def test_a_wrong_word_is_named(wrong: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong.values()))):
+        SoftFingerEnv(**wrong)
