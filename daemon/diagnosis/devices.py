@@ -44,7 +44,7 @@ def check_servos(
             found = examine(line, settings, model)
         results = [line for each in found for line in _judge(each, settings, model)]
         if not all(each.answers for each in found):
-            results += _search(settings, model, wait)
+            results += _search(settings, model, wait) or _blame_power(found)
     except ServoError as error:
         return [Result("FAIL", "servos", str(error))]
     return results
@@ -94,7 +94,18 @@ def _search(settings: Settings, model: ServoModel, wait: float) -> list[Result]:
     for each in what.strangers:
         fix = ALONE if what.missing and each.number == model.number else ""
         lines.append(Result("note", "found", str(each), fix))
-    return lines or [Result("note", "found", "no other servo answers at any rate")]
+    return lines
+
+
+def _blame_power(examined: list[Examined]) -> list[Result]:
+    """What is most likely where servos are missing and no other ones answer instead."""
+    at = reg.PRESENT_INPUT_VOLTAGE
+    volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
+    problem = "no other servo answers at any rate"
+    if not volts:
+        return [Result("note", "found", problem)]
+    fix = "likely the power or cable from one servo to the next: swap it, then look at the supply"
+    return [Result("note", "found", f"{problem}; {min(volts):.1f} V at those that do", fix)]
 
 
 def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Result:

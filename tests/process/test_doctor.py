@@ -129,7 +129,9 @@ def test_a_missing_port_and_a_missing_servo(hands, capsys):
     failed = with_status(lines, "FAIL")
     assert [line for line in failed if "tactile-right: no such file" in line]
     assert [line for line in failed if line == "servo 2 (right): no answer at 2000000 baud"]
-    assert "note   found: no other servo answers at any rate" in lines
+    (at,) = [k for k, line in enumerate(lines) if "no other servo answers at any rate; " in line]
+    assert lines[at].endswith(" V at those that do")
+    assert "likely the power or cable" in lines[at + 1]
 
 
 def test_servos_at_another_rate_are_found(hands, capsys):
