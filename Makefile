@@ -1,6 +1,7 @@
 # make run: the simulated hand with its live page.  make test: the tests, on every processor.
 # make test ARGS=tests/unit: some of them, or options of pytest; ARGS=-n0: in one process.
 # make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
+# make docs: the documentation site, in build/site.
 # Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
 
 PYTHON ?= python3
@@ -15,11 +16,12 @@ SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py packer.py schema.py)
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
+TO_DOCUMENT := $(VENV)/.ready-docs
 
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test lowest lint format clean
+.PHONY: run test docs lowest lint format clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -28,6 +30,10 @@ run: $(TO_RUN)
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(COVERAGE) $(ARGS)
+
+docs: $(TO_DOCUMENT)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "Built build/site/index.html"
 
 lowest:
 	$(PYTHON) -m venv build/lowest
@@ -59,6 +65,11 @@ $(TO_RUN): pyproject.toml constraints.txt
 $(TO_TEST): $(TO_RUN)
 	@echo "Adding what the tests need to $(VENV) once: the viewer, pyarrow, scipy and others."
 	@$(INSTALL) --editable '.[dev]'
+	@touch $@
+
+$(TO_DOCUMENT): $(TO_RUN)
+	@echo "Adding MkDocs and its theme to $(VENV) once."
+	@$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 clean:
