@@ -277,12 +277,11 @@ while True:
 """
 
 
-def test_an_ipc_address_never_replaces_a_file(tmp_path: Path) -> None:
+def test_an_ipc_address_never_replaces_a_file(tmp_path: Path, profile: Profile) -> None:
     file = tmp_path / "precious"
     file.write_text("kept", encoding="utf-8")
-    config = tmp_path / "profile.toml"
-    config.write_text(f'stream.address = "ipc://{file}"\n', encoding="utf-8")
-    done = softfinger("run", "--config", str(config), "--duration", "0.2")
+    words = ("--set", f"stream.address=ipc://{file}", "--duration", "0.2")
+    done = softfinger("run", "--config", str(profile("")), *words)
     assert done.returncode == 1
     assert "is there already and is no socket" in done.stderr
     assert file.read_text(encoding="utf-8") == "kept"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -28,6 +29,12 @@ LINEAR = Material.constant(E)
 GRID = SensorGrid(32, 32, 0.058 / 32)
 AREA = (0.058 / 32) ** 2
 RNG = np.random.default_rng(11)
+
+
+@pytest.fixture(autouse=True)
+def own_noise(monkeypatch):
+    """The same for each test, whatever ran before it in this process."""
+    monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(11))
 
 
 def force(d: float, theta: float = 0.0) -> float:
