@@ -42,4 +42,4 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "status": (_ANY, {}),
 }
 
-UNLEASED = frozenset({"disarm", "status"})  # and "stop": can only make the hand safer
+UNLEASED = frozenset({"stop", "disarm", "status"})  # can only make the hand safer
