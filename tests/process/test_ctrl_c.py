@@ -27,7 +27,7 @@ sys.exit(cli.main(sys.argv[2:]))
     [
         ("argparse", ["limits"]),
         ("pydantic", ["run"]),
-        ("softfinger.daemon.profile.settings", ["monitor"]),
+        ("softfinger.tools.terminal.feed", ["monitor"]),
     ],
 )
 def test_it_ends_the_process_as_any_other(module: str, words: list[str]) -> None:
