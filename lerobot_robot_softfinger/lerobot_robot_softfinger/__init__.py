@@ -1,0 +1,6 @@
+"""The softfinger hand as a robot of LeRobot: ``--robot.type=softfinger``."""
+
+from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
+from lerobot_robot_softfinger.softfinger import Softfinger
+
+__all__ = ["Softfinger", "SoftfingerConfig"]

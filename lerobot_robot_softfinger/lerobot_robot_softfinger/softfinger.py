@@ -1,0 +1,159 @@
+"""`Softfinger`: LeRobot's `Robot` over the wire of a running ``softfinger``."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+from typing import Any
+
+import numpy as np
+from lerobot.robots import Robot
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+
+from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
+from softfinger import Hand
+from softfinger.daemon.client import NoStream, Refused, TactileFrame
+from softfinger.tools.recordings.features import IMAGES, JOINTS, STATE, image, observation
+
+FINEST = 0.1, 2e-3  # N and rad by which an action differs from the last, or is the same
+
+_log = logging.getLogger(__name__)
+
+
+class Softfinger(Robot):
+    """Both fingers. Connecting neither stiffens nor moves the hand; the first action arms it.
+
+    A hand that is disarmed, or in fault, after that stays so: the next action raises Refused.
+    """
+
+    config_class = SoftfingerConfig
+    name = "softfinger"
+
+    def __init__(self, config: SoftfingerConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.cameras: dict[str, Any] = {}  # lerobot-record counts them; the grids need none
+        self._hand: Hand | None = None
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        shape = (self.config.rows, self.config.cols, 3)
+        return dict.fromkeys(STATE, float) | dict.fromkeys(IMAGES.values(), shape)
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        by_law = self.config.control == "law"
+        return dict.fromkeys(("grip.force", "grip.angle") if by_law else JOINTS, float)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._hand is not None
+
+    @check_if_already_connected
+    def connect(self, calibrate: bool = True) -> None:
+        """Raises NoStream or NoAnswer without a daemon, ValueError for grids of another size."""
+        config = self.config
+        hand = Hand(
+            config.stream,
+            config.commands,
+            client="lerobot",
+            timeout=config.timeout,
+            keys=config.keys,
+        )
+        try:
+            hand.status()
+            self._waiting = hand.frames()
+            self._frames: dict[str, TactileFrame] = {}
+            while len(self._frames) < len(IMAGES):
+                self._take(self._waiting.next(config.timeout))
+            hand.state()
+        except BaseException:
+            hand.close()
+            raise
+        self._hand, self._armed, self._asked = hand, False, (math.nan, math.nan)
+
+    def _take(self, frame: TactileFrame) -> None:
+        size, expected = (frame.rows, frame.cols), (self.config.rows, self.config.cols)
+        if size != expected:
+            raise ValueError(
+                "--robot.rows, --robot.cols: found {} × {}, the hand's grids have {} × {}".format(
+                    *expected, *size
+                )
+            )
+        self._frames[frame.finger] = frame
+
+    @property
+    def is_calibrated(self) -> bool:
+        """The daemon holds the calibration, of ``softfinger calibrate``."""
+        return True
+
+    @check_if_not_connected
+    def calibrate(self) -> None:
+        """Take what the grids read now as unloaded. Raises Refused when something touches a tip."""
+        self._hand.tare()
+
+    def configure(self) -> None:
+        """Nothing to do: the daemon's settings are its own."""
+
+    @check_if_not_connected
+    def get_observation(self) -> dict[str, Any]:
+        """The next state, and the newest frame of each finger."""
+        state = self._hand.state()
+        with contextlib.suppress(NoStream):
+            while True:
+                self._take(self._waiting.next(0.0))
+        images = {
+            IMAGES[name]: image(frame, self.config.full_scale)
+            for name, frame in self._frames.items()
+        }
+        return observation(state, self._frames) | images
+
+    @check_if_not_connected
+    def send_action(self, action: dict[str, Any]) -> dict[str, float]:
+        """Goals for the joints [rad], or the grip's force [N] and object angle [rad].
+
+        Returns what the hand was asked for. Raises Refused for what is out of the hand's limits.
+        """
+        numbers = {name: float(np.asarray(action[name]).item()) for name in self.action_features}
+        if not self._armed:
+            self._hand.arm()
+            self._armed = True
+        if self.config.control == "joints":
+            left, right = (numbers[name] for name in JOINTS)
+            self._hand.move(left, right)
+            return numbers
+        return self._grip(numbers["grip.force"], numbers["grip.angle"])
+
+    def _grip(self, force: float, angle: float) -> dict[str, float]:
+        """A command begins its ramp anew: only what differs is sent, a turn once the grip holds."""
+        state = self._hand.state()
+        if state.mode in ("disarmed", "fault"):
+            self._asked = math.nan, math.nan  # asked again, to be refused with the reason
+        asked_force, asked_angle = self._asked
+        if force < self.config.least_force:
+            if asked_force != 0.0:
+                self._hand.release()
+            self._asked = 0.0, math.nan
+        elif not abs(force - asked_force) <= FINEST[0]:
+            if state.mode != "releasing":
+                self._hand.grasp(force)
+                self._asked = force, asked_angle
+        elif state.mode in ("holding", "rotating") and not abs(angle - asked_angle) <= FINEST[1]:
+            try:
+                self._hand.rotate(angle)
+            except Refused as refusal:  # how far it turns depends on the grip
+                _log.warning("%s", refusal)
+            else:
+                self._asked = asked_force, angle
+        force, angle = (0.0 if math.isnan(each) else each for each in self._asked)
+        return {"grip.force": force, "grip.angle": angle}
+
+    @check_if_not_connected
+    def disconnect(self) -> None:
+        hand, self._hand = self._hand, None
+        try:
+            if self._armed and self.config.disarm_on_disconnect:
+                hand.disarm()
+        finally:
+            hand.close()

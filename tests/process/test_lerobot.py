@@ -1,0 +1,148 @@
+"""The hand as a robot of LeRobot: found, driven and recorded by the real package."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.client import Refused
+from tests.harness.daemon_process import PATIENT, Running
+
+PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
+
+
+@pytest.fixture
+def make(tmp_path: Path, addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes the robot as LeRobot's programs do, of the installed package."""
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    pytest.importorskip("lerobot")
+    from lerobot.robots import RobotConfig, make_robot_from_config
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    source, site = tmp_path / "source", tmp_path / "site"
+    shutil.copytree(PACKAGE, source)  # builds leave files
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(site))
+    pip = (sys.executable, "-m", "pip", "install", *options, str(source))
+    subprocess.run(pip, check=True, capture_output=True)
+    monkeypatch.syspath_prepend(site)
+    register_third_party_plugins()
+    stream, commands = addresses
+
+    def make(**options: Any) -> Any:
+        kind = RobotConfig.get_choice_class("softfinger")
+        config = kind(
+            id="a",
+            calibration_dir=tmp_path / "calibration",
+            stream=stream,
+            commands=commands,
+            timeout=60.0,
+            **options,
+        )
+        return make_robot_from_config(config)
+
+    return make
+
+
+def act_until(robot: Any, action: dict[str, float], done: Callable[[dict[str, Any]], Any]) -> Any:
+    """Give one action again and again, as a policy does, until an observation is as wanted."""
+    for _ in range(20_000):
+        robot.send_action(action)
+        found = robot.get_observation()
+        if done(found):
+            return found
+    raise AssertionError(f"not by {action}; the last: {found}")
+
+
+def test_lerobot_drives_and_records_the_simulated_hand(
+    make: Any, start: Callable[..., Running], profile: Callable[[str], Path], tmp_path: Path
+) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.utils.errors import DeviceNotConnectedError
+
+    start("--config", str(profile()), *PATIENT)
+    robot = make()
+    with pytest.raises(DeviceNotConnectedError):
+        robot.get_observation()
+    with pytest.raises(ValueError, match="found 10 × 44, the hand's grids have 44 × 44"):
+        make(rows=10).connect()
+    robot.connect()
+    first = robot.get_observation()
+    assert robot._hand.state().mode == "disarmed"  # connecting and looking left it as it was
+    assert set(first) == set(robot.observation_features)
+    robot.calibrate()
+
+    goal = {name: first[name] + 0.02 for name in robot.action_features}
+    moved = act_until(
+        robot, goal, lambda found: all(abs(found[name] - goal[name]) < 5e-3 for name in goal)
+    )
+    record(LeRobotDataset, robot, first, goal, moved, tmp_path / "dataset")
+    with pytest.raises(Refused, match=r"left: found 9 rad, expected"):
+        robot.send_action({"left.pos": 9.0, "right.pos": 0.0})
+    robot._hand.disarm()
+    with pytest.raises(Refused, match="arm first"):  # who disarmed it is not overruled
+        robot.send_action(goal)
+    robot.disconnect()
+    assert not robot.is_connected
+
+    robot = make(control="law")
+    robot.connect()
+    grip = {"grip.force": 5.0, "grip.angle": 0.0}
+    held = act_until(
+        robot, grip, lambda found: min(found["left.force"], found["right.force"]) > 4.5
+    )
+    assert held["left_touch"].max() > first["left_touch"].max()
+    assert robot.send_action(grip)["grip.force"] == 5.0
+    assert 0.0 <= held["left.touch_age"] < 60.0
+    act_until(
+        robot,
+        {"grip.force": 5.0, "grip.angle": 0.1},
+        lambda found: abs(found["object.angle"] - 0.1) < 0.02,
+    )
+    act_until(
+        robot, {"grip.force": 0.0, "grip.angle": 0.0}, lambda found: not found["left.contact"]
+    )
+    hand = robot._hand
+    assert hand.status()["torque"]
+    robot.disconnect()
+    again = make()
+    again.connect()
+    assert not again._hand.status()["torque"]
+    again.disconnect()
+
+
+def record(
+    kind: Any,
+    robot: Any,
+    first: dict[str, Any],
+    action: dict[str, float],
+    moved: dict[str, Any],
+    root: Path,
+) -> None:
+    """Two observations as LeRobot's own recorder writes them, and read again."""
+    from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
+
+    features = hw_to_dataset_features(robot.action_features, "action", False)
+    features |= hw_to_dataset_features(robot.observation_features, "observation", False)
+    dataset = kind.create("a/b", 10, features, root=root, robot_type=robot.name, use_videos=False)
+    for each in (first, moved):
+        frame = build_dataset_frame(features, each, "observation")
+        frame |= build_dataset_frame(features, action, "action")
+        dataset.add_frame(frame | {"task": "move"})
+    dataset.save_episode()
+    dataset.finalize()
+    item = kind("a/b", root=root)[1]
+    names = features["observation.state"]["names"]
+    np.testing.assert_allclose(
+        item["observation.state"].numpy(), [moved[name] for name in names], rtol=1e-6
+    )
+    assert tuple(item["observation.images.left_touch"].shape) == (3, 44, 44)
+    picture = item["observation.images.left_touch"].numpy()[0] * 255.0
+    np.testing.assert_allclose(picture, moved["left_touch"][:, :, 0], atol=1e-3)
