@@ -1,24 +1,21 @@
 """Gymnasium's environments of the simulated hand; `environment` has them.
 
-``gymnasium.make("SoftFinger-Grasp-v0")``, ``…-Rotate-v0`` and ``…-Push-v0``: Gymnasium calls
-`register` by itself, and the hand is loaded when the first is made.
+Importing this registers them, and the hand is loaded when the first is made:
+``gymnasium.make("softfinger.gym:SoftFinger-Grasp-v0")``, ``…-Rotate-v0`` and ``…-Push-v0``.
 """
 
 from __future__ import annotations
+
+from gymnasium.envs.registration import register
 
 TASKS = ("grasp", "rotate", "push")
 SECONDS = 4.0  # of an episode
 STEP = 0.02  # s
 
-
-def register() -> None:
-    """Tell Gymnasium of the environments."""
-    from gymnasium.envs.registration import register
-
-    for task in TASKS:
-        register(
-            f"SoftFinger-{task.capitalize()}-v0",
-            "softfinger.gym.environment:SoftFingerEnv",
-            kwargs={"task": task},
-            max_episode_steps=round(SECONDS / STEP),
-        )
+for _task in TASKS:
+    register(
+        f"SoftFinger-{_task.capitalize()}-v0",
+        "softfinger.gym.environment:SoftFingerEnv",
+        kwargs={"task": _task},
+        max_episode_steps=round(SECONDS / STEP),
+    )

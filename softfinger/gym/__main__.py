@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.gym import SECONDS, STEP, TASKS, register
+from softfinger.gym import SECONDS, STEP, TASKS
 from softfinger.gym.environment import ANGLE, FORCE, FORCES, Observation
 
 Policy = Callable[[Observation], NDArray[np.float32]]
@@ -19,7 +19,6 @@ Policy = Callable[[Observation], NDArray[np.float32]]
 
 def main(episodes: int) -> None:
     """Print a line for each task and agent; the seeds are 0 to ``episodes`` - 1."""
-    register()
     print(f"{'task':8}{'agent':8}return of {SECONDS / STEP:.0f} steps      x real time")
     for task in TASKS:
         name = f"SoftFinger-{task.capitalize()}-v0"

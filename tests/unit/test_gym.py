@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from softfinger.gym import TASKS, register
+from softfinger.gym import TASKS
 from softfinger.gym.__main__ import at_random, by_law, episode
 from softfinger.gym.environment import SoftFingerEnv
 
 pytestmark = pytest.mark.filterwarnings("error")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def registered() -> None:
-    register()
 
 
 @pytest.mark.parametrize("task", TASKS)
