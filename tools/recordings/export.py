@@ -1,4 +1,4 @@
-"""``softfinger export FILE.mcap``: a recording's topics as CSV or Parquet, frames as arrays."""
+"""``softfinger export FILE.mcap``: topics as CSV or Parquet, frames as arrays, or for LeRobot."""
 
 from __future__ import annotations
 
@@ -14,23 +14,33 @@ import numpy as np
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import write_bytes, write_text
 from softfinger.daemon.wire import schema
-from softfinger.tools.arguments import add_range, to_stderr
+from softfinger.tools.arguments import add_range, number, to_stderr
 from softfinger.tools.extras import require
+from softfinger.tools.recordings.lerobot_dataset import samples, touch_rate, write_dataset
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
 Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
 sensor's frames also go into tactile-left.npz or -right.npz: frames [n, rows, cols] and t [n],
-which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes in the table too."""
+which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes in the table too.
+--lerobot writes a LeRobot dataset (v3.0) instead, into FILE.lerobot: one episode, the joints' goals
+as actions, the grids as images. Its rows come at the sensors' own rate, or at that of --fps."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="output folder (default: FILE.export)"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="output folder (default: FILE.export, FILE.lerobot)",
     )
-    parser.add_argument("--format", choices=("csv", "parquet"), default="csv")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--format", choices=("csv", "parquet"), default="csv")
+    kind.add_argument("--lerobot", action="store_true", help="a LeRobot dataset")
+    parser.add_argument("--fps", type=_rate, metavar="N", help="rows a second of --lerobot")
+    parser.add_argument("--task", default="", help="what was done, in words, for --lerobot")
     parser.add_argument(
         "--topics", nargs="+", metavar="TOPIC", help="as state or hand/state (default: all)"
     )
@@ -42,18 +52,38 @@ def run(arguments: argparse.Namespace) -> int:
     from softfinger.tools.terminal.progress import Progress
 
     path: Path = arguments.file
-    folder = arguments.out or path.with_name(path.name + ".export")
+    lerobot: bool = arguments.lerobot
+    suffix = ".lerobot" if lerobot else ".export"
+    folder = arguments.out or path.with_name(path.name + suffix)
     kind = CsvTable if arguments.format == "csv" else ParquetTable
     recording = Recording(path, to_stderr("export"))
     topics = _topics(arguments.topics, recording.topics)
+    if lerobot and arguments.topics:
+        raise RecordingError("--lerobot takes states and frames: leave out --topics")
+    if not lerobot and (arguments.fps or arguments.task):
+        raise RecordingError("--fps and --task are of --lerobot")
+    span = arguments.start, arguments.end
     folder.mkdir(parents=True, exist_ok=True)
     with Progress("export", recording.size) as progress:
-        files = export(recording, folder, kind, topics, arguments.start, arguments.end, progress)
+        if lerobot:
+            fps = arguments.fps or touch_rate(recording)
+            rows = samples(recording, fps, *span, progress)
+            files = write_dataset(rows, folder, fps, arguments.task)
+        else:
+            files = export(recording, folder, kind, topics, *span, progress)
     for each in files:
         print(each)
     if not files:
-        print(f"export: {path}: no messages in it", file=sys.stderr)
+        what = "no states with frames of both sensors" if lerobot else "no messages"
+        print(f"export: {path}: {what} in it", file=sys.stderr)
     return 0 if files else 1
+
+
+def _rate(text: str) -> int:
+    value = number(text, "a whole number of rows a second", 0.0, 1000.0)
+    if value != round(value):
+        raise argparse.ArgumentTypeError(f"expected a whole number, found {text!r}")
+    return round(value)
 
 
 def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
