@@ -13,6 +13,7 @@ _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
     "view": ("the viewer needs rerun-sdk from 0.32 on", ("rerun", "rerun_cli")),
+    "foxglove": ("Foxglove's server needs foxglove-sdk and orjson", ("foxglove", "orjson")),
     "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
 }
 

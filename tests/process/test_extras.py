@@ -19,6 +19,7 @@ from tests.process.test_record import written
         ("orjson", "record new.mcap", "record"),
         ("zstandard", "record new.mcap", "record"),
         ("rerun", "view", "view"),
+        ("foxglove", "view --foxglove", "foxglove"),
         ("pyarrow", "export run.mcap --format parquet", "parquet"),
     ],
 )

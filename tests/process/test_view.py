@@ -26,9 +26,9 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.tools import cli
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.viewing.bridge import TOPICS, Bridge
+from softfinger.tools.viewing.bridge import Bridge
+from softfinger.tools.viewing.live_stream import TOPICS, LiveStream
 from softfinger.tools.viewing.page import ViewError, WebPage, policy
-from softfinger.tools.viewing.session import LiveStream
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state

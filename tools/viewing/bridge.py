@@ -21,17 +21,11 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.terminal.feed import field, number, printable, text
 from softfinger.tools.viewing import views
+from softfinger.tools.viewing.colours import GOAL, LEVELS
 from softfinger.tools.viewing.drawing import Drawing
 from softfinger.tools.viewing.known import ShownHand, read_settings
+from softfinger.tools.viewing.live_stream import TOPICS
 
-TOPICS = (
-    schema.SETTINGS,
-    schema.EVENT,
-    schema.STATE,
-    schema.TRUTH,
-    schema.TACTILE,
-    schema.STATS,
-)
 _EVENTS = 500  # kept for one drawing
 _SETTINGS_WAIT = 100  # states that the layout waits for the settings
 _PLOTTED = 0.2  # s of the stream that go into the plots at once: fewer, larger pieces
@@ -267,7 +261,7 @@ class Bridge:
                 rr.TextLog(
                     f"{clock}  {kind}: {text(event, 'text')}",
                     level={"warning": "WARN", "error": "ERROR"}.get(level, "INFO"),
-                    color=views.LEVELS.get(level, views.GOAL),
+                    color=LEVELS.get(level, GOAL),
                 ),
             )
         if self._statistics is not None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from softfinger.daemon.client.records import read
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import TactileFrame
-from softfinger.tools.terminal.feed import field, number
-from softfinger.tools.viewing import views
+from softfinger.tools.terminal.feed import number
+from softfinger.tools.viewing.colours import COLOURS, GOAL, LEVELS, OBJECT, SPRING, between
 from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.landscape import Landscape
 from softfinger.tools.viewing.planar import (
@@ -30,6 +30,8 @@ from softfinger.tools.viewing.planar import (
     footprint,
     grid_of,
     tip_circle,
+    touch,
+    true_outline,
 )
 
 _TRAIL = 160  # points in a trail on the landscape
@@ -58,7 +60,7 @@ class Drawing:
         self._still(
             "hand/palm",
             rr.LineStrips2D(
-                [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[views.SPRING], radii=[1.2]
+                [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[SPRING], radii=[1.2]
             ),
         )
         if self.landscape is not None:
@@ -86,7 +88,7 @@ class Drawing:
                 labels=[*names, *(name for _, name in ticks)],
                 show_labels=True,
                 radii=rr.Radius.ui_points(0.0),
-                colors=[(235, 235, 235)] * len(spots) + [views.GOAL] * len(ticks),
+                colors=[(235, 235, 235)] * len(spots) + [GOAL] * len(ticks),
                 draw_order=2.0,
             ),
         )
@@ -100,7 +102,7 @@ class Drawing:
 
     def state(self, state: dict[str, Any]) -> None:
         """Draw the hand, and its points on the landscape."""
-        contacts = [_contact(state, name) for name in self._hand.fingers]
+        contacts = [touch(state, name) for name in self._hand.fingers]
         lines: list[FingerLines] = []
         for name, contact in zip(self._hand.fingers, contacts, strict=True):
             q = number(state, name, "q")
@@ -116,12 +118,12 @@ class Drawing:
         for name, finger in zip(self._hand.fingers, lines, strict=True):
             for strip, radius in ((finger.link, 2.6), (finger.base, 1.2), (finger.skin, 0.5)):
                 strips.append(_view(strip))
-                colours.append((*views.COLOURS[name], 255))
+                colours.append((*COLOURS[name], 255))
                 radii.append(radius)
             for spring, strain in zip(finger.springs, finger.strain, strict=True):
                 share = min(4.0 * float(strain), 1.0)
                 strips.append(_view(spring))
-                colours.append((*_between(views.SPRING, views.LEVELS["error"], share), 200))
+                colours.append((*between(SPRING, LEVELS["error"], share), 200))
                 radii.append(0.25 + 0.35 * share)
         self._recording.log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
 
@@ -138,9 +140,9 @@ class Drawing:
             origins.append(_view(at[None])[0])
             vectors.append(_view(length * direction[None])[0])
             labels.append(f"{contact.force:.1f} N")
-            colours.append(views.COLOURS[name])
+            colours.append(COLOURS[name])
         strips = [*faces, *normals]
-        shades = [views.OBJECT] * len(faces) + [views.GOAL] * len(normals)
+        shades = [OBJECT] * len(faces) + [GOAL] * len(normals)
         radii = [1.0] * len(faces) + [0.35] * len(normals)
         self._recording.log(
             "hand/contact", rr.LineStrips2D(strips, colors=shades, radii=radii, draw_order=2)
@@ -159,35 +161,15 @@ class Drawing:
         )
 
     def _held(self, state: dict[str, Any], contacts: list[Touch | None]) -> None:
-        left, right = contacts if len(contacts) == 2 else (None, None)
-        width = number(state, "object", "width")
-        outlines = []
-        if left and right and field(state, "object", "valid") is True and math.isfinite(width):
-            outline = self._object.outline(
-                (number(state, "left", "q"), number(state, "right", "q")),
-                np.array([left.d, right.d]),
-                np.array([left.theta, right.theta]),
-                width,
-                self._height,
-            )
-            if np.isfinite(outline).all():
-                outlines.append(_view(outline))
-        else:
-            self._object.lose()
-        self._recording.log(
-            "hand/object", rr.LineStrips2D(outlines, colors=[views.OBJECT], radii=[0.7])
-        )
+        outline = self._object.shown(state, contacts, self._height)
+        outlines = [] if outline is None else [_view(outline)]
+        self._recording.log("hand/object", rr.LineStrips2D(outlines, colors=[OBJECT], radii=[0.7]))
 
     def truth(self, truth: dict[str, Any]) -> None:
         """Draw the simulated object's true pose."""
-        x, y = number(truth, "true_object", "x"), number(truth, "true_object", "y")
-        angle = number(truth, "true_object", "angle")
-        simulated = self._hand.settings.simulation
-        outline = _outline(simulated.object_shape, simulated, x, y, angle)
-        strips = [] if outline is None or not np.isfinite(outline).all() else [_view(outline)]
-        self._recording.log(
-            "hand/simulated", rr.LineStrips2D(strips, colors=[views.GOAL], radii=[0.3])
-        )
+        outline = true_outline(self._hand.settings.simulation, truth)
+        strips = [] if outline is None else [_view(outline)]
+        self._recording.log("hand/simulated", rr.LineStrips2D(strips, colors=[GOAL], radii=[0.3]))
 
     def _points(self, contacts: list[Touch | None]) -> None:
         if self.landscape is None:
@@ -202,8 +184,8 @@ class Drawing:
             d, theta = np.array(trail).T
             trails.append(self.landscape.place(d, theta))
             now.append(trails[-1][-1])
-            colours.append(views.COLOURS[name])
-            shades.append((*views.COLOURS[name], 170))
+            colours.append(COLOURS[name])
+            shades.append((*COLOURS[name], 170))
         self._recording.log(
             "landscape/trails",
             rr.LineStrips2D(trails, colors=shades, radii=rr.Radius.ui_points(1.4), draw_order=3.0),
@@ -239,11 +221,11 @@ class Drawing:
                 f"pressure/{name}/rim",
                 rr.LineStrips2D(
                     [tip_circle(grid, radius)],
-                    colors=[(*views.COLOURS[name], 120)],
+                    colors=[(*COLOURS[name], 120)],
                     radii=rr.Radius.ui_points(0.7),
                 ),
             )
-        contact = _contact(state, name)
+        contact = touch(state, name)
         place = None
         if contact is not None:
             tilt_y = number(state, name, "tilt_y")
@@ -264,7 +246,7 @@ class Drawing:
         # With a white rim: the right finger's orange would be lost on a bright map.
         spots: list[Any] = [] if place is None else [place.centroid, place.centroid]
         sizes: list[Any] = [rr.Radius.ui_points(6.5), rr.Radius.ui_points(4.5)][: len(spots)]
-        shades = [(255, 255, 255), views.COLOURS[name]][: len(spots)]
+        shades = [(255, 255, 255), COLOURS[name]][: len(spots)]
         self._recording.log(
             f"pressure/{name}/centroid",
             rr.Points2D(
@@ -281,46 +263,8 @@ class Drawing:
         self._recording.log(entity, what, static=True)
 
 
-def _contact(state: dict[str, Any] | None, name: str) -> Touch | None:
-    """One tip's contact, None where there is none."""
-    if field(state, name, "contact") is not True:
-        return None
-    d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))
-    if not (math.isfinite(d) and math.isfinite(theta) and d > 0.0):
-        return None
-    return Touch(d, theta, force if math.isfinite(force) else 0.0)
-
-
-def _outline(
-    shape: str, simulated: Any, x: float, y: float, angle: float
-) -> NDArray[np.float64] | None:
-    """The simulated object's outline [n, 2] m, closed; None where there is no object."""
-    if shape == "none":
-        return None
-    if shape == "disc":
-        turn = np.linspace(0.0, 2.0 * math.pi, 49)
-        own = simulated.object_radius * np.column_stack((np.cos(turn), np.sin(turn)))
-    else:
-        half_height = 0.5 * simulated.object_height
-        lean = math.tan(0.5 * simulated.object_taper) if shape == "wedge" else 0.0
-        low = 0.5 * simulated.object_width + half_height * lean
-        high = 0.5 * simulated.object_width - half_height * lean
-        own = np.array([(-low, -1.0), (-high, 1.0), (high, 1.0), (low, -1.0), (-low, -1.0)])
-        own[:, 1] *= half_height
-    cosine, sine = math.cos(angle), math.sin(angle)
-    turned: NDArray[np.float64] = own @ np.array([(cosine, sine), (-sine, cosine)]) + (x, y)
-    return turned
-
-
 def _view(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """The hand's plane [m, y up] → Rerun's 2-D view [mm, y down]."""
     assert points is not None
     shown: NDArray[np.float64] = points * (1e3, -1e3)
     return shown
-
-
-def _between(
-    first: tuple[int, int, int], second: tuple[int, int, int], share: float
-) -> tuple[int, int, int]:
-    red, green, blue = (round(a + share * (b - a)) for a, b in zip(first, second, strict=True))
-    return red, green, blue

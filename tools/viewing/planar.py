@@ -8,15 +8,17 @@ axes are x along its base and z out of it; in them the object's face is
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.profile.settings import SimulationSettings
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.terminal.feed import number
+from softfinger.tools.terminal.feed import field, number
 
 FloatArray = NDArray[np.float64]
 
@@ -31,6 +33,16 @@ class Touch:
     d: float
     theta: float
     force: float
+
+
+def touch(state: dict[str, Any] | None, name: str) -> Touch | None:
+    """One tip's contact in a ``hand/state``, None where there is none."""
+    if field(state, name, "contact") is not True:
+        return None
+    d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))
+    if not (math.isfinite(d) and math.isfinite(theta) and d > 0.0):
+        return None
+    return Touch(d, theta, force if math.isfinite(force) else 0.0)
 
 
 @dataclass(frozen=True)
@@ -118,6 +130,25 @@ class HeldObject:
         """The object is no longer held."""
         self._along = None
 
+    def shown(
+        self, state: dict[str, Any], contacts: Sequence[Touch | None], height: float
+    ) -> FloatArray | None:
+        """Its outline [5, 2] m by a ``hand/state``; None, and lost, where both don't hold it."""
+        left, right = contacts if len(contacts) == 2 else (None, None)
+        width = number(state, "object", "width")
+        valid = field(state, "object", "valid") is True and math.isfinite(width)
+        if left is None or right is None or not valid:
+            self.lose()
+            return None
+        outline = self.outline(
+            (number(state, "left", "q"), number(state, "right", "q")),
+            np.array([left.d, right.d]),
+            np.array([left.theta, right.theta]),
+            width,
+            height,
+        )
+        return outline if np.isfinite(outline).all() else None
+
     def outline(
         self, q: tuple[float, float], d: FloatArray, theta: FloatArray, width: float, height: float
     ) -> FloatArray:
@@ -139,6 +170,27 @@ class HeldObject:
             centre + 0.5 * width * corners[:, :1] * n + 0.5 * height * corners[:, 1:] * t
         )
         return outline
+
+
+def true_outline(simulated: SimulationSettings, truth: dict[str, Any]) -> FloatArray | None:
+    """The simulated object's outline [n, 2] m, closed, by a ``hand/truth``; None without one."""
+    shape = simulated.object_shape
+    x, y, angle = (number(truth, "true_object", key) for key in ("x", "y", "angle"))
+    if shape == "none":
+        return None
+    if shape == "disc":
+        turn = np.linspace(0.0, 2.0 * math.pi, 49)
+        own = simulated.object_radius * np.column_stack((np.cos(turn), np.sin(turn)))
+    else:
+        half_height = 0.5 * simulated.object_height
+        lean = math.tan(0.5 * simulated.object_taper) if shape == "wedge" else 0.0
+        low = 0.5 * simulated.object_width + half_height * lean
+        high = 0.5 * simulated.object_width - half_height * lean
+        own = np.array([(-low, -1.0), (-high, 1.0), (high, 1.0), (low, -1.0), (-low, -1.0)])
+        own[:, 1] *= half_height
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turned: FloatArray = own @ np.array([(cosine, sine), (-sine, cosine)]) + (x, y)
+    return turned if np.isfinite(turned).all() else None
 
 
 # A picture's coordinates are cells: x along the columns, y along the rows, from the corner of the

@@ -15,32 +15,27 @@ from collections.abc import Callable
 from typing import Any
 
 import rerun as rr
-import zmq
 
-from softfinger.daemon.client.connection import drain, subscribe, unpack
 from softfinger.daemon.loop.warm_up import LANDSCAPE
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.keys import ClientKeys
-from softfinger.daemon.wire.schema import TACTILE
-from softfinger.tools.arguments import PATIENCE, client_keys, no_stream, to_stderr, waiting
+from softfinger.tools.arguments import client_keys, to_stderr
 from softfinger.tools.ending import Ending
 from softfinger.tools.processes.kernel_build import build_kernels
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.progress import Progress
-from softfinger.tools.viewing.bridge import TOPICS, Bridge
+from softfinger.tools.viewing.bridge import Bridge
 from softfinger.tools.viewing.known import warm_up
+from softfinger.tools.viewing.live_stream import TOPICS, follow
 from softfinger.tools.viewing.page import ViewError
+from softfinger.tools.viewing.view import NICE
 from softfinger.tools.viewing.viewer import Viewer, is_free, resident
 
 _PORT = 9090  # of the page, when it is free
-_SILENCE = 2.0  # s without a message after which a line says so
 _MEMORY_STEP = 1.0  # s between two looks at this process's memory
 _MEMORY_SLACK = 50.0  # MB that it may grow by itself
 _AHEAD = 200  # pictures of a recording that are sent before waiting for the viewer
 _FLUSH_TIME = 60.0  # s for that
 _LATE = 10.0  # MB of the stream, some 30 s, that a page opened late reads before it is up to date
-_REST = 1.0  # s between two pictures at most, where drawing is slow
-_NICE = 5  # everything real-time goes first
 
 
 class Session:
@@ -65,7 +60,7 @@ class Session:
         """From the first message to the end."""
         arguments, bridge = self._arguments, self._bridge
         recording = None if arguments.file is None else Recording(arguments.file, self._say)
-        os.nice(_NICE)
+        os.nice(NICE)
         try:
             if arguments.web or arguments.save is None:
                 self._open()
@@ -74,7 +69,7 @@ class Session:
             warm_up()
             self._ending.begin()
             if recording is None:
-                self._show_stream()
+                follow(arguments, self._keys, bridge, self._ending, self._say, self._is_open)
             else:
                 self._show_recording(recording)
         finally:
@@ -117,39 +112,6 @@ class Session:
             # A footer makes large files open faster; of a stream it would grow without end.
             sinks.append(rr.FileSink(save, write_footer=self._arguments.file is not None))
         self._recording.set_sinks(*sinks)
-
-    def _show_stream(self) -> None:
-        arguments, bridge = self._arguments, self._bridge
-        period = 1.0 / arguments.rate
-        silent = False
-        with LiveStream(arguments.address, self._keys) as stream:
-            due = last = time.monotonic()
-            while not self._ending.over:
-                count = stream.drain(bridge, due)
-                now = time.monotonic()
-                if count:
-                    last = now
-                    if silent:
-                        self._say("the stream has begun")
-                    silent = False
-                elif arguments.no_wait and now - last > PATIENCE:
-                    raise ViewError(no_stream(arguments.address, arguments.keys))
-                elif not silent and now - last > _SILENCE:
-                    never = math.isnan(bridge.time)
-                    self._say(
-                        waiting(arguments.address, arguments.keys)
-                        if never
-                        else f"silent: {arguments.address}"
-                    )
-                    silent = True
-                bridge.draw()
-                after = time.monotonic()
-                # Never busy for more than half of its time, however slow the machine is.
-                due = after + max(period - (after - now), min(after - now, _REST))
-                if not self._is_open():
-                    return
-            stream.drain(bridge, 0.0)
-            bridge.draw(last=True)
 
     def _show_recording(self, recording: Recording) -> None:
         arguments, bridge = self._arguments, self._bridge
@@ -202,63 +164,3 @@ class Session:
         behind = memory - self._resident
         if behind > self._arguments.memory + _MEMORY_SLACK:
             raise ViewError(f"the viewer is {behind:.0f} MB behind: see --memory")
-
-
-_QUEUE = 40_000  # messages: 40 MB, 20 s of state and truth at 1 kHz
-_FRAMES = 1_000  # frames: 4 MB, 5 s of two sensors at 100 Hz; 131 MB of the largest grid
-_AT_ONCE = 4_000  # messages read before the other socket has its turn
-
-
-class LiveStream:
-    """A context that reads ``address``, with the client's keys if any. Raises ViewError.
-
-    While a picture is drawn nothing is read, on a busy machine for seconds. Messages wait meanwhile
-    in libzmq's queues: a long one for small messages, of which every one counts, a shorter one for
-    frames, of which the newest is drawn. Only what these don't hold is lost.
-    """
-
-    def __init__(self, address: str, keys: ClientKeys | None = None) -> None:
-        self.address = address
-        self._context: zmq.Context[Any] = zmq.Context()
-        small = [topic for topic in TOPICS if topic != TACTILE]
-        try:
-            if keys is not None:
-                keys.guard(self._context)
-            self._sockets = (
-                subscribe(self._context, address, *small, queue=_QUEUE),
-                subscribe(self._context, address, TACTILE, queue=_FRAMES),
-            )
-        except zmq.ZMQError as error:
-            self.close()
-            raise ViewError(f"{address}: {error}") from None
-        self._poller = zmq.Poller()
-        for socket in self._sockets:
-            self._poller.register(socket, zmq.POLLIN)
-
-    def drain(self, bridge: Bridge, until: float) -> int:
-        """Give ``bridge`` the messages until the monotonic time ``until`` [s]; their number."""
-        count = 0
-        while True:
-            left = until - time.monotonic()
-            if not self._poller.poll(max(0, int(1e3 * left))):
-                if left <= 1e-3:
-                    return count
-                continue
-            for socket in self._sockets:
-                for message in drain(socket, _AT_ONCE):
-                    count += 1
-                    try:
-                        bridge.take(*unpack(message))
-                    except ValueError:
-                        bridge.unreadable += 1
-            if left <= 0.0:
-                return count
-
-    def close(self) -> None:
-        self._context.destroy(linger=0)
-
-    def __enter__(self) -> LiveStream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -1,8 +1,4 @@
-"""The viewer's layout, and the colours and names of what is in it.
-
-The left finger is blue, the right one orange, goals are grey: distinguishable for colour-blind
-people, on light and on dark ground.
-"""
+"""The viewer's layout, and the names of what is in it."""
 
 from __future__ import annotations
 
@@ -12,18 +8,13 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
+from softfinger.tools.viewing.colours import COLOURS, GOAL, LATE, OBJECT
 from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.landscape import HEIGHT, WIDTH
 
 TIME = "time"  # the timeline: Unix time of the daemon
 SECONDS = 12.0  # of the past in the plots
 
-COLOURS = {"left": (51, 136, 221), "right": (230, 126, 0)}
-GOAL = (140, 140, 140)
-OBJECT = (0, 158, 115)
-LATE = (204, 96, 150)
-SPRING = (150, 150, 150)
-LEVELS = {"info": (120, 120, 120), "warning": (214, 140, 0), "error": (214, 54, 40)}
 MODES = {
     "disarmed": (120, 120, 120),
     "armed": (86, 140, 190),

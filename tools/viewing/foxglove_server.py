@@ -1,0 +1,264 @@
+"""The stream for Foxglove: its WebSocket server, by the ``foxglove-sdk``, on the loopback.
+
+Channels have the names and fields of recordings (`tools.recordings.channels`), so that one layout
+shows both; ``hand/scene``, the moving hand, is made here. What nobody subscribes to isn't packed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import foxglove
+import foxglove.messages as fm
+import orjson
+from foxglove.channels import LogChannel, RawImageChannel, SceneUpdateChannel
+
+from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import Gaps
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire import schema
+from softfinger.tools.arguments import client_keys, to_stderr
+from softfinger.tools.ending import Ending
+from softfinger.tools.recordings.channels import schema_of
+from softfinger.tools.terminal.feed import number, text
+from softfinger.tools.viewing import planar
+from softfinger.tools.viewing.colours import COLOURS, GOAL, LEVELS, OBJECT, SPRING, between
+from softfinger.tools.viewing.known import ShownHand, read_settings
+from softfinger.tools.viewing.live_stream import TOPICS, follow
+from softfinger.tools.viewing.page import LOOPBACK, ViewError
+
+LAYOUT = Path(__file__).with_name("foxglove_layout.json")
+SCENE = "hand/scene"
+_NUMBERS = (schema.STATE, schema.TRUTH, schema.STATS)  # sent whole, as JSON
+_FRAME = "hand"  # x from the left pivot to the right one, y away from the palm [m]
+_EVENTS = 50  # kept for the first who looks at them, as many as the daemon repeats
+_ARROW = 1.6e-3  # m of a force's arrow a newton
+_ARROW_LONGEST = 0.045  # m
+_LEVELS = {"info": fm.LogLevel.Info, "warning": fm.LogLevel.Warning, "error": fm.LogLevel.Error}
+
+
+class FoxgloveServer:
+    """Takes messages and serves them on ``port``, 0 for a free one. Raises ViewError."""
+
+    def __init__(self, port: int) -> None:
+        context = self._context = foxglove.Context()  # its end closes the channels
+        self._numbers = {topic: _channel(topic, context) for topic in _NUMBERS}
+        self._log = LogChannel(schema.EVENT.decode(), context=context)
+        self._scene = SceneUpdateChannel(SCENE, context=context)
+        self._images = {
+            name: RawImageChannel(f"{schema.TACTILE.decode()}/{name}", context=context)
+            for name in FINGERS
+        }
+        self._gaps = {topic: Gaps() for topic in TOPICS}
+        self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+        self._frames: dict[str, dict[str, Any]] = {}
+        self._newest: dict[bytes, dict[str, Any]] = {}  # state and truth, for the scene
+        self._know(ShownHand())
+        self.time = math.nan
+        self.unreadable = 0
+        self.states = 0
+        try:
+            self._server = foxglove.start_server(
+                name="softfinger", host=LOOPBACK, port=port, context=context
+            )
+        except RuntimeError as error:
+            raise ViewError(f"port {port}: {error}") from None
+        self.address = f"ws://{LOOPBACK}:{self._server.port}"
+
+    def close(self) -> None:
+        self._server.stop()
+
+    def take(self, topic: bytes, message: Any) -> None:
+        """One message, whatever it holds."""
+        stamp = number(message, "timestamp")
+        if topic not in self._gaps or not self._gaps[topic].take(message):
+            return  # unknown, or repeated for a later subscriber
+        if not 0.0 <= stamp < 2.0**32:
+            self.unreadable += 1
+        elif topic == schema.EVENT:
+            self._events.append(message)
+        elif topic == schema.TACTILE:
+            self._frames[text(message, "finger")] = message
+        elif topic == schema.SETTINGS:
+            settings, _ = read_settings(message)
+            if settings != self._hand.settings:
+                self._know(ShownHand(settings))
+        else:
+            self._newest[topic] = message
+            if topic == schema.STATE:
+                self.time = stamp
+                self.states += 1
+            channel = self._numbers[topic]
+            if not channel.has_sinks():
+                return
+            try:
+                channel.log(orjson.dumps(message), log_time=_ns(stamp))  # null for NaN
+            except TypeError:  # orjson's error, too: JSON can't hold it
+                self.unreadable += 1
+
+    def draw(self, last: bool = False) -> None:
+        """Send the newest frames, the scene, and events if somebody looks at them."""
+        for message in self._frames.values():
+            try:
+                self._image(read(schema.TactileFrame, message))
+            except (ValueError, KeyError):
+                self.unreadable += 1
+        self._frames.clear()
+        state = self._newest.pop(schema.STATE, None)
+        if state is not None and self._scene.has_sinks():
+            self._scene.log(self._drawn(state), log_time=_ns(self.time))
+        while self._log.has_sinks() and self._events:
+            self._event(self._events.popleft())
+
+    def _know(self, hand: ShownHand) -> None:
+        self._hand = hand
+        self._object = planar.HeldObject(hand.geometry)
+
+    def _image(self, frame: schema.TactileFrame) -> None:
+        self._images[frame.finger].log(
+            fm.RawImage(
+                timestamp=_time(frame.timestamp),
+                frame_id=frame.finger,
+                width=frame.cols,
+                height=frame.rows,
+                encoding="mono16",
+                step=2 * frame.cols,
+                data=frame.data,
+            ),
+            log_time=_ns(frame.timestamp),
+        )
+
+    def _event(self, event: dict[str, Any]) -> None:
+        stamp = number(event, "timestamp")
+        line = fm.Log(
+            timestamp=_time(stamp),
+            level=_LEVELS.get(text(event, "level"), fm.LogLevel.Unknown),
+            message=text(event, "text"),
+            name=text(event, "kind"),
+        )
+        now = stamp if math.isnan(self.time) else max(stamp, self.time)
+        self._log.log(line, log_time=_ns(now))
+
+    def _drawn(self, state: dict[str, Any]) -> fm.SceneUpdate:
+        """The hand by a state and the newest truth: each entity whole, empty where it isn't."""
+        hand = self._hand
+        half = hand.geometry.half_separation + 0.012
+        entities = [_entity("palm", [_line(((-half, 0.0), (half, 0.0)), SPRING, 2.4)])]
+        contacts = [planar.touch(state, name) for name in hand.fingers]
+        for name, contact in zip(hand.fingers, contacts, strict=True):
+            q = number(state, name, "q")
+            lines = planar.finger_lines(
+                hand.geometry, FINGERS.index(name), q if math.isfinite(q) else 0.0, contact
+            )
+            entities.append(_finger(name, lines, contact))
+        held = self._object.shown(state, contacts, hand.settings.simulation.object_height)
+        entities.append(_entity("object", [] if held is None else [_line(held, OBJECT, 1.4)]))
+        truth = self._newest.get(schema.TRUTH)
+        true = None if truth is None else planar.true_outline(hand.settings.simulation, truth)
+        entities.append(_entity("simulated", [] if true is None else [_line(true, GOAL, 0.6)]))
+        return fm.SceneUpdate(entities=entities)
+
+
+def _finger(name: str, finger: planar.FingerLines, contact: planar.Touch | None) -> fm.SceneEntity:
+    """One finger with its tip, and where it touches the face and the force's arrow."""
+    colour = COLOURS[name]
+    strips = ((finger.link, 5.2), (finger.base, 2.4), (finger.skin, 1.0))
+    lines = [_line(strip, colour, width) for strip, width in strips]
+    shades = [
+        _colour(between(SPRING, LEVELS["error"], min(4.0 * float(strain), 1.0)))
+        for strain in finger.strain
+    ]
+    springs = fm.LinePrimitive(
+        type=fm.LinePrimitiveLineType.LineList,
+        thickness=0.6e-3,
+        points=_points(finger.springs.reshape(-1, 2)),
+        colors=[shade for shade in shades for _ in range(2)],
+    )
+    lines.append(springs)
+    if contact is None or finger.face is None or finger.normal is None or finger.push is None:
+        return _entity(name, lines)
+    lines += [_line(finger.face, OBJECT, 2.0), _line(finger.normal, GOAL, 0.7)]
+    at, direction = finger.push
+    length = min(_ARROW * contact.force, _ARROW_LONGEST)
+    half = 0.5 * math.atan2(direction[1], direction[0])
+    arrow = fm.ArrowPrimitive(
+        pose=_pose(at, fm.Quaternion(z=math.sin(half), w=math.cos(half))),
+        shaft_length=0.75 * length,
+        shaft_diameter=1.8e-3,
+        head_length=0.25 * length,
+        head_diameter=4e-3,
+        color=_colour(colour),
+    )
+    label = fm.TextPrimitive(
+        pose=_pose(at + length * direction, fm.Quaternion(w=1.0)),
+        billboard=True,
+        font_size=12.0,
+        scale_invariant=True,
+        color=_colour(colour),
+        text=f"{contact.force:.1f} N",
+    )
+    return _entity(name, lines, [arrow], [label])
+
+
+def _entity(
+    name: str,
+    lines: list[fm.LinePrimitive],
+    arrows: list[fm.ArrowPrimitive] | None = None,
+    texts: list[fm.TextPrimitive] | None = None,
+) -> fm.SceneEntity:
+    return fm.SceneEntity(id=name, frame_id=_FRAME, lines=lines, arrows=arrows, texts=texts)
+
+
+def _line(points: Any, colour: tuple[int, int, int], width: float) -> fm.LinePrimitive:
+    """A strip of points [n, 2] m, ``width`` mm thick."""
+    return fm.LinePrimitive(
+        type=fm.LinePrimitiveLineType.LineStrip,
+        thickness=1e-3 * width,
+        points=_points(points),
+        color=_colour(colour),
+    )
+
+
+def _points(points: Any) -> list[fm.Point3]:
+    return [fm.Point3(x=float(x), y=float(y)) for x, y in points]
+
+
+def _pose(place: planar.FloatArray, turn: fm.Quaternion) -> fm.Pose:
+    return fm.Pose(position=fm.Vector3(x=float(place[0]), y=float(place[1])), orientation=turn)
+
+
+def _colour(colour: tuple[int, int, int]) -> fm.Color:
+    red, green, blue = (part / 255.0 for part in colour)
+    return fm.Color(r=red, g=green, b=blue, a=1.0)
+
+
+def _channel(topic: bytes, context: foxglove.Context) -> foxglove.Channel:
+    name, described = schema_of(topic)
+    form = foxglove.Schema(name=name, encoding="jsonschema", data=orjson.dumps(described))
+    return foxglove.Channel(topic.decode(), message_encoding="json", schema=form, context=context)
+
+
+def _ns(stamp: float) -> int:
+    return int(stamp * 1e9)
+
+
+def _time(stamp: float) -> fm.Timestamp:
+    return fm.Timestamp(sec=int(stamp), nsec=_ns(stamp % 1.0))
+
+
+def serve(arguments: argparse.Namespace, ending: Ending) -> None:
+    """Serve the stream until the end. Raises SoftfingerError."""
+    keys = client_keys(arguments.keys)
+    server = FoxgloveServer(arguments.foxglove)
+    try:
+        print(f"view: {server.address} for Foxglove; layout: {LAYOUT}", flush=True)
+        ending.begin()
+        follow(arguments, keys, server, ending, to_stderr("view"))
+    finally:
+        server.close()
+    if server.states == 0:
+        raise ViewError(f"{arguments.address}: nothing came that can be shown")
