@@ -51,7 +51,8 @@ def test_it_holds_one_package_with_all_its_data(wheel: Path) -> None:
             assert f"softfinger/{module.relative_to(ROOT)}" in names
     for profile in (ROOT / "config").glob("*.toml"):
         assert f"softfinger/config/{profile.name}" in names
-    assert {"softfinger/py.typed", "softfinger/daemon/wire/STREAM.md"} <= names
+    data = ("py.typed", "daemon/wire/STREAM.md", "tools/viewing/foxglove_layout.json")
+    assert {f"softfinger/{name}" for name in data} <= names
     assert not any(name.startswith("softfinger/tests") for name in names)
 
 

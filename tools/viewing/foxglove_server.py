@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing import planar
 from softfinger.tools.viewing.colours import COLOURS, GOAL, LEVELS, OBJECT, SPRING, between
 from softfinger.tools.viewing.known import ShownHand, read_settings
-from softfinger.tools.viewing.live_stream import TOPICS, follow
+from softfinger.tools.viewing.live_stream import NICE, TOPICS, follow
 from softfinger.tools.viewing.page import LOOPBACK, ViewError
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
@@ -254,6 +255,7 @@ def serve(arguments: argparse.Namespace, ending: Ending) -> None:
     """Serve the stream until the end. Raises SoftfingerError."""
     keys = client_keys(arguments.keys)
     server = FoxgloveServer(arguments.foxglove)
+    os.nice(NICE)
     try:
         print(f"view: {server.address} for Foxglove; layout: {LAYOUT}", flush=True)
         ending.begin()

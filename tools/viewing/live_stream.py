@@ -26,6 +26,7 @@ TOPICS = (
     schema.TACTILE,
     schema.STATS,
 )
+NICE = 5  # everything real-time goes first
 _SILENCE = 2.0  # s without a message after which a line says so
 _REST = 1.0  # s between two pictures at most, where drawing is slow
 _QUEUE = 40_000  # messages: 40 MB, 20 s of state and truth at 1 kHz

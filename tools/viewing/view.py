@@ -11,8 +11,6 @@ from softfinger.tools.arguments import add_range, add_stream, megabytes, number,
 from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
-NICE = 5  # everything real-time goes first
-
 _EPILOG = """\
 Opens Rerun's window, or with --web a page on this machine; with --save alone, neither.
 With --foxglove: a WebSocket server for Foxglove on this machine, by default at ws://127.0.0.1:8765;
@@ -96,7 +94,6 @@ def _serve(arguments: argparse.Namespace) -> int:
     require("foxglove")
     from softfinger.tools.viewing.foxglove_server import serve
 
-    os.nice(NICE)
     with Ending(arguments.duration) as ending:
         serve(arguments, ending)
     return 0
