@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.planar import HeldObject, touch
-from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 
@@ -64,7 +64,7 @@ def fields(message: bytes) -> dict[int, list[Any]]:
 
 
 class Client:
-    """Subscribes to every channel; ``next`` is a channel's next message, with its log time [s]."""
+    """Subscribes to channels; ``next`` is a channel's next message, with its log time [s]."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self.socket = socket
@@ -74,7 +74,10 @@ class Client:
             for channel in message.get("channels", ()):
                 self.channels[channel["topic"]] = channel
         self._topics = {channel["id"]: topic for topic, channel in self.channels.items()}
-        wanted = [{"id": each, "channelId": each} for each in self._topics]
+
+    def subscribe(self, *topics: str) -> None:
+        numbers = [self.channels[topic]["id"] for topic in topics]
+        wanted = [{"id": number, "channelId": number} for number in numbers]
         self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
     def next(self, topic: str) -> tuple[float, bytes]:
@@ -97,16 +100,19 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert used_topics(json.loads(layout.read_text())) <= set(TOPICS)
             listening = psutil.Process(process.pid).net_connections()
             assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.1"]
-            early = event(1, "start", "before anybody looked", "warning")
             fake.changes = {"goal_force": float("nan")}
-            seen = fake.published
-            until(lambda: fake.published > seen + 20)
-            fake.send(schema.EVENT, msgpack.packb(early))
             with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None) as socket:
                 client = Client(socket)
+                client.subscribe(*(topic for topic in TOPICS if topic != "hand/event"))
                 check_numbers(client)
                 check_pictures(client)
                 check_scene(client)
+                early = event(1, "start", "before anybody looked", "warning")
+                fake.send(schema.EVENT, msgpack.packb(early))
+                sent, newer = time.time(), 0
+                while newer < 2:  # the second of these was published after it, so taken after it
+                    newer += client.next("hand/state")[0] > sent
+                client.subscribe("hand/event")
                 check_events(client, early)
         finally:
             process.terminate()
