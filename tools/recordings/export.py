@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     with Progress("export", recording.size) as progress:
         if lerobot:
-            fps = arguments.fps or touch_rate(recording)
+            fps = arguments.fps or touch_rate(recording, *span)
             rows = samples(recording, fps, *span, progress)
             files = write_dataset(rows, folder, fps, arguments.task)
         else:

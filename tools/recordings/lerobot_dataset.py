@@ -6,6 +6,7 @@ names of `features`. Joints' goals are its action.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import struct
@@ -36,10 +37,12 @@ _LEVELS = np.arange(256) / 255.0
 Sample = tuple[HandState, dict[str, TactileFrame]]
 
 
-def touch_rate(recording: Recording) -> int:
-    """Frames a second of one sensor, as they were recorded; at least 1."""
-    frames = recording.count(schema.TACTILE) / len(FINGERS)
-    return max(round((frames - 1.0) / recording.duration), 1) if recording.duration > 0.0 else 1
+def touch_rate(recording: Recording, start: float = -math.inf, end: float = math.inf) -> int:
+    """Frames a second of one sensor, by its clock, from the first few hundred; at least 1."""
+    some = itertools.islice(recording.messages([schema.TACTILE], start, end), 400)
+    times = [message["mono_ns"] for _, message in some if message["finger"] == FINGERS[0]]
+    between = np.median(np.diff(times)) if len(times) > 1 else 1e9
+    return max(round(1e9 / max(between, 1e6)), 1)
 
 
 def samples(
