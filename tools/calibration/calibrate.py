@@ -1,4 +1,4 @@
-"""``softfinger calibrate``: one step of calibrating the sensor under one tip, and its file."""
+"""``softfinger calibrate``: one step of calibrating the joints or the sensor under one tip."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from pathlib import Path
 from softfinger.tools.arguments import add_profile, number, profile
 from softfinger.tools.extras import MissingExtra, require
 
-STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law")
+STEPS = ("joints", "tare", "equilibrate", "curve", "centre", "modulus", "law")
 _EPILOG = """\
-steps, in this order; each is written into FILE, which keeps the others:
+the joints, of both fingers; FILE is a profile, made of --config's if absent:
+  joints       with torque off each finger is closed, opened and put upright by hand: its servo,
+               direction, zero and range
+
+steps of a tip, in this order; each is written into FILE, which keeps the others:
   tare         unloaded: the zero of each cell; its noise, how that correlates, and drift
   equilibrate  several uniform pressures: the gain of each cell, and dead cells
   curve        known weights upright on the tip (--force), or a run of known displacement (--d)
@@ -25,6 +29,7 @@ load, or one .npz of the whole run with its own d [m], theta [rad], force [N] fo
 A live modulus may come from one press at a known speed (--speed): its zero of d is fitted.
 Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
+  --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
 Each step draws its result and residuals beside FILE, where matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus: they depend on it.
 """
@@ -33,7 +38,7 @@ A new equilibrate removes curve and modulus, a new curve removes modulus: they d
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("step", choices=STEPS)
-    parser.add_argument("file", type=Path, metavar="FILE", help="the calibration; made if absent")
+    parser.add_argument("file", type=Path, metavar="FILE", help="what is written; made if absent")
     parser.add_argument("--finger", choices=("left", "right"), default="left")
     add_profile(parser)
     parser.add_argument(
@@ -78,7 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--move",
         metavar="COMMAND",
         help="live: a program that brings each load on and ends when it is there, as of a stage, "
-        "instead of Enter; {force}, {d} and {theta} stand for the load's",
+        "instead of Enter; {force}, {d} and {theta} stand for the load's, {finger} and {pose} "
+        "(closed, open, zero) for a joint's",
     )
     parser.add_argument(
         "--plot", type=Path, metavar="PICTURE", help="the picture's file (default: FILE.STEP.png)"
@@ -88,7 +94,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Do one step. Raises SoftfingerError or OSError; then the file is unchanged."""
+    joints = arguments.step == "joints"
+    if joints and arguments.config is None:
+        arguments.config = arguments.file
     settings = profile(arguments)
+    if joints:
+        from softfinger.tools.calibration.joints import calibrate_joints
+
+        told = calibrate_joints(arguments, settings)
+        print(f"joints: {told}\n  written to {arguments.file}")
+        return 0
     from softfinger.daemon.perception.calibration_file import save_calibration
     from softfinger.kinematics.estimation.calibration import CalibrationError
     from softfinger.tools.calibration.calibration_frames import gather

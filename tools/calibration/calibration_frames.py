@@ -8,7 +8,7 @@ import math
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,19 +101,24 @@ def _live(
             if count > 1 or truths:
                 load = {name: values[k] / _UNITS[name] for name, values in truths.items()}
                 words = ", ".join(f"{name} {value:g}" for name, value in load.items())
-                ask = "" if arguments.move else "; then press Enter"
-                _say(f"load {k + 1} of {count}: {words or 'uniform pressure'}{ask}")
-                if arguments.move:
-                    _move(arguments.move, {"load": k + 1, **load})
-                elif not sys.stdin.readline():
-                    raise CalibrationError("ended before all loads were on")
+                told = f"load {k + 1} of {count}: {words or 'uniform pressure'}"
+                bring(arguments, told, {"load": k + 1, **load})
             # A frame scanned before this moment may still show the last load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
 
 
-def _move(command: str, load: dict[str, float]) -> None:
+def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | str]) -> None:
+    """Say what is wanted, and wait for Enter or for ``--move``. Raises CalibrationError."""
+    _say(told if arguments.move else f"{told}; then press Enter")
+    if arguments.move:
+        _move(arguments.move, load)
+    elif not sys.stdin.readline():
+        raise CalibrationError("ended before all loads were on")
+
+
+def _move(command: str, load: Mapping[str, float | str]) -> None:
     """Run the stage's program for one load, until it ends. Raises CalibrationError."""
     try:
         words = [

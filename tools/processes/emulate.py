@@ -42,6 +42,9 @@ a plate on a stage, which presses a tip instead of the object, so that `calibrat
     tip=left       or right (both)
   The log says what a tip feels where a plate has come to rest. The joints don't feel it.
 
+a person's hand, which turns joints without torque, so that `calibrate joints` can be tried:
+  --send "turn left=closed right=open"   each to its stop, or upright with zero; ends when there
+
 the object, where it slipped away: --send place puts it back, at rest and without a load.
 
 what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
@@ -221,12 +224,13 @@ def _send(folder: Path, words: str) -> int:
     try:
         reply = send_words(folder, words)
         # The way takes the emulated hand's time, which stands still while that is held up.
-        while words.startswith("press") and reply.startswith("{"):
+        kind = words.partition(" ")[0]
+        while kind in ("press", "turn") and reply.startswith("{"):
             left = json.loads(reply)["wait"]
             if left == 0.0:
                 return 0
             time.sleep(min(left, _LOOK))
-            reply = send_words(folder, "press")
+            reply = send_words(folder, kind)
     except NoEmulator as error:
         reply = f"error: {error}"
     if reply.startswith("error: "):

@@ -14,7 +14,7 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from typing import Any
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.folder import ControlPort, FolderError, LinkFolder
 from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
@@ -42,6 +43,9 @@ from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, longest that the physics lags behind
 _REQUESTS = ("report", "goals", "forget", "place")  # words to the control socket that are no fault
+_TURNS = {"closed": 6.0, "open": -6.0, "zero": 0.0}  # rad; a joint's stops come before 6
+_TURNING = 0.3  # A of the servo's motor, as strong as the hand that turns a joint is
+_TURN_TIME = 1.0  # s
 _SLIPS = 0.999  # of what friction bears
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
 # The board where a profile names none: that of config/hil.toml.
@@ -132,6 +136,7 @@ class Emulator:
         self._boards: dict[str, TactileBoard] = {}
         self._sources: dict[str, SimulatedTactile] = {}
         self._plates: dict[str, Plate] = {}
+        self._turned = 0.0  # when a person's hand has turned a joint
         self._tell = tell
         self._advance_due = 0.0
         self._pushed: float | None = None  # when a load on the object last changed
@@ -284,9 +289,12 @@ class Emulator:
         A time behind a word counts from now. With ``report`` among them the answer is
         :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
         ``forget`` begins the record anew; ``place`` puts the object back where it was at the
-        start, at rest and with no load on it. ``press …`` is for :meth:`press`.
+        start, at rest and with no load on it. ``press …`` is for :meth:`press`, ``turn …`` for
+        :meth:`turn`.
         """
         words = text.split()
+        if words[:1] == ["turn"]:
+            return self.turn(words[1:])
         if words[:1] == ["press"]:
             return self.press(text.partition("press")[2])
         try:
@@ -329,6 +337,25 @@ class Emulator:
                 self._sources[finger].stage = plate
         ends = [plate.arrives - now for plate in self._plates.values()]
         return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
+
+    def turn(self, words: Sequence[str]) -> str:
+        """Let a person's hand turn joints: ``left=closed``, to its stop; ``open``; ``zero``.
+
+        It holds them until the servos are written to. ``error: `` and why not, or JSON as of
+        :meth:`press`; without words how long the last way takes yet.
+        """
+        now = self.clock.now()
+        turns = [word.partition("=") for word in words]
+        for finger, _, pose in turns:
+            if finger not in FINGERS or pose not in _TURNS or self._servos is None:
+                return f"error: turn: expected left or right={'|'.join(_TURNS)}, and servos"
+            if self._servos.bus.servos[FINGERS.index(finger)].torque_on:
+                return f"error: turn: torque of the {finger} servo is on"
+        for finger, _, pose in turns:
+            joint = FINGERS.index(finger)
+            self.hand.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, _TURNS[pose], _TURNING)
+            self._turned = now + _TURN_TIME
+        return json.dumps({"wait": max(0.0, self._turned - now)})
 
     def _answer(self, text: str) -> str:
         """:meth:`request`, with what starts now in force before the reply goes out."""

@@ -1,0 +1,159 @@
+"""`calibrate joints`: direction, zero and range of each joint, moved by hand with torque off.
+
+Of each finger the servos' counts are read where it is closed, open and at its zero.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import tomllib
+from typing import Any
+
+from softfinger.daemon.errors import ServoError, SettingsError
+from softfinger.daemon.own_files import write_whole
+from softfinger.daemon.profile.load import find, load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
+from softfinger.daemon.servos.protocol import ServoLine, open_line
+from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.estimation.calibration import CalibrationError
+from softfinger.tools.calibration.calibration_frames import bring
+
+_POSES = {
+    "closed": "close it fully",
+    "open": "open it fully",
+    "zero": "put it upright, straight away from the palm",
+}
+_PATIENCE = 1.0  # s for a reply: nothing is in a hurry here
+_LEAST = 0.2  # rad between closed and open
+_ALONE = 0.25  # of that, which another finger may move meanwhile
+_MARGIN = 0.03  # rad between the stops and the commanded range
+_Counts = dict[int, int]  # by the servo's ID
+
+
+def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
+    """Have each finger moved, write the profile, and tell what was found.
+
+    Raises ServoError, CalibrationError or SettingsError; then nothing is written.
+    """
+    servos = settings.servos
+    if servos.backend != "dynamixel":
+        raise CalibrationError(
+            f"servos.backend: found {servos.backend!r}, expected 'dynamixel': joints are real ones"
+        )
+    new: dict[str, dict[str, list[Any]]] = {
+        "servos": {name: list(getattr(servos, name)) for name in ("ids", "direction", "zero")},
+        "hand": {name: list(getattr(settings.hand, name)) for name in ("q_min", "q_max")},
+    }
+    scene = sorted(FINGERS.index(name) for name in settings.scene.fingers)
+    ids = [servos.ids[finger] for finger in scene]
+    radian = 2.0 * math.pi / reg.COUNTS_PER_TURN / servos.gear_ratio
+    told = []
+    with open_line(servos.port, servos.baud, _PATIENCE) as line:
+        _read(line, ids)
+        for finger in scene:
+            name = FINGERS[finger]
+            at = {}
+            for pose, wanted in _POSES.items():
+                bring(arguments, f"{name} finger: {wanted}", {"finger": name, "pose": pose})
+                at[pose] = _read(line, ids)
+            servo = _turned(name, at, radian)
+            closed, opened, zero = (at[pose][servo] for pose in _POSES)
+            direction = 1 if closed > opened else -1
+            low, high = (direction * (counts - zero) * radian for counts in (opened, closed))
+            found = (servo, direction, zero, round(low + _MARGIN, 3), round(high - _MARGIN, 3))
+            keys = [(section, key) for section, values in new.items() for key in values]
+            for (section, key), value in zip(keys, found, strict=True):
+                new[section][key][finger] = value
+            old = servos.ids[finger]
+            swapped = "" if servo == old else f" (not {old}: IDs are swapped)"
+            told.append(
+                f"{name}: servo {servo}{swapped}, direction {direction:+d}, zero {zero} counts, "
+                f"{math.degrees(low):.1f}° to {math.degrees(high):.1f}°"
+            )
+    if len(set(new["servos"]["ids"])) < len(FINGERS):
+        raise CalibrationError(f"servo {new['servos']['ids'][0]} turned for both fingers")
+    _write(arguments, new)
+    lines = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
+    return "\n  ".join([*told, *lines])
+
+
+def _read(line: ServoLine, ids: list[int]) -> _Counts:
+    """Each servo's position. Raises ServoError unless all answer, limp and within one turn."""
+    counts = {}
+    for servo in ids:
+        table = Registers(line.read(servo, 0, CHECKED) or b"")
+        if not table:
+            raise ServoError(f"servo {servo}: no answer: see `softfinger doctor`")
+        if table[reg.TORQUE_ENABLE]:
+            raise ServoError(f"servo {servo}: torque is on: end `softfinger run`, or disarm")
+        counts[servo] = table.long(reg.PRESENT_POSITION)
+        # What it is after a power-up: the encoder's count, below one turn.
+        encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
+        if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
+            encoder = -encoder
+        if not 0 <= encoder < reg.COUNTS_PER_TURN:
+            raise ServoError(
+                f"servo {servo}: at {encoder} counts it is past the encoder's wrap, 0 to "
+                f"{reg.COUNTS_PER_TURN - 1}, and would be a turn off after a power-up: switch its "
+                "power off and on; if that doesn't help, mount its horn half a turn round"
+            )
+    return counts
+
+
+def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
+    """The servo that turned between closed and open. Raises CalibrationError."""
+    moved = {k: abs(at["closed"][k] - at["open"][k]) * radian for k in at["open"]}
+    servo, *others = sorted(moved, key=lambda k: -moved[k])
+    if moved[servo] < _LEAST:
+        raise CalibrationError(
+            f"{name} finger: found {math.degrees(moved[servo]):.1f}° between closed and open, "
+            f"expected {math.degrees(_LEAST):.0f}° at least"
+        )
+    for other in others:
+        if moved[other] > _ALONE * moved[servo]:
+            raise CalibrationError(
+                f"{name} finger: servos {servo} and {other} turned, expected one: move it alone"
+            )
+    return servo
+
+
+def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) -> None:
+    """Put ``new`` into the file, or into a copy of the profile; nothing else in it changes."""
+    changes = [f"{s}.{key}={value}" for s, values in new.items() for key, value in values.items()]
+    source = arguments.file if arguments.file.exists() else arguments.config
+    load(source, arguments.dir, [*arguments.set, *changes])
+    before = text = find(source).read_text(encoding="utf-8-sig")
+    for section, values in new.items():
+        text = put(text, section, values)
+    wanted = tomllib.loads(before)
+    for section, values in new.items():
+        wanted.setdefault(section, {}).update(values)
+    try:
+        same = tomllib.loads(text) == wanted
+    except tomllib.TOMLDecodeError:
+        same = False
+    if not same:
+        raise SettingsError(f"{source}: put this in yourself: {', '.join(changes)}")
+    write_whole(arguments.file, text.encode())
+
+
+def put(text: str, section: str, values: dict[str, list[Any]]) -> str:
+    """A profile's text with these arrays in its ``[section]``, where they stand or as new lines."""
+    head = re.search(rf"(?m)^\[{section}\].*\n?", text)
+    if head is None:
+        text = f"{text.rstrip()}\n\n[{section}]\n"
+        start = len(text)
+    else:
+        start = head.end()
+    after = re.compile(r"(?m)^\[").search(text, start)
+    end = after.start() if after else len(text)
+    body = text[start:end]
+    for key, value in reversed(values.items()):
+        body, found = re.subn(rf"(?m)^({key}\s*=\s*)\[[^\]]*\]", rf"\g<1>{value}", body)
+        if not found:
+            body = f"{key} = {value}\n{body}"
+    return text[:start] + body + text[end:]
