@@ -64,6 +64,7 @@ def test_a_wrong_profile_is_set_right(hand, tmp_path, capsys):
     ("turn", "told"),
     [
         ("left={pose} right={pose}", "servos 1 and 2 turned, expected one: move it alone"),
+        ("left={pose}", "servo 2 turned for both fingers"),
         ("left=ajar", "it ended with 1"),
     ],
 )

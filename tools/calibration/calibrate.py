@@ -101,8 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     if joints:
         from softfinger.tools.calibration.joints import calibrate_joints
 
-        told = calibrate_joints(arguments, settings)
-        print(f"joints: {told}\n  written to {arguments.file}")
+        print(f"joints: {calibrate_joints(arguments, settings)}\n  written to {arguments.file}")
         return 0
     from softfinger.daemon.perception.calibration_file import save_calibration
     from softfinger.kinematics.estimation.calibration import CalibrationError

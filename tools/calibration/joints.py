@@ -6,6 +6,7 @@ Of each finger the servos' counts are read where it is closed, open and at its z
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import re
 import tomllib
@@ -74,11 +75,9 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
                 f"{name}: servo {servo}{swapped}, direction {direction:+d}, zero {zero} counts, "
                 f"{math.degrees(low):.1f}° to {math.degrees(high):.1f}°"
             )
-    if len(set(new["servos"]["ids"])) < len(FINGERS):
+    if len({new["servos"]["ids"][finger] for finger in scene}) < len(scene):
         raise CalibrationError(f"servo {new['servos']['ids'][0]} turned for both fingers")
-    _write(arguments, new)
-    lines = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
-    return "\n  ".join([*told, *lines])
+    return "\n  ".join([*told, *_write(arguments, new)])
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
@@ -121,9 +120,9 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
     return servo
 
 
-def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) -> None:
+def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) -> list[str]:
     """Put ``new`` into the file, or into a copy of the profile; nothing else in it changes."""
-    changes = [f"{s}.{key}={value}" for s, values in new.items() for key, value in values.items()]
+    changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir, [*arguments.set, *changes])
     before = text = find(source).read_text(encoding="utf-8-sig")
@@ -132,23 +131,21 @@ def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) 
     wanted = tomllib.loads(before)
     for section, values in new.items():
         wanted.setdefault(section, {}).update(values)
-    try:
-        same = tomllib.loads(text) == wanted
-    except tomllib.TOMLDecodeError:
-        same = False
-    if not same:
+    found = None
+    with contextlib.suppress(tomllib.TOMLDecodeError):
+        found = tomllib.loads(text)
+    if found != wanted:
         raise SettingsError(f"{source}: put this in yourself: {', '.join(changes)}")
     write_whole(arguments.file, text.encode())
+    return changes
 
 
 def put(text: str, section: str, values: dict[str, list[Any]]) -> str:
     """A profile's text with these arrays in its ``[section]``, where they stand or as new lines."""
     head = re.search(rf"(?m)^\[{section}\].*\n?", text)
     if head is None:
-        text = f"{text.rstrip()}\n\n[{section}]\n"
-        start = len(text)
-    else:
-        start = head.end()
+        return put(f"{text.rstrip()}\n\n[{section}]\n", section, values)
+    start = head.end()
     after = re.compile(r"(?m)^\[").search(text, start)
     end = after.start() if after else len(text)
     body = text[start:end]
