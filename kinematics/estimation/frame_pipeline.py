@@ -31,7 +31,9 @@ D_MAX = 0.75  # of the radius
 HIDDEN_MAX = 0.6
 HIDDEN_MAX_FAR = 0.03
 GAIN_FAR = 2.0
-SHARED_MAX = 0.5  # of d, one standard deviation of what all frames share: beyond, it's anything
+SHARED_MAX = (
+    0.5  # standard deviation of d by the known uncertainties, over d: beyond, it's anything
+)
 
 
 @inner_kernel
@@ -228,7 +230,7 @@ def _likelihood(
 def _is_this_tip(state: EstimatorState) -> bool:
     """Whether a misfit leaves it possible that the model is the tip's, and d is known at all."""
     estimate = state.estimate
-    if math.sqrt(state.budget.covariance[0, 0]) > SHARED_MAX * estimate.d:
+    if estimate.shared > SHARED_MAX:
         return False
     near = GAIN_FAR * state.options.fixed_gain > estimate.gain
     near = near and GAIN_FAR * estimate.gain > state.options.fixed_gain
@@ -365,6 +367,7 @@ def _begin(state: EstimatorState, scale: float, step: float) -> None:
     estimate.iterations = 0
     estimate.second = False
     estimate.hidden = 0.0
+    estimate.shared = 0.0
     estimate.shear_x = 0.0
     estimate.shear_y = 0.0
     estimate.covariance[:] = 0.0

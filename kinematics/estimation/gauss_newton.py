@@ -207,6 +207,8 @@ def judge(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> flo
     expected = hidden = 0.0
     if budget.systematic:
         expected = systematic(solid, state, packed, d, budget.shared)
+        set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
+        estimate.shared = math.sqrt(budget.covariance[0, 0]) / d
     beyond = misfit - expected - variance * freedom
     if beyond > variance * math.sqrt(2.0 * max(freedom, 0.0)):
         hidden = hidden_misfit(solid, state, packed, beyond)
@@ -218,7 +220,6 @@ def judge(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> flo
                 budget.shared[i, j] += hidden * fit.inverse[i, j]
         set_covariance(solid, fit, fit.inverse, hidden, budget.covariance)
         estimate.hidden = math.sqrt(budget.covariance[0, 0]) / d
-    if budget.systematic or hidden > 0.0:
         set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
     if budget.correlated:
         freedom = fit.sums.weight - colour(solid, state, d)

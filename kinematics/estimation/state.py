@@ -108,6 +108,7 @@ class Estimate(Record):
     n_y: float
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
     hidden: float  # what a smooth misfit may hide of d, over d
+    shared: float  # standard deviation of d by the known uncertainties, over d
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
     systematic: Matrix  # the part of it that all frames share
 

@@ -135,6 +135,13 @@ def test_a_sheet_that_is_told_to_be_one_is_not_nothing() -> None:
         assert rig.loop._control._gripping or rig.state.mode == "fault"
 
 
+def test_a_small_disc_is_no_other_tip() -> None:
+    """Its misfit hides more than half of d, and yet no uncertainty is known that would."""
+    with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
+        rig.grasp(8.0)
+        assert rig.state.mode == "holding"
+
+
 def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:
     with Rig({"simulation": {"object_shape": "disc"}}) as rig:
         rig.grasp(8.0)
