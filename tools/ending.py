@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
+import select
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from typing import Any, Protocol
@@ -15,7 +16,7 @@ class Ending:
     """A context in which SIGINT and SIGTERM ask for the end, as does the end of ``duration`` s."""
 
     def __init__(self, duration: float | None = None) -> None:
-        self._asked = threading.Event()
+        self._asked = False
         self._duration = math.inf if duration is None else duration
         self._deadline = math.inf
 
@@ -26,7 +27,7 @@ class Ending:
     @property
     def asked(self) -> bool:
         """A signal has come."""
-        return self._asked.is_set()
+        return self._asked
 
     @property
     def over(self) -> bool:
@@ -36,18 +37,27 @@ class Ending:
     def wait(self, seconds: float) -> bool:
         """Wait for the end, ``seconds`` at most; True when it has come."""
         left = self._deadline - time.monotonic()
-        return self._asked.wait(max(0.0, min(seconds, left))) or self.over
+        select.select([self._wakes], [], [], max(0.0, min(seconds, left)))
+        return self.over
+
+    def _ask(self, *_: object) -> None:
+        # No lock, as an Event has: the signal may come while this very thread holds it.
+        if not self._asked:
+            self._asked = True
+            os.write(self._wake, b"!")
 
     def __enter__(self) -> Ending:
+        self._wakes, self._wake = os.pipe()
         self._before = {
-            number: signal.signal(number, lambda *_: self._asked.set())
-            for number in (signal.SIGINT, signal.SIGTERM)
+            number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)
         }
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        os.close(self._wakes)
+        os.close(self._wake)
 
 
 class Endable(Protocol):
