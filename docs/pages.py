@@ -1,13 +1,15 @@
 """The pages of the site that are made at its build: from the code, and from the project's folder.
 
-MkDocs calls `on_files` and `on_page_markdown` (``hooks`` in mkdocs.yml); `PAGES` is all there is.
+MkDocs calls `on_files` and `on_page_markdown` (``hooks`` in mkdocs.yml). `PAGES` is all there is.
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
 import inspect
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -127,6 +129,108 @@ def stream() -> str:
     return page()
 
 
+# --- commands and subcommands ---------------------------------------------------------------------
+
+
+def commands() -> str:
+    """The hand's commands from the table of modes, the command line's words from its parser."""
+    from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
+    from softfinger.tools.terminal.send import _EPILOG
+
+    parts = [
+        "# Commands to the hand\n\nMsgpack maps on a REQ socket, `softfinger send`, or methods of "
+        f"[`Hand`](api.md): the same words.\n\n```text\n{_EPILOG}\n```\n\n",
+        _head("command", "numbers", "accepted in the modes", "needs the lease"),
+    ]
+    for name, (modes, numbers) in COMMANDS.items():
+        given = ", ".join(f"`{key}`" + " (may be left out)" * (not numbers[key]) for key in numbers)
+        where = "any" if modes == set(Mode) else ", ".join(m for m in Mode if m in modes)
+        leased = "no" if name in UNLEASED | {"stop"} else "yes"
+        parts.append(_row(f"`{name}`", given, where, leased))
+    return "".join(parts)
+
+
+def command_line() -> str:
+    """The help of every subcommand."""
+    from softfinger.tools.cli import SUBCOMMANDS, make_parser
+
+    os.environ["COLUMNS"] = "100"  # the width that argparse wraps to
+    parser, _ = make_parser(SUBCOMMANDS)
+    parts = [f"# The command line\n\n```text\n{parser.format_help()}```\n"]
+    for name, subparser in _children(parser).items():
+        parts.append(f"\n## {name}\n\n```text\n{subparser.format_help()}```\n")
+        for action, inner in _children(subparser).items():
+            parts.append(f"\n### {name} {action}\n\n```text\n{inner.format_help()}```\n")
+    return "".join(parts)
+
+
+def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of a parser's subcommands."""
+    found: dict[str, argparse.ArgumentParser] = {}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found |= action.choices
+    return found
+
+
+# --- limits ---------------------------------------------------------------------------------------
+
+
+_LIMITS = """\
+# Limits
+
+What is judged of a running hand, with the built-in one's numbers; `softfinger limits --config FILE`
+has a profile's. `warn` is reported, `limit` changes the goal, `fault` turns torque off until
+`clear`. *Noticed* counts from the first reading or frame that is past the bound; an age among the
+settings comes before it.
+
+"""
+
+
+def limits() -> str:
+    """Every limit: what is judged, how soon, by which settings, and what follows."""
+    from softfinger.daemon.profile.settings import Settings
+    from softfinger.daemon.safety.limits import LIMITS
+    from softfinger.tools.setup.limits import _values
+
+    settings = Settings()
+    taking_turns = sum(bool(row.in_turn or row.check) for row in LIMITS)
+    rows = [
+        _LIMITS,
+        _head("limit", "what is judged", "follows", "noticed", "settings, with their defaults"),
+    ]
+    for row in LIMITS:
+        tick = 1e3 / settings.loop.rate
+        lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
+        after = f"{lasts:g} s + " if lasts else ""
+        if row.in_turn or row.check:
+            turns = 2 if lasts else 1  # to see it, and to see that it has lasted
+            when = f"{after}up to {turns * taking_turns * tick:g} ms"
+        elif row.holds:
+            when = f"{after}a tick ({tick:g} ms)"
+        else:
+            when = "where it is met"
+        keys = _values(settings, row.keys)
+        rows.append(_row(f"`{row.name}`", row.judged, row.level, when, keys and f"`{keys}`"))
+    return "".join(rows)
+
+
+# --- the interface for programs -------------------------------------------------------------------
+
+
+def api() -> str:
+    """The public names of the package, from their docstrings."""
+    import softfinger
+
+    parts = ["# For programs\n\nThe names below are imported from `softfinger` itself.\n"]
+    for name in softfinger.__all__:
+        if not name.startswith("_"):
+            module = softfinger._MODULES.get(name, "softfinger")
+            parts.append(f"\n::: {module}.{name}\n")
+    parts.append("\n## Checks for authors of plugins\n\n::: softfinger.testing\n")
+    return "".join(parts)
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "index.md": _from("README.md"),
     "contributing.md": _from("CONTRIBUTING.md"),
@@ -134,6 +238,10 @@ PAGES: dict[str, Callable[[], str]] = {
     "example.md": _program("tools/examples/grasp_and_turn.py"),
     "configuration.md": configuration,
     "stream.md": stream,
+    "commands.md": commands,
+    "command-line.md": command_line,
+    "limits.md": limits,
+    "api.md": api,
 }
 # Where a link to a file of the project's folder leads to on the site.
 _LINKS = {
