@@ -10,6 +10,7 @@ import math
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.cell_centres import next_above, totals
+from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.footprint import (
     Grid,
@@ -82,7 +83,9 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
 
 
 @inner_kernel
-def presses_outside(state: EstimatorState, frame: Pointer, height: Pointer, level: float) -> bool:
+def presses_outside(
+    solid: SolidFit | None, state: EstimatorState, frame: Pointer, height: Pointer, level: float
+) -> bool:
     """Whether a cell of ``level`` or more, and not it alone, lies two cells off the footprint.
 
     Three standard deviations of the blur are added to the two cells. ``level`` is in the frame's

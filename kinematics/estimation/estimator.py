@@ -24,9 +24,9 @@ from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
 from softfinger.kinematics.estimation.solid_budget import set_solid_budget
-from softfinger.kinematics.estimation.solid_projection import SolidFit, solid_fit
+from softfinger.kinematics.estimation.solid_fit import lay_out_solid
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
-from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE, cell_integrals
+from softfinger.kinematics.sensing.cell_integrals import LIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
@@ -197,7 +197,7 @@ class ContactEstimator:
         self._solid: Any = None
         self._places: IntArray | None
         if tip.physics == "solid":
-            self._arena, self._places, solid = _lay_out_solid(state, grid, tip, alive, material)
+            self._arena, self._places, solid = lay_out_solid(state, grid, tip, alive, material)
             set_solid_budget(state, solid, known, grid, tip, self._places, material.fit_error)
             self._solid = solid.array
         else:
@@ -393,28 +393,3 @@ def _lay_out(
         setattr(state.at, name, start)
         start += array.size
     return np.concatenate([array.ravel() for array in arrays.values()]), places
-
-
-def _lay_out_solid(
-    state: EstimatorState,
-    grid: SensorGrid,
-    tip: Fingertip,
-    live: NDArray[np.bool_],
-    material: Material,
-) -> tuple[FloatArray, IntArray, SolidFit]:
-    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory."""
-    geometry = grid.on(tip)
-    state.grid.assign(geometry)
-    state.model.assign(geometry)
-    centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
-    cells = np.zeros((grid.rows, CELL_PLANES, grid.cols))
-    places = np.flatnonzero(centres[HEIGHT] >= 0.0).astype(np.int64)
-    packed = np.ascontiguousarray(grid.pictures(tip)[:, places])
-    solid = solid_fit(tip, material, packed)
-    state.at.cells = centres.size
-    solid.packed = centres.size + cells.size
-    solid.readings = solid.packed + packed.size
-    solid.model = solid.readings + len(places)
-    scratch = np.zeros(2 * len(places))
-    arena = np.concatenate([centres.ravel(), cells.ravel(), packed.ravel(), scratch])
-    return arena, places, solid

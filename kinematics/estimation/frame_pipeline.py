@@ -7,17 +7,15 @@ frame alone.
 from __future__ import annotations
 
 import math
-from typing import Any, cast
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.detection import presses_outside
-from softfinger.kinematics.estimation.gauss_newton import fit, judge, linearise, solve
-from softfinger.kinematics.estimation.moments import refine, start_from_frame
+from softfinger.kinematics.estimation.gauss_newton import energy_of, fit, judge, linearise, solve
+from softfinger.kinematics.estimation.moments import start, track
 from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
-from softfinger.kinematics.estimation.solid_fit import fit_solid, start_solid
-from softfinger.kinematics.estimation.solid_projection import SolidFit, is_solid, presses
+from softfinger.kinematics.estimation.solid_projection import SolidFit, presses, solid_kernel
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_face
 
@@ -31,124 +29,7 @@ D_MAX = 0.75  # of the radius
 HIDDEN_MAX = 0.6
 HIDDEN_MAX_FAR = 0.03
 GAIN_FAR = 2.0
-SHARED_MAX = (
-    0.5  # standard deviation of d by the known uncertainties, over d: beyond, it's anything
-)
-
-
-@inner_kernel
-def _take_moments(state: EstimatorState) -> None:
-    """The moments' contact becomes the estimate."""
-    estimate = state.estimate
-    estimate.d = state.moments.d
-    estimate.n_x = state.moments.n_x
-    estimate.n_y = state.moments.n_y
-    estimate.gain = state.moments.gain
-
-
-@inner_kernel
-def _start(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
-    """The estimate from the frame's moments alone."""
-    start_from_frame(state, frame, centres)
-    _take_moments(state)
-    state.estimate.gain = min(max(state.moments.gain, 0.02), 50.0)
-
-
-@inner_kernel
-def _track_moments(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
-    """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
-    estimate = state.estimate
-    m = state.moments
-    a = state.grid.radius
-    near = 0.5 * min(state.grid.pitch_x, state.grid.pitch_y)
-    for _ in range(8):
-        m.d = estimate.d
-        m.n_x = estimate.n_x
-        m.n_y = estimate.n_y
-        refine(state, frame, centres)
-        grown = math.sqrt(m.d * (2.0 * a - m.d)) - math.sqrt(estimate.d * (2.0 * a - estimate.d))
-        moved = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
-        _take_moments(state)
-        if not m.gain > 0.0:
-            return False
-        if abs(grown) + moved < near:
-            return True
-    return False
-
-
-# What depends on the tip: of each pair a scene compiles one, by the type of ``solid``. ``energy``
-# is as for `gauss_newton.fit`.
-
-
-@inner_kernel
-def _begin_cold(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    arena: Pointer,
-    centres: Pointer,
-    places: IntArray | None,
-) -> None:
-    _start(state, frame, centres)
-
-
-@inner_kernel
-def _begin_solid(
-    solid: SolidFit,
-    state: EstimatorState,
-    frame: Pointer,
-    arena: Pointer,
-    centres: Pointer,
-    places: IntArray,
-) -> None:
-    start_solid(state, solid, frame, arena, centres, address(places))
-
-
-@inner_kernel
-def _fit(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    arena: Pointer,
-    centres: Pointer,
-    places: IntArray | None,
-    energy: float,
-    tolerance: float,
-) -> bool:
-    return fit(state, frame, arena, places, energy, tolerance)
-
-
-@inner_kernel
-def _fit_solid(
-    solid: SolidFit,
-    state: EstimatorState,
-    frame: Pointer,
-    arena: Pointer,
-    centres: Pointer,
-    places: IntArray,
-    energy: float,
-    tolerance: float,
-) -> bool:
-    return fit_solid(state, solid, frame, arena, centres, address(places), tolerance)
-
-
-@inner_kernel
-def _presses_outside(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    centres: Pointer,
-    level: float,
-) -> bool:
-    return presses_outside(state, frame, centres, level)
-
-
-@inner_kernel
-def _presses_nowhere(
-    solid: SolidFit, state: EstimatorState, frame: Pointer, centres: Pointer, level: float
-) -> bool:
-    # A solid tip's footprint can't be seen, and all of its base is pressed.
-    return False
+SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
 
 
 @inner_kernel
@@ -157,70 +38,53 @@ def _by_moments(
     state: EstimatorState,
     frame: Pointer,
     arena: Pointer,
-    centres: Pointer,
     places: IntArray | None,
 ) -> bool:
-    done = False
-    if state.estimate.warm:
-        done = _track_moments(state, frame, centres)
-    if not done:
-        _start(state, frame, centres)
+    """Moments from the last estimate, or from the frame alone if that fails."""
+    if not (state.estimate.warm and track(state, frame, further(arena, state.at.centres))):
+        start(solid, state, frame, arena, places)
     return _judge_moments(state, frame, arena, places)
 
 
-@inner_kernel
+@solid_kernel(_by_moments)
 def _without_moments(
-    solid: SolidFit,
-    state: EstimatorState,
-    frame: Pointer,
-    arena: Pointer,
-    centres: Pointer,
-    places: IntArray,
+    solid: SolidFit, state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray
 ) -> bool:
     return False
 
 
-for _springs, _rubber in (
-    (_begin_cold, _begin_solid),
-    (_fit, _fit_solid),
-    (_presses_outside, _presses_nowhere),
-    (_by_moments, _without_moments),
-):
-    cast(Any, _springs).also(_rubber, is_solid)
-
-
 @inner_kernel
 def _likelihood(
+    solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
     arena: Pointer,
-    centres: Pointer,
     places: IntArray | None,
-    solid: SolidFit | None,
 ) -> bool:
     """Maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
-    energy = signal.energy * signal.scale * signal.scale
+    energy = energy_of(state)
     for attempt in range(2):
         if attempt == 0 and not estimate.warm:
             continue
         estimate.second = False
         if attempt == 1:
-            _begin_cold(solid, state, frame, arena, centres, places)
+            start(solid, state, frame, arena, places)
         if not options.free_gain:
             estimate.gain = options.fixed_gain
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
-        if _fit(solid, state, frame, arena, centres, places, energy, tolerance):
-            misfit, scatter = _explain(state, energy)
+        if fit(solid, state, frame, arena, places, tolerance):
+            misfit, scatter = _explain(state)
             if estimate.explained < options.explained_min:
                 continue
             # Only pressure beyond the footprint that is no noise and no small part asks for a look.
             if misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
-                estimate.second = _presses_outside(solid, state, frame, centres, level)
+                height = further(arena, state.at.centres)
+                estimate.second = presses_outside(solid, state, frame, height, level)
             if not estimate.second:
                 return _is_this_tip(state)
     return False
@@ -238,11 +102,12 @@ def _is_this_tip(state: EstimatorState) -> bool:
 
 
 @inner_kernel
-def _explain(state: EstimatorState, energy: float) -> tuple[float, float]:
+def _explain(state: EstimatorState) -> tuple[float, float]:
     """Set the share of the frame's squared pressure, noise apart, that the model accounts for.
 
-    ``energy`` as for `fit`. Returns what it doesn't account for [Pa²], and noise's own scatter.
+    Returns what it doesn't account for [Pa²], and noise's own scatter.
     """
+    energy = energy_of(state)
     budget = state.budget
     estimate = state.estimate
     number = float(state.reach.number)
@@ -265,18 +130,16 @@ def _judge_moments(
     """
     fit = state.fit
     estimate = state.estimate
-    signal = state.signal
-    energy = signal.energy * signal.scale * signal.scale
     set_face(fit.face, state.grid.radius, estimate.d, estimate.n_x, estimate.n_y)
     fit.gain = estimate.gain
-    linearise(state, frame, arena, places, energy)
+    linearise(state, frame, arena, places)
     if not solve(fit, state.options.free_gain):
         return False
     variance = judge(None, state, further(arena, state.at.packed))
     if not variance > 0.0:
         return False
-    _explain(state, energy)
-    wider = variance / signal.variance
+    _explain(state)
+    wider = variance / state.signal.variance
     if state.budget.correlated:
         # Moments weigh the large scales alone, as all of a deep footprint's patterns do.
         wider *= math.sqrt(state.budget.inflation[-1, 1, 1] * state.budget.inflation[-1, 2, 2])
@@ -318,20 +181,18 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, turned: Matrix) -> None
 
 @inner_kernel
 def _estimate(
+    solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
     arena: Pointer,
-    centres: Pointer,
     places: IntArray | None,
-    solid: SolidFit | None,
 ) -> bool:
     """The estimate of a frame with a contact; whether it can be used."""
     estimate = state.estimate
-    done = False
     if state.options.moments_only:
-        done = _by_moments(solid, state, frame, arena, centres, places)
+        done = _by_moments(solid, state, frame, arena, places)
     else:
-        done = _likelihood(state, frame, arena, centres, places, solid)
+        done = _likelihood(solid, state, frame, arena, places)
     in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
     _to_tilts(state, state.fit.covariance, estimate.covariance)
     if state.budget.systematic or estimate.hidden > 0.0:
@@ -396,20 +257,20 @@ def estimate_frame(
     solid = None if solids is None else solids[0]
     estimate = state.estimate
     readings = address(frame)
-    start = address(arena)
-    centres = further(start, state.at.centres)
-    cells = further(start, state.at.cells)
+    whole = address(arena)
+    centres = further(whole, state.at.centres)
+    cells = further(whole, state.at.cells)
     _begin(state, scale, step)
     rejected = without_outliers(state, readings, cells, centres)
     signal = state.signal
     if solid is not None and signal.finite:
-        signal.contact = presses(state, solid, readings, start, address(places))
+        signal.contact = presses(state, solid, readings, whole, address(places))
     estimate.peak = signal.peak * scale
     estimate.rejected = rejected
     estimate.contact = signal.contact
     done = False
     if signal.contact:
-        done = _estimate(state, readings, start, centres, places, solid)
+        done = _estimate(solid, state, readings, whole, places)
     else:
         estimate.d = 0.0
         estimate.n_x = 0.0

@@ -151,7 +151,14 @@ def free_noise(square: float, floor: float) -> float:
 
 
 @inner_kernel
-def _clip_noise(state: EstimatorState, packed: Pointer, energy: float) -> float:
+def energy_of(state: EstimatorState) -> float:
+    """Σ p² [Pa²] of the cells in reach."""
+    energy: float = state.signal.energy * state.signal.scale * state.signal.scale
+    return energy
+
+
+@inner_kernel
+def _clip_noise(state: EstimatorState, packed: Pointer) -> float:
     """Noise [Pa] of the cells that end at the floor, by those that nothing presses.
 
     These show how much of the noise there is; where a board sends none at all there is nothing to
@@ -161,7 +168,7 @@ def _clip_noise(state: EstimatorState, packed: Pointer, energy: float) -> float:
     clip = math.sqrt(state.signal.variance)
     number = float(state.reach.number)
     if number - inside_number >= 16.0:
-        free_square = max(energy - inside, 0.0) / (number - inside_number)
+        free_square = max(energy_of(state) - inside, 0.0) / (number - inside_number)
         clip = min(clip, free_noise(free_square, state.signal.floor))
     return clip
 
@@ -269,7 +276,7 @@ def conclude(
 
 @inner_kernel
 def linearise(
-    state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None, energy: float
+    state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None
 ) -> None:
     """Pack the cells of the fit's face, press them, and sum up the normal equations."""
     packed = further(arena, state.at.packed)
@@ -282,24 +289,24 @@ def linearise(
     press(state, packed)
     if places is not None:
         spread(state, frame, arena, address(places))
-    state.fit.clip = _clip_noise(state, packed, energy) if state.signal.clipped else 0.0
+    state.fit.clip = _clip_noise(state, packed) if state.signal.clipped else 0.0
     accumulate(state, packed)
 
 
 @inner_kernel
 def fit(
+    solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
     arena: Pointer,
     places: IntArray | None,
-    energy: float,
     tolerance: float,
 ) -> bool:
     """Gauss-Newton from the contact in ``state.estimate``, the new estimate left there.
 
-    ``energy`` is Σ p² [Pa²] of the cells in reach. Stops when the promised decrement is below
-    ``tolerance`` · variance, that is the step is that part of the noise floor, squared. False when
-    the frame doesn't determine the contact or the iteration doesn't settle.
+    Stops when the promised decrement is below ``tolerance`` · variance, that is the step is that
+    part of the noise floor, squared. False when the frame doesn't determine the contact or the
+    iteration doesn't settle.
     """
     fit = state.fit
     face = fit.face
@@ -313,7 +320,7 @@ def fit(
     halvings = 0
     solved = False
     for iteration in range(state.options.iterations):
-        linearise(state, frame, arena, places, energy)
+        linearise(state, frame, arena, places)
         now = fit.sums.misfit - fit.sums.readings
         if solved and not now <= cost + variance and halvings < _MOST_HALVINGS:
             # Too far: half way back.

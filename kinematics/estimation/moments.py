@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
+from softfinger.kinematics.compiled.simd import Pointer, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.cell_centres import (
@@ -28,10 +28,12 @@ from softfinger.kinematics.estimation.cell_centres import (
     sums_inside,
 )
 from softfinger.kinematics.estimation.detection import neighbourhood
+from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import RATIO_POINTS, EstimatorState, Moments
 from softfinger.kinematics.sensing.footprint import (
     FloatArray,
     Grid,
+    IntArray,
     rows_touched,
     set_extremes,
     set_face,
@@ -148,10 +150,49 @@ def _d_from_extent(m: Moments, a: float, reach: float) -> float:
 
 
 @inner_kernel
-def start_from_frame(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
-    """First estimate from the frame alone: its strongest cells, then twice their moments."""
+def _take(state: EstimatorState) -> None:
+    """The moments' contact becomes the estimate."""
+    estimate = state.estimate
+    estimate.d = state.moments.d
+    estimate.n_x = state.moments.n_x
+    estimate.n_y = state.moments.n_y
+    estimate.gain = state.moments.gain
+
+
+@inner_kernel
+def track(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
+    """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
+    estimate = state.estimate
+    m = state.moments
+    a = state.grid.radius
+    near = 0.5 * min(state.grid.pitch_x, state.grid.pitch_y)
+    for _ in range(8):
+        m.d = estimate.d
+        m.n_x = estimate.n_x
+        m.n_y = estimate.n_y
+        refine(state, frame, centres)
+        grown = math.sqrt(m.d * (2.0 * a - m.d)) - math.sqrt(estimate.d * (2.0 * a - estimate.d))
+        moved = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
+        _take(state)
+        if not m.gain > 0.0:
+            return False
+        if abs(grown) + moved < near:
+            return True
+    return False
+
+
+@inner_kernel
+def start(
+    solid: SolidFit | None,
+    state: EstimatorState,
+    frame: Pointer,
+    arena: Pointer,
+    places: IntArray | None,
+) -> None:
+    """The estimate from the frame alone: its strongest cells, then twice their moments."""
     m = state.moments
     signal = state.signal
+    centres = further(arena, state.at.centres)
     peak = signal.peak
     if peak > _WEAK * signal.noise:
         level = max(4.0 * signal.noise, 0.15 * peak)
@@ -168,6 +209,8 @@ def start_from_frame(state: EstimatorState, frame: Pointer, centres: Pointer) ->
     _set_from_area(m, state.grid, share * m.number)
     refine(state, frame, centres)
     refine(state, frame, centres)
+    _take(state)
+    state.estimate.gain = min(max(m.gain, 0.02), 50.0)
 
 
 @inner_kernel

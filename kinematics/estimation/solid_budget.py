@@ -9,27 +9,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, cast
 
 import numpy as np
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.estimation import error_budget, gauss_newton
 from softfinger.kinematics.estimation.error_budget import (
     Uncertainty,
+    bend,
     both_ways,
+    colour,
+    patterns,
     quadratic,
     set_errors,
+    smooth_misfit,
 )
+from softfinger.kinematics.estimation.gauss_newton import set_covariance
 from softfinger.kinematics.estimation.solid_projection import (
     SolidFit,
     columns_at,
     dot,
-    is_solid,
     multiply,
     set_model,
+    solid_kernel,
 )
 from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
@@ -120,7 +123,7 @@ def _apply(matrix: Pointer, values: Pointer, rows: int, count: int, out: Pointer
             out[k] += value * row[k]
 
 
-@inner_kernel
+@solid_kernel(patterns)
 def _patterns(solid: SolidFit, state: EstimatorState, packed: Pointer) -> None:
     budget = solid.budget
     count = solid.count
@@ -148,7 +151,7 @@ def _patterns(solid: SolidFit, state: EstimatorState, packed: Pointer) -> None:
             state.budget.answers[column, source] = dot(each[column], change, count)
 
 
-@inner_kernel
+@solid_kernel(bend)
 def _bend(solid: SolidFit, state: EstimatorState, d: float, out: Matrix) -> None:
     moved = state.budget.moved
     square = min((moved[1] / d) ** 2, 1.0)
@@ -163,7 +166,7 @@ def _bend(solid: SolidFit, state: EstimatorState, d: float, out: Matrix) -> None
     out[3, 3] += along_y * along_y
 
 
-@inner_kernel
+@solid_kernel(colour)
 def _colour(solid: SolidFit, state: EstimatorState, d: float) -> float:
     fit = state.fit
     first = 0 if state.options.free_gain else 1
@@ -200,7 +203,7 @@ def _colour(solid: SolidFit, state: EstimatorState, d: float) -> float:
     return trace + solid.budget.shear - 2.0
 
 
-@inner_kernel
+@solid_kernel(smooth_misfit)
 def _smooth_misfit(solid: SolidFit, state: EstimatorState, packed: Pointer) -> tuple[float, float]:
     set_model(solid, packed, state.fit.gain)
     model = further(packed, solid.model)
@@ -215,7 +218,7 @@ def _smooth_misfit(solid: SolidFit, state: EstimatorState, packed: Pointer) -> t
     return total, number
 
 
-@inner_kernel
+@solid_kernel(set_covariance)
 def _set_covariance(
     solid: SolidFit, fit: Fit, inverse: Matrix, variance: float, out: Matrix
 ) -> None:
@@ -223,13 +226,3 @@ def _set_covariance(
     for i in range(4):
         for j in range(4):
             out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
-
-
-for _springs, _rubber in (
-    (error_budget.patterns, _patterns),
-    (error_budget.bend, _bend),
-    (error_budget.colour, _colour),
-    (error_budget.smooth_misfit, _smooth_misfit),
-    (gauss_newton.set_covariance, _set_covariance),
-):
-    cast(Any, _springs).also(_rubber, is_solid)

@@ -10,9 +10,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import IntPointer, Pointer, address, further
-from softfinger.kinematics.estimation.gauss_newton import conclude, solve
+from softfinger.kinematics.compiled.simd import Pointer, address, further
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
+from softfinger.kinematics.estimation.detection import presses_outside
+from softfinger.kinematics.estimation.gauss_newton import conclude, fit, solve
+from softfinger.kinematics.estimation.moments import start
 from softfinger.kinematics.estimation.solid_projection import (
     SolidFit,
     columns_at,
@@ -21,8 +29,13 @@ from softfinger.kinematics.estimation.solid_projection import (
     multiply,
     project,
     set_model,
+    solid_fit,
+    solid_kernel,
 )
 from softfinger.kinematics.estimation.state import EstimatorState
+from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.kinematics.sensing.solid_pressure import PICTURES, own_shear
 
 _PASSES = 24  # projections of a frame
@@ -30,6 +43,31 @@ _LIMITED = 4  # of them that may end where the data do, one after the other
 _SETTLED = 0.1  # squared step, in units of the noise floor, at which readings by the model stay
 _MOST_HALVINGS = 5
 _STARTS = 8  # depths from which a frame alone is fitted
+
+
+def lay_out_solid(
+    state: EstimatorState,
+    grid: SensorGrid,
+    tip: Fingertip,
+    live: NDArray[np.bool_],
+    material: Material,
+) -> tuple[FloatArray, IntArray, SolidFit]:
+    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory."""
+    geometry = grid.on(tip)
+    state.grid.assign(geometry)
+    state.model.assign(geometry)
+    centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
+    cells = np.zeros((grid.rows, CELL_PLANES, grid.cols))
+    places = np.flatnonzero(centres[HEIGHT] >= 0.0).astype(np.int64)
+    packed = np.ascontiguousarray(grid.pictures(tip)[:, places])
+    solid = solid_fit(tip, material, packed)
+    state.at.cells = centres.size
+    solid.packed = centres.size + cells.size
+    solid.readings = solid.packed + packed.size
+    solid.model = solid.readings + len(places)
+    scratch = np.zeros(2 * len(places))
+    arena = np.concatenate([centres.ravel(), cells.ravel(), packed.ravel(), scratch])
+    return arena, places, solid
 
 
 @inner_kernel
@@ -112,14 +150,9 @@ def _descend(state: EstimatorState, solid: SolidFit, tolerance: float) -> int:
     return 0
 
 
-@inner_kernel
-def start_solid(
-    state: EstimatorState,
-    solid: SolidFit,
-    frame: Pointer,
-    arena: Pointer,
-    height: Pointer,
-    places: IntPointer,
+@solid_kernel(start)
+def _start(
+    solid: SolidFit, state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray
 ) -> None:
     """The best of some contacts, straight and tilted, into ``state.estimate``: where a fit starts.
 
@@ -132,7 +165,7 @@ def start_solid(
     for k in range(solid.cells):
         clip[k] = math.inf
     solid.count = solid.low
-    project(state, solid, frame, arena, height, places)
+    project(state, solid, frame, arena, address(places))
     best = math.inf
     tilt = 0.5 * math.sin(solid.weights.table.tilt)
     for k in range(_STARTS):
@@ -155,17 +188,24 @@ def start_solid(
     solid.shear[:] = 0.0
 
 
-@inner_kernel
-def fit_solid(
-    state: EstimatorState,
+@solid_kernel(presses_outside)
+def _presses_outside(
+    solid: SolidFit, state: EstimatorState, frame: Pointer, height: Pointer, level: float
+) -> bool:
+    # A solid tip's footprint can't be seen, and all of its base is pressed.
+    return False
+
+
+@solid_kernel(fit)
+def _fit(
     solid: SolidFit,
+    state: EstimatorState,
     frame: Pointer,
     arena: Pointer,
-    height: Pointer,
-    places: IntPointer,
+    places: IntArray,
     tolerance: float,
 ) -> bool:
-    """As `gauss_newton.fit`; False also where the contact is beyond what the data cover."""
+    """False also where the contact is beyond what the data cover."""
     estimate = state.estimate
     fit = state.fit
     solid.d = min(estimate.d, solid.weights.table.deepest)
@@ -179,7 +219,7 @@ def fit_solid(
         x = solid.shear[0]
         y = solid.shear[1]
         set_model(solid, arena, fit.gain)
-        changed = project(state, solid, frame, arena, height, places)
+        changed = project(state, solid, frame, arena, address(places))
         # What is read off the model settles more slowly than Gauss-Newton does.
         steps = _descend(state, solid, min(tolerance, _SETTLED) if changed else tolerance)
         total += steps

@@ -10,12 +10,13 @@ along, by taking out of all other pictures what they share with these two.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numba.core import types
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
+from softfinger.kinematics.compiled.kernel import Function, fast_inner_kernel, inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.compiled.simd import IntPointer, Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
@@ -104,9 +105,19 @@ def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
     return fit
 
 
-def is_solid(kind: Any) -> bool:
-    """Whether that is Numba's type of a `SolidFit`; springs have None in its place."""
-    return not isinstance(kind, types.NoneType)
+def solid_kernel(springs: Any) -> Callable[[Function], Function]:
+    """Make an inner kernel that stands for ``springs`` where there is a solid tip.
+
+    Kernels that depend on the tip take ``solid`` first, None for a tip of springs; of each pair a
+    scene compiles one.
+    """
+
+    def make(function: Function) -> Function:
+        made = inner_kernel(function)
+        springs.also(made, lambda kind: not isinstance(kind, types.NoneType))
+        return made
+
+    return make
 
 
 @fast_inner_kernel
@@ -219,12 +230,7 @@ def _excess(model: float, floor: float, clip: float) -> float:
 
 @inner_kernel
 def project(
-    state: EstimatorState,
-    solid: SolidFit,
-    frame: Pointer,
-    arena: Pointer,
-    height: Pointer,
-    places: IntPointer,
+    state: EstimatorState, solid: SolidFit, frame: Pointer, arena: Pointer, places: IntPointer
 ) -> bool:
     """Take the frame's live cells, as they would read the model without ends, and project them.
 
@@ -233,6 +239,7 @@ def project(
     signal = state.signal
     readings = further(arena, solid.readings)
     model = further(arena, solid.model)
+    height = further(arena, state.at.centres)
     floor = max(signal.floor, 0.0)
     clip = math.sqrt(signal.variance) if signal.clipped else 0.0
     near = floor + CLIP_END * clip
