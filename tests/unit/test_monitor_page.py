@@ -11,11 +11,10 @@ import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.cells import cell_len
-from rich.segment import Segment
+from rich.console import Console
+from rich.text import Text
 
-from softfinger.tools.terminal.feed import HISTORY_STEP, Feed
-from softfinger.tools.terminal.feed_sockets import ShownReply
+from softfinger.tools.terminal.feed import HISTORY_STEP, Feed, ShownReply
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.terminal import KeyDecoder
 from tests.harness import fake_daemon
@@ -40,11 +39,10 @@ def shown(feed: Feed, now: float = 0.0, width: int = 80, height: int = 24, **mor
     return check(lines, width, height)
 
 
-def check(lines: Sequence[Sequence[Segment]], width: int, height: int) -> str:
-    texts = ["".join(segment.text for segment in line) for line in lines]
-    assert [cell_len(text) for text in texts] == [width] * height
-    assert all(text.isprintable() for text in texts)
-    return "\n".join(texts)
+def check(lines: Sequence[Text], width: int, height: int) -> str:
+    assert [line.cell_len for line in lines] == [width] * height
+    assert all(line.plain.isprintable() for line in lines)
+    return "\n".join(line.plain for line in lines)
 
 
 @pytest.mark.parametrize("size", [(80, 24), (81, 25), (100, 30), (120, 40), (200, 24), (80, 90)])
@@ -204,7 +202,8 @@ def test_temperature_of_a_servo() -> None:
 
     def style_of_the_hot_one() -> object:
         lines = MonitorPage(feed, "").lines(80, 24, 0.0, None)
-        return next(part.style for each in lines for part in each if "71.5" in part.text)
+        segments = (part for each in lines for part in each.render(Console()))
+        return next(part.style for part in segments if "71.5" in part.text)
 
     before = style_of_the_hot_one()
     give(feed, b"hand/settings", {"settings": warned})
@@ -316,7 +315,7 @@ def test_a_frame_that_lies_about_its_size_is_skipped() -> None:
         give(feed, b"hand/tactile", good | change)
     assert (feed.skipped, feed.frames) == (4, {})
     give(feed, b"hand/tactile", good)
-    assert feed.frames["left"].grid().shape == (8, 8)
+    assert feed.frames["left"].grid.shape == (8, 8)
 
 
 def test_keys() -> None:

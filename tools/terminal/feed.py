@@ -1,8 +1,7 @@
-"""What the live page shows of the stream: state, frames, last events, statistics, a history.
+"""What the live page shows of the stream, and the sockets it comes from; nothing that draws.
 
-Without the sockets (`feed_sockets`), and nothing that draws. Every message is data of unknown
-origin: a missing or wrong-typed field is NaN or an empty text, a message that can't be read is
-counted and skipped.
+Every message is data of unknown origin: a missing or wrong-typed field is NaN or empty, a message
+that can't be read is counted and skipped.
 """
 
 from __future__ import annotations
@@ -13,32 +12,30 @@ import statistics
 import time
 from bisect import insort
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgpack
 import numpy as np
+import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.connection import unpack
+from softfinger.daemon.client.command_client import LOCALLY, UNCONFIRMED
+from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
 from softfinger.daemon.client.records import read
 from softfinger.daemon.control.modes import UNLEASED
 from softfinger.daemon.types import FINGERS, GRIP_SHARE
-from softfinger.daemon.wire.schema import (
-    COMMAND,
-    EVENT,
-    SETTINGS,
-    STATE,
-    STATS,
-    TACTILE,
-    TactileFrame,
-)
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.local_stop import stop_locally
 
 HISTORY_STEP = 0.2  # s in one column of the trends
 HISTORY_LENGTH = 600
 WINDOW = 1.0  # s of statistics
 LATELY = 3.0  # s in which waiting for a busy machine is shown
 EVENTS = 200  # kept
+_DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
+_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def field(record: object, *path: str) -> Any:
@@ -69,25 +66,16 @@ def printable(value: str) -> str:
     return "".join(c if c.isprintable() else " " for c in value)
 
 
-@dataclass(frozen=True, slots=True)
-class ShownFrame:
+class ShownFrame(NamedTuple):
     """A tactile frame as the page draws it."""
 
     arrived: float  # monotonic s
-    rows: int
-    cols: int
     scale: float  # Pa per count, NaN when unknown
-    counts: NDArray[np.uint16]  # [rows, cols]
+    grid: NDArray[np.float64]  # [rows, cols] pressures, Pa; counts where the scale isn't known
     aspect: float  # a cell's height over its width
 
-    def grid(self) -> NDArray[np.float64]:
-        """Pressures [rows, cols], Pa; counts where the scale isn't known."""
-        scale = 1.0 if math.isnan(self.scale) else self.scale
-        return self.counts.astype(np.float64) * scale
 
-
-@dataclass(frozen=True, slots=True)
-class ShownEvent:
+class ShownEvent(NamedTuple):
     """One line of hand/event."""
 
     timestamp: float  # Unix s, NaN when unknown
@@ -103,8 +91,7 @@ class ShownEvent:
             return "--:--:--"
 
 
-@dataclass(frozen=True, slots=True)
-class RecentTicks:
+class RecentTicks(NamedTuple):
     """Medians and worst values over the last second; NaN when unknown."""
 
     messages: float = math.nan  # states a second
@@ -115,22 +102,6 @@ class RecentTicks:
     late_max: float = math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class LoopTimes:
-    """Times of all ticks so far, from ``hand/stats`` [s]; NaN when unknown."""
-
-    compute: tuple[float, ...]  # median, p99, largest
-    late: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Commanding:
-    """Who has the commander's lease, and until when."""
-
-    client: str  # empty: the clients that give no name
-    until: float  # monotonic s
-
-
 class Feed:
     """Takes messages, remembers what a page shows. ``now`` is monotonic seconds throughout.
 
@@ -139,15 +110,16 @@ class Feed:
     """
 
     def __init__(self) -> None:
-        self.state: dict[str, Any] | None = None
+        self.state = read(schema.HandState, None)
         self.state_at = -math.inf
+        self.mode = self.fault = ""  # of the state
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENTS)
         self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
-        self.times: LoopTimes | None = None
+        self.times: schema.LoopStatistics | None = None  # of all ticks so far
         self.warm = math.inf  # °C from which a servo's temperature is warned about
-        self.commanding: Commanding | None = None
+        self._commanding = "", -math.inf  # who has the commander's lease, until when
         self._lease = math.nan  # s
         self.asked = math.nan  # N of the last grasp command, of any client
         self.force_default = math.nan  # N of a grasp without a force
@@ -159,126 +131,98 @@ class Feed:
         self._ticks: deque[tuple[float, float, float, float]] = deque(maxlen=10_000)
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
-        self._mono = math.nan
-        self.topics: dict[bytes, Callable[[dict[str, Any], float], None]] = {
-            STATE: self._take_state,
-            TACTILE: self._take_frame,
-            EVENT: self._take_event,
-            STATS: self._take_stats,
-            COMMAND: self._take_command,
-            SETTINGS: self._take_settings,
+        self.topics: dict[bytes, Callable[[Any, float], None]] = {
+            schema.STATE: self._take_state,
+            schema.TACTILE: self._take_frame,
+            schema.EVENT: self._take_event,
+            schema.STATS: self._take_stats,
+            schema.COMMAND: self._take_command,
+            schema.SETTINGS: self._take_settings,
         }
 
     def take(self, message: list[bytes], now: float) -> None:
         """One message off the wire, whatever it holds."""
         try:
             topic, record = unpack(message)
-            take = self.topics.get(topic)
-            if take is not None:
-                take(record, now)
+            if topic in self.topics:
+                self.topics[topic](read(schema.TOPICS[topic].record, record), now)
         except (ValueError, TypeError, RecursionError):
             self.skipped += 1
 
-    def _take_state(self, record: dict[str, Any], now: float) -> None:
-        mono = 1e-9 * number(record, "mono_ns")
-        if number(record, "seq") < number(self.state, "seq"):  # another daemon: a new story
-            self._ticks.clear()
-            self._waits.clear()
-            self.history.clear()
-            self.frames.clear()
-            self._bin.clear()
+    def _take_state(self, state: schema.HandState, now: float) -> None:
+        before = self.state
+        if state.seq < before.seq:  # another daemon: a new story
+            for each in (self._ticks, self._waits, self.history, self.frames, self._bin):
+                each.clear()
             self._period = 0.0
-            self.times = self.commanding = None
+            self.times, self._commanding = None, ("", -math.inf)
             self.asked = math.nan
-        elif 0.0 < mono - self._mono < 60.0:
-            step = mono - self._mono
+        elif before.mono_ns and 0.0 < (step := 1e-9 * (state.mono_ns - before.mono_ns)) < 60.0:
             self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
-            waited = number(record, "behind_s") - number(self.state, "behind_s")
-            if waited > 0.0:
+            if (waited := state.behind_s - before.behind_s) > 0.0:
                 self._waits.append((now, waited))
-        self._mono = mono
-        self.state = record
-        self.state_at = now
-        self._ticks.append(
-            (
-                now,
-                number(record, "tick_s"),
-                number(record, "compute_s"),
-                number(record, "wake_late_s"),
-            )
-        )
+        self.state, self.state_at = state, now
+        self.mode, self.fault = printable(state.mode), printable(state.fault)
+        self._ticks.append((now, state.tick_s, state.compute_s, state.wake_late_s))
         if now >= self._bin_end:
             if self._bin:
                 left, right = zip(*self._bin, strict=True)
                 self.history.append((statistics.fmean(left), statistics.fmean(right)))
             self._bin.clear()
             self._bin_end = now + HISTORY_STEP
-        self._bin.append((number(record, "left", "force"), number(record, "right", "force")))
+        self._bin.append((state.left.force, state.right.force))
 
-    def _take_frame(self, record: dict[str, Any], now: float) -> None:
-        frame = read(TactileFrame, record)
+    def _take_frame(self, frame: schema.TactileFrame, now: float) -> None:
         if frame.finger not in FINGERS:
             raise ValueError("not a frame of one of the fingers")
+        known = 0.0 < frame.scale < math.inf
+        grid = frame.counts.astype(np.float64) * (frame.scale if known else 1.0)
         aspect = frame.pitch_y / (frame.pitch or math.nan)
         self.frames[frame.finger] = ShownFrame(
             now,
-            frame.rows,
-            frame.cols,
-            frame.scale if 0.0 < frame.scale < math.inf else math.nan,
-            frame.counts,
+            frame.scale if known else math.nan,
+            grid,
             aspect if 0.01 < aspect < 100.0 else 1.0,
         )
 
-    def _take_event(self, record: dict[str, Any], _: float) -> None:
+    def _take_event(self, event: schema.Event, _: float) -> None:
         # Told again for somebody who came later, it has its first seq and times; another daemon's
         # has other times.
-        name = number(record, "seq"), number(record, "timestamp")
-        if record.get("again") is True and name in self._heard:
+        name = event.seq, event.timestamp
+        if event.again and name in self._heard:
             return
         self._heard.append(name)
-        self._happened(
-            ShownEvent(
-                number(record, "timestamp"),
-                text(record, "level"),
-                text(record, "kind"),
-                text(record, "text"),
-            )
-        )
+        self._happened(event.timestamp, event.level, event.kind, event.text)
 
-    def _happened(self, event: ShownEvent) -> None:
+    def _happened(self, timestamp: float, *texts: str) -> None:
+        event = ShownEvent(timestamp, *map(printable, texts))
         self._news.append(event)
-        if math.isnan(event.timestamp):
+        if math.isnan(timestamp):
             self.events.append(event)
         else:
             insort(self.events, event, key=lambda each: each.timestamp)
         del self.events[:-EVENTS]
 
-    def _take_stats(self, record: dict[str, Any], _: float) -> None:
-        compute, late = (
-            tuple(number(record, part, share) for share in ("p50", "p99", "max"))
-            for part in ("compute", "wake")
-        )
-        self.times = LoopTimes(compute, late)
+    def _take_stats(self, times: schema.LoopStatistics, _: float) -> None:
+        self.times = times
 
-    def _take_command(self, record: dict[str, Any], now: float) -> None:
+    def _take_command(self, answered: schema.AnsweredCommand, now: float) -> None:
         """Who commands; a refusal is shown as an event, for those who didn't send the command."""
-        name, client = text(record, "command"), text(record, "client")
-        if record.get("again") is True:
+        client = printable(answered.client)
+        if answered.again:
             return
-        if record.get("ok") is not True:
-            why = text(record, "error")
+        if not answered.ok:
             by = f" (to {client})" if client else ""
-            when = number(record, "timestamp")
-            self._happened(ShownEvent(when, "warning", "refused", f"{why}{by}"))
+            self._happened(answered.timestamp, "warning", "refused", f"{answered.error}{by}")
             return
-        if name == "grasp":
-            force = number(json.loads(text(record, "request") or "{}"), "force")
+        if answered.command == "grasp":
+            force = number(json.loads(answered.request or "{}"), "force")
             self.asked = self.force_default if math.isnan(force) else force
-        if name not in UNLEASED and self._lease > 0.0:
-            self.commanding = Commanding(client, now + self._lease)
+        if answered.command not in UNLEASED and self._lease > 0.0:
+            self._commanding = client, now + self._lease
 
-    def _take_settings(self, record: dict[str, Any], _: float) -> None:
-        settings = json.loads(text(record, "settings") or "{}")
+    def _take_settings(self, message: schema.HandSettings, _: float) -> None:
+        settings = json.loads(message.settings or "{}")
         self._lease = number(settings, "commands", "lease")
         warm = number(settings, "safety", "temperature_warn")
         self.force_default = number(settings, "control", "force_default")
@@ -292,11 +236,10 @@ class Feed:
         self._news.clear()
         return fresh
 
-    def commander(self, now: float) -> str | None:
-        """The client that has the commander's lease, "" for one without a name; None: nobody."""
-        if self.commanding is None or now >= self.commanding.until:
-            return None
-        return self.commanding.client
+    def commander(self, now: float) -> str:
+        """The client that has the commander's lease; empty: nobody, or one without a name."""
+        client, until = self._commanding
+        return client if now < until else ""
 
     def age(self, now: float) -> float:
         """Seconds since the last state, infinite before the first."""
@@ -304,9 +247,9 @@ class Feed:
 
     def status(self, now: float) -> str:
         """``waiting`` before the first state, then ``live``, ``stale`` or ``lost`` by its age."""
-        if self.state is None:
-            return "waiting"
         age = self.age(now)
+        if age == math.inf:
+            return "waiting"
         if age > max(2.0, 10.0 * self._period):
             return "lost"
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
@@ -323,26 +266,112 @@ class Feed:
             self._ticks.popleft()
         if not self._ticks:
             return RecentTicks()
-        _, tick, compute, late = zip(*self._ticks, strict=True)
-        period = _median(tick)
-        return RecentTicks(
-            messages=len(self._ticks) / WINDOW,
-            rate=1.0 / period if period > 0.0 else math.nan,
-            compute=_median(compute),
-            compute_max=_greatest(compute),
-            late=_median(late),
-            late_max=_greatest(late),
-        )
+        _, *columns = zip(*self._ticks, strict=True)
+        (tick, _), compute, late = map(_spread, columns)
+        rate = 1.0 / tick if tick > 0.0 else math.nan
+        return RecentTicks(len(self._ticks) / WINDOW, rate, *compute, *late)
 
 
-def _finite(values: tuple[float, ...]) -> list[float]:
-    return [value for value in values if math.isfinite(value)]
+def _spread(values: Iterable[float]) -> tuple[float, float]:
+    """Median and largest of the finite ones, NaN without any."""
+    finite = [value for value in values if math.isfinite(value)] or [math.nan]
+    return statistics.median(finite), max(finite)
 
 
-def _median(values: tuple[float, ...]) -> float:
-    finite = _finite(values)
-    return statistics.median(finite) if finite else math.nan
+class FeedSubscriber:
+    """The stream's socket: everything that waits is taken into a feed."""
+
+    def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
+        self.feed = feed
+        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_LIMIT)
+
+    def drain(self, now: float) -> None:
+        for message in drain(self._socket, _DRAIN_LIMIT):
+            self.feed.take(message, now)
 
 
-def _greatest(values: tuple[float, ...]) -> float:
-    return max(_finite(values), default=math.nan)
+class ShownReply(NamedTuple):
+    """What came of a command, for the page."""
+
+    at: float
+    ok: bool
+    text: str
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A command that is not answered yet."""
+
+    label: str
+    socket: zmq.Socket[bytes]
+    sent: float
+    warned: bool = False  # that it takes long
+
+
+class Commander:
+    """Sends commands without waiting for their replies. The newest one is kept in ``reply``.
+
+    Each command has a request socket of its own: an answer that never comes holds nothing up,
+    a stop least of all. To a daemon of this user on this machine, a stop goes past all clients; its
+    answer comes at the next tick, and a daemon that stands still is given a moment for it.
+    """
+
+    OPEN_LIMIT = 8  # commands under way; further ones are dropped, except stop
+
+    def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
+        self._context = context
+        self._address = address
+        self._envelope = {"client": client} if client else {}
+        self._pending: list[_Pending] = []
+        self.reply: ShownReply | None = None
+
+    def send(self, now: float, label: str, command: str, **fields: float) -> None:
+        """Send ``command`` with ``fields``; the reply is shown under ``label``."""
+        if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
+            self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
+            return
+        if command == "stop" and (stopped := stop_locally(self._address, LOCALLY)) is not None:
+            self.reply = _judge(now, label, stopped)
+            return
+        request = self._context.socket(zmq.REQ)
+        request.setsockopt(zmq.LINGER, 0)
+        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+        request.connect(self._address)
+        request.send(msgpack.packb({"command": command, **self._envelope, **fields}), zmq.NOBLOCK)
+        self._pending.append(_Pending(label, request, now))
+
+    def refuse(self, now: float, why: str) -> None:
+        """Say why something was not done."""
+        self.reply = ShownReply(now, False, why)
+
+    def collect(self, now: float) -> None:
+        """Take the replies that came, give up on those that are overdue."""
+        for each in list(self._pending):
+            try:
+                payload = each.socket.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                overdue = now - each.sent >= PATIENCE
+                if overdue or (not each.warned and now - each.sent >= SILENCE):
+                    each.warned = True
+                    so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
+                    self.refuse(now, f"{each.label}: no answer from {self._address} {so_far}")
+                if not overdue:
+                    continue
+            else:
+                try:
+                    record = msgpack.unpackb(payload)
+                except (ValueError, RecursionError, msgpack.UnpackException):
+                    record = None
+                self.reply = _judge(now, each.label, record)
+            each.socket.close()
+            self._pending.remove(each)
+
+
+def _judge(now: float, label: str, record: Any) -> ShownReply:
+    if field(record, "ok") is True:
+        if text(record, "torque_off") == "unconfirmed":
+            return ShownReply(now, False, f"{label}: {UNCONFIRMED}")
+        return ShownReply(now, True, f"{label}: ok")
+    why = text(record, "error") or "an answer that can't be read"
+    named = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
+    return ShownReply(now, False, why if named else f"{label}: {why}")

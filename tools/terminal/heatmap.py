@@ -7,14 +7,13 @@ as tall as wide, so the pixels come out square.
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.color import Color
-from rich.segment import Segment
 from rich.style import Style
+from rich.text import Span, Text
 
 FloatArray = NDArray[np.float64]
 
@@ -41,14 +40,11 @@ _FIXED = (17, 18, 24, 30, 36, 72, 77, 113, 149, 185, 227)
 Depth = Literal["any", "fixed", "none"]
 
 
-def colour_map(levels: int = LEVELS) -> list[tuple[int, int, int]]:
+def colour_map() -> list[tuple[int, int, int]]:
     """The scale's colours from zero to full, as (red, green, blue) of 0…255."""
-    at = np.linspace(0.0, len(_ANCHORS) - 1.0, levels)
-    knots = np.arange(len(_ANCHORS))
-    channels = [np.interp(at, knots, [anchor[c] for anchor in _ANCHORS]) for c in range(3)]
-    return [
-        (int(r), int(g), int(b)) for r, g, b in zip(*(np.rint(c) for c in channels), strict=True)
-    ]
+    at = np.linspace(0.0, len(_ANCHORS) - 1.0, LEVELS)
+    channels = [np.interp(at, range(len(_ANCHORS)), each) for each in zip(*_ANCHORS, strict=True)]
+    return [(r, g, b) for r, g, b in np.rint(channels).T.astype(int).tolist()]
 
 
 _COLOURS = {
@@ -99,39 +95,37 @@ def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
     return np.rint(scaled * (LEVELS - 1)).astype(np.int64)
 
 
-def picture(
-    grid: FloatArray, full: float, lines: int, columns: int, depth: Depth
-) -> list[list[Segment]]:
+def picture(grid: FloatArray, full: float, lines: int, columns: int, depth: Depth) -> list[Text]:
     """``grid`` as ``lines`` of ``columns`` characters, row 0 lowest as y points up.
 
     ``full`` is the value that gets the brightest colour, or the densest shade.
     """
     if depth == "none":
-        levels = levels_of(resample(grid, lines, columns), full)[::-1]
-        return [_shades(row) for row in levels]
+        return [_shades(row) for row in levels_of(resample(grid, lines, columns), full)[::-1]]
     levels = levels_of(resample(grid, 2 * lines, columns), full)[::-1]
-    return [_runs(levels[2 * k] * LEVELS + levels[2 * k + 1], depth) for k in range(lines)]
+    return [_runs(levels[2 * k], levels[2 * k + 1], depth) for k in range(lines)]
 
 
-def _runs(pairs: NDArray[np.int64], depth: Depth) -> list[Segment]:
-    """One line, neighbours of the same two colours in one segment."""
-    starts = [0, *(np.flatnonzero(np.diff(pairs)) + 1).tolist(), len(pairs)]
-    segments = []
-    for start, end in pairwise(starts):
-        top, bottom = divmod(int(pairs[start]), LEVELS)
-        segments.append(Segment("▀" * (end - start), _pair_style(top, bottom, depth)))
-    return segments
+def _runs(top: NDArray[np.int64], bottom: NDArray[np.int64], depth: Depth) -> Text:
+    """One line, neighbours of the same two colours in one span."""
+    changes = np.flatnonzero(np.diff(top) | np.diff(bottom)) + 1
+    starts, styles = [0, *changes.tolist()], (top * LEVELS + bottom).tolist()
+    spans = [
+        Span(start, end, _pair_style(*divmod(styles[start], LEVELS), depth))
+        for start, end in zip(starts, [*starts[1:], len(styles)], strict=True)
+    ]
+    return Text("▀" * len(styles), spans=spans)
 
 
-def _shades(levels: NDArray[np.int64]) -> list[Segment]:
+def _shades(levels: NDArray[np.int64]) -> Text:
     index = np.ceil(levels * ((len(SHADES) - 1) / (LEVELS - 1))).astype(int)
-    return [Segment("".join(SHADES[i] for i in index))]
+    return Text("".join(SHADES[i] for i in index))
 
 
-def colour_bar(columns: int, depth: Depth) -> list[Segment]:
+def colour_bar(columns: int, depth: Depth) -> Text:
     """The scale from nothing to full, in one line."""
     levels = levels_of(np.linspace(0.0, 1.0, columns), 1.0)
-    return _shades(levels) if depth == "none" else _runs(levels * LEVELS + levels, depth)
+    return _shades(levels) if depth == "none" else _runs(levels, levels, depth)
 
 
 def round_up(value: float) -> float:

@@ -31,13 +31,13 @@ from softfinger.tools.arguments import (
     stream_address,
     to_stderr,
 )
-from softfinger.tools.terminal.feed import Feed, number, text
-from softfinger.tools.terminal.feed_sockets import Commander, FeedSubscriber
+from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber
 from softfinger.tools.terminal.monitor_keys import HandKeys
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
+from softfinger.tools.terminal.typeset import short
 
-REDRAW = 1.0 / 15.0  # s between redraws at most
+REDRAW = 0.1  # s between redraws at most
 PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
 PLAIN_LINE = 1.0  # s between plain lines
 
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         context.destroy(linger=0)
     if ending.why:
         to_stderr("monitor")(ending.why)
-    return 1 if args.no_wait and feed.state is None and ending.why else 0
+    return 1 if args.no_wait and feed.age(0.0) == math.inf and ending.why else 0
 
 
 def _lower_priority() -> None:
@@ -268,32 +268,26 @@ def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> Non
 def plain_line(feed: Feed, now: float) -> str:
     """The hand in one short line."""
     state = feed.state
-    parts = [_clock(), text(state, "mode") or "—"]
-    fault = text(state, "fault")
-    if fault:
-        parts.append(f"FAULT {fault}")
+    parts = [_clock(), feed.mode or "—"]
+    if feed.fault:
+        parts.append(f"FAULT {feed.fault}")
     for name in FINGERS:
-        force = number(state, name, "force")
-        d = 1e3 * number(state, name, "d")
-        theta = math.degrees(number(state, name, "theta"))
-        parts.append(f"{name} {_number(force, 2)} N {_number(d, 2)} mm {_number(theta, 1, '+')}°")
-    goal = number(state, "goal_force")
-    if math.isfinite(goal):
-        parts.append(f"goal {_number(goal, 1)} N")
-    angle = math.degrees(number(state, "object", "angle"))
-    parts.append(f"object {_number(angle, 1, '+')}°")
+        tip = getattr(state, name)
+        force, d, theta = short(tip.force, 2), short(1e3 * tip.d, 2), _degrees(tip.theta)
+        parts.append(f"{name} {force} N {d} mm {theta}")
+    if math.isfinite(state.goal_force):
+        parts.append(f"goal {state.goal_force:.1f} N")
+    parts.append(f"object {_degrees(state.object.angle)}")
     tick = feed.statistics(now)
-    parts.append(
-        f"tick {_number(tick.rate, 0)} Hz {_number(1e6 * tick.compute, 0)} µs "
-        f"overruns {_number(number(state, 'overruns'), 0)}"
-    )
+    rate, compute = short(tick.rate, 0), short(1e6 * tick.compute, 0)
+    parts.append(f"tick {rate} Hz {compute} µs overruns {state.overruns}")
     if feed.skipped:
         parts.append(f"unreadable {feed.skipped}")
     return "  ".join(parts)
 
 
-def _number(value: float, decimals: int, sign: str = "") -> str:
-    return f"{value:{sign}.{decimals}f}" if math.isfinite(value) else "—"
+def _degrees(angle: float) -> str:
+    return f"{math.degrees(angle):+.1f}°" if math.isfinite(angle) else "—°"
 
 
 def _clock() -> str:

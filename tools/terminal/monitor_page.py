@@ -2,36 +2,29 @@
 
 Lengths are in mm, angles in degrees, energies in mJ, pressures in kPa. The left finger's map is on
 the left, the right one's on the right, the numbers of both between them, with the object's.
+Widths are terminal columns: a wide character takes two.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import islice
 
-from rich.cells import cell_len
-from rich.segment import Segment
-from rich.style import Style
+from rich.text import Text
 
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, RecentTicks, number, text
-from softfinger.tools.terminal.feed import field as value_at
-from softfinger.tools.terminal.feed_sockets import ShownReply
-from softfinger.tools.terminal.monitor_keys import key_line
+from softfinger.tools.terminal.feed import Feed, RecentTicks, ShownReply
 from softfinger.tools.terminal.typeset import (
     DIM,
-    PLAIN,
-    Line,
     aligned,
     apart,
     bars,
     centred,
     cut,
-    exactly,
     faded,
-    length,
     micro,
     narrow,
     rule,
@@ -47,28 +40,36 @@ REPLY_TIME = 12.0  # s a reply stays
 LATE = 0.05  # s behind from which a line says so
 _RAISED = 1.01  # share of the requested force above which the grip is reported as raised
 
-BOLD = Style(bold=True)
-GOOD = Style(color="#1fa883")
-WARN = Style(color="#e69f00")
-BAD = Style(color="#ff6a3d", bold=True)
-ALARM = Style(color="#ffffff", bgcolor="#b8360b", bold=True)
-SIDE = {"left": Style(color="#56b4e9", bold=True), "right": Style(color="#e69f00", bold=True)}
-
+GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
+KEY = "bold #56b4e9"
+ALARM = "bold #ffffff on #b8360b"
+SIDE = {"left": KEY, "right": "bold #e69f00"}
 _BADGES = {
-    "disarmed": Style(color="#ffffff", bgcolor="#5a6068", bold=True),
-    "armed": Style(color="#ffffff", bgcolor="#0067a8", bold=True),
-    "holding": Style(color="#ffffff", bgcolor="#007a58", bold=True),
+    "disarmed": "bold #ffffff on #5a6068",
+    "armed": "bold #ffffff on #0067a8",
+    "holding": "bold #ffffff on #007a58",
     "fault": ALARM,
 }
-_BUSY = Style(color="#201800", bgcolor="#e6a817", bold=True)
+_BUSY = "bold #201800 on #e6a817"
 _LEVELS = {"info": DIM, "warning": WARN, "error": BAD}
+_KEYS = {
+    "a": "arm",
+    "g": "grasp",
+    "+-": "",  # the force
+    "←→": "turn 5°",
+    "r": "release",
+    "space": "stop",
+    "c": "clear",
+    "d": "disarm",
+    "q": "quit",
+}
 
 # (label, field, factor, decimals, unit, field of the standard deviation)
 _ROWS = (
     ("d", "d", 1e3, 2, "mm", "d_std"),
     ("θ", "theta", math.degrees(1.0), 1, "°", "theta_std"),
     ("force", "force", 1.0, 2, "N", "force_std"),
-    ("energy", "energy", 1e3, 2, "mJ", "energy_std"),
+    ("energy", "energy", 1e3, 2, "mJ", ""),
     ("map age", "frame_age_s", 1e3, 1, "ms", ""),
     ("joint", "q", math.degrees(1.0), 2, "°", ""),
     ("goal", "goal_q", math.degrees(1.0), 2, "°", ""),
@@ -89,19 +90,22 @@ class MonitorPage:
     keys: bool = True  # a keyboard is there
     guarded: bool = False  # subscribed with keys
     force: float = math.nan  # N of the grasp key
-    _pressure: heatmap.FullScale = field(
-        default_factory=lambda: heatmap.FullScale(least=5e3, patience=3.0)
-    )
-    _force: heatmap.FullScale = field(
-        default_factory=lambda: heatmap.FullScale(least=1.0, patience=0.0)
-    )
+    _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
+    _force: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(1.0, 0.0))
     _statistics: RecentTicks = field(default_factory=RecentTicks)
     _statistics_at: float = -math.inf
 
-    def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Line]:
+    def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
         """The page as ``height`` lines of exactly ``width`` columns."""
         if width < WIDTH or height < HEIGHT:
-            return _too_small(width, height)
+            page = _too_small(width, height)
+        else:
+            page = self._page(width, height, now, reply)
+        for line in page:
+            line.truncate(width, overflow="crop", pad=True)
+        return page
+
+    def _page(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
         if now - self._statistics_at >= 0.5:  # so that the numbers can be read
             self._statistics = self.feed.statistics(now)
             self._statistics_at = now
@@ -109,175 +113,150 @@ class MonitorPage:
         maps, trend, events = _shares(width, height)
         numbers = [
             *self._body(width, maps, now),
-            rule(width, cut(self._goal(), width - 4)),
+            rule(width, Text(self._goal())),
             *self._trends(width, trend),
             self._ticks(width),
         ]
         if status in ("stale", "lost"):
             numbers = [faded(line) for line in numbers]
-        page = [
+        return [
             self._header(width, now, status),
             self._notice(width, now, status),
             *numbers,
             *self._messages(width, events, now, reply),
             self._footer(width),
         ]
-        return [exactly(line, width) for line in page]
 
-    def _header(self, width: int, now: float, status: str) -> Line:
-        mode = text(self.feed.state, "mode")
-        fault = text(self.feed.state, "fault")
-        badge = ALARM if fault else _BADGES.get(mode, _BUSY)
-        if not mode or status == "lost":
+    def _header(self, width: int, now: float, status: str) -> Text:
+        feed = self.feed
+        badge = ALARM if feed.fault else _BADGES.get(feed.mode, _BUSY)
+        if not feed.mode or status == "lost":
             badge = _BADGES["disarmed"]
-        left = [
-            Segment(" softfinger ", BOLD),
-            Segment(f" {mode.upper() or '—'} ", badge),
-        ]
+        left = Text.assemble((" softfinger ", "bold"), (f" {feed.mode.upper() or '—'} ", badge))
         if status == "waiting":
-            right = [Segment("○ no stream yet ", WARN)]
+            right = Text("○ no stream yet ", WARN)
         elif status == "live":
             rate = short(self._statistics.messages, 0)
-            right = [Segment("● live ", GOOD), Segment(f"{rate} Hz ", DIM)]
+            right = Text.assemble(("● live ", GOOD), (f"{rate} Hz ", DIM))
         else:
-            sign = "◐ stale" if status == "stale" else "○ lost"
-            age = short(self.feed.age(now), 1)
-            right = [Segment(f"{sign} {age} s ", WARN if status == "stale" else BAD)]
-        room = width - length(left) - length(right) - 2
-        unreadable = f"{self.feed.skipped} unreadable  " if self.feed.skipped else ""
-        if len(self.address) + len(unreadable) <= room:
-            right = [Segment(f"{self.address}  ", DIM), *right]
-        right = [Segment(unreadable, WARN), *right]
-        return apart(left, right, width)
+            sign, style = ("◐ stale", WARN) if status == "stale" else ("○ lost", BAD)
+            right = Text(f"{sign} {short(feed.age(now), 1)} s ", style)
+        unreadable = f"{feed.skipped} unreadable  " if feed.skipped else ""
+        room = width - left.cell_len - right.cell_len - 2
+        address = f"{self.address}  " if len(self.address + unreadable) <= room else ""
+        return apart(left, Text.assemble((unreadable, WARN), (address, DIM), right), width)
 
-    def _notice(self, width: int, now: float, status: str) -> Line:
+    def _notice(self, width: int, now: float, status: str) -> Text:
+        feed = self.feed
         if status == "lost":
-            return [Segment(" the stream has stopped; everything below is old", BAD)]
-        fault = text(self.feed.state, "fault")
-        if fault:
-            line = [Segment(f" FAULT {cut(fault, width - len(self._way_out) - 8)}", ALARM)]
-            return apart(line, [Segment(self._way_out, ALARM)], width, ALARM)
+            return Text(" the stream has stopped; everything below is old", BAD)
+        if feed.fault:
+            fault = cut(Text(f" FAULT {feed.fault}"), width - len(self._way_out) - 1)
+            line = apart(fault, Text(self._way_out), width)
+            line.stylize(ALARM)
+            return line
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
-            what += "" if self.guarded else " (or it requires --keys)"
-            return [Segment(cut(what, width), WARN)]
-        schema = value_at(self.feed.state, "schema")
-        if self.feed.state is not None and schema != SCHEMA:
-            what = f" the stream has schema {schema!r:.12}, this page knows {SCHEMA}"
-            return [Segment(what + " and shows the fields it knows", WARN)]
-        lately = self.feed.waited(now)
+            return cut(Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width)
+        if feed.state.schema != SCHEMA:
+            what = f" the stream has schema {feed.state.schema}, this page knows {SCHEMA}"
+            return Text(what + " and shows the fields it knows", WARN)
+        lately = feed.waited(now)
         if lately > LATE:
-            total = short(number(self.feed.state, "behind_s"), 2)
-            what = f" this machine is busy: the simulated hand runs {short(lately, 2)} s behind"
-            return [Segment(cut(f"{what} ({total} s in all)", width), WARN)]
-        return []
+            what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
+            return cut(Text(f"{what} ({short(feed.state.behind_s, 2)} s in all)", WARN), width)
+        return Text()
 
-    def _body(self, width: int, lines: int, now: float) -> list[Line]:
+    def _body(self, width: int, lines: int, now: float) -> list[Text]:
         """Titles, maps with the numbers between them, and the maps' scale with the object."""
         box = min(2 * lines, (width - CENTRE - 2) // 2)
-        grids = {name: frame.grid() for name, frame in self.feed.frames.items()}
-        peak = max((float(grid.max()) for grid in grids.values()), default=0.0)
+        frames = self.feed.frames
+        peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
-        counts = any(math.isnan(frame.scale) for frame in self.feed.frames.values())
+        counts = any(math.isnan(frame.scale) for frame in frames.values())
         left, right = (self._map(name, lines, box, full, now, counts) for name in FINGERS)
-        rows = self._numbers(lines + 2)
-        gap = max(1, (width - 2 * box - CENTRE) // 2)
-        gap = min(gap, 6)
-        margin = Segment(" " * max(0, (width - 2 * box - 2 * gap - CENTRE) // 2))
-        space = Segment(" " * gap)
-        return [
-            [
-                margin,
-                *exactly(a, box),
-                space,
-                *exactly(b, CENTRE),
-                space,
-                *exactly(c, box),
-            ]
-            for a, b, c in zip(left, rows, right, strict=True)
-        ]
+        gap = min(max(1, (width - 2 * box - CENTRE) // 2), 6)
+        margin = " " * max(0, (width - 2 * box - 2 * gap - CENTRE) // 2)
+        page = []
+        for parts in zip(left, self._numbers(lines + 2), right, strict=True):
+            for part, room in zip(parts, (box, CENTRE, box), strict=True):
+                part.truncate(room, overflow="crop", pad=True)
+            page.append(Text.assemble(margin, parts[0], " " * gap, parts[1], " " * gap, parts[2]))
+        return page
 
     def _map(
         self, name: str, lines: int, box: int, full: float, now: float, counts: bool
-    ) -> list[Line]:
+    ) -> list[Text]:
         """Title, ``lines`` of picture and the scale, each at most ``box`` columns."""
         frame = self.feed.frames.get(name)
-        unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
+        title = Text(name.upper(), SIDE[name])
+        picture = [Text() for _ in range(lines)]
         if frame is None:
-            empty = [centred([Segment("no frames", DIM)], box) if i == lines // 2 else []
-                     for i in range(lines)]  # fmt: skip
-            return [[Segment(name.upper(), SIDE[name])], *empty, []]
-        grid = frame.grid()
-        old = now - frame.arrived > OLD
-        touch = value_at(self.feed.state, name, "contact")
-        said = "old" if old else "contact" if touch is True else "free" if touch is False else ""
-        style = WARN if old else GOOD if touch is True else DIM
-        peak = f"{grid.max() * factor:.{decimals}f} {unit}"
-        title = apart(
-            [Segment(name.upper(), SIDE[name]), Segment(f" {said}", style)], [Segment(peak)], box
-        )
-        height, columns = heatmap.fit(frame.rows, frame.cols, lines, box, frame.aspect)
+            picture[lines // 2] = centred(Text("no frames", DIM), box)
+            return [title, *picture, Text()]
+        unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
+        touch = getattr(self.feed.state, name).contact
+        said, style = ("contact", GOOD) if touch else ("free", DIM)
+        if now - frame.arrived > OLD:
+            said, style = "old", WARN
+        peak = Text(f"{frame.grid.max() * factor:.{decimals}f} {unit}")
+        title = apart(Text.assemble(title, (f" {said}", style)), peak, box)
+        rows, cols = frame.grid.shape
+        height, columns = heatmap.fit(rows, cols, lines, box, frame.aspect)
         above = (lines - height) // 2
-        picture: list[Line] = [[] for _ in range(lines)]
-        for i, line in enumerate(heatmap.picture(grid, full, height, columns, self.depth)):
-            picture[above + i] = centred([*line], box)
+        for i, line in enumerate(heatmap.picture(frame.grid, full, height, columns, self.depth)):
+            picture[above + i] = centred(line, box)
         end = f" {full * factor:g} {unit}"
         bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.depth)
-        return [title, *picture, [Segment("0 ", DIM), *bar, Segment(end, DIM)]]
+        return [title, *picture, Text.assemble(("0 ", DIM), bar, (end, DIM))]
 
-    def _numbers(self, lines: int) -> list[Line]:
+    def _numbers(self, lines: int) -> list[Text]:
         """Heads, one row a quantity, and the object, in the middle of ``lines``."""
         rows = [self._row(*row) for row in _ROWS]
-        between: list[Line] = [[]] if lines > len(rows) + 3 else []
-        block = [self._heads(), *between, *rows, *between, self._object()]
+        between = [Text()] if lines > len(rows) + 3 else []
+        block = [self._heads(), *between, *rows, *(each.copy() for each in between), self._object()]
         above = (lines - len(block)) // 2
-        return [[]] * above + block + [[]] * (lines - above - len(block))
+        block = [*(Text() for _ in range(above)), *block]
+        return block + [Text() for _ in range(lines - len(block))]
 
-    def _heads(self) -> Line:
-        present = {name: value_at(self.feed.state, name, "valid") is not False for name in FINGERS}
-        heads = [
-            Segment(f"{name if present[name] else name + ' —':^10} ", SIDE[name])
-            for name in FINGERS
-        ]
-        return [Segment(" " * 8), *heads]
-
-    def _row(self, label: str, key: str, factor: float, decimals: int, unit: str, std: str) -> Line:
-        line = [Segment(f"{label:<8}", DIM)]
+    def _heads(self) -> Text:
+        line = Text(" " * 8)
         for name in FINGERS:
-            finger = value_at(self.feed.state, name)
-            here = value_at(finger, "valid") is not False
-            value = number(finger, key)
-            if key == "temperature" and value == 0.0:
-                value = math.nan  # not known yet
-            shown = aligned(factor * value, decimals)
-            spread = number(finger, std) if std else math.nan
-            beside = "" if math.isnan(spread) else "±" + narrow(factor * spread)
-            style = PLAIN if here else DIM
-            if key == "temperature" and value >= self.feed.warm:
-                style = BAD
-            line.append(Segment(shown, style))
-            line.append(Segment(f"{beside:<{11 - len(shown)}}", DIM))
-        line.append(Segment(f" {unit}", DIM))
+            here = getattr(self.feed.state, name).valid
+            line.append(f"{name if here else name + ' —':^10} ", SIDE[name])
         return line
 
-    def _object(self) -> Line:
-        pose = value_at(self.feed.state, "object")
-        if value_at(pose, "valid") is False:
-            pose = None
-        angle = math.degrees(number(pose, "angle"))
-        width = 1e3 * number(pose, "width")
-        return [
-            Segment(f"{'object':<8}", DIM),
-            Segment(f"{aligned(angle, 2):<6}", BOLD),
-            Segment(f"{' °':<5}", DIM),
-            Segment(f"{aligned(width, 2):<6}", BOLD),
-            Segment(" mm wide", DIM),
-        ]
+    def _row(self, label: str, key: str, factor: float, decimals: int, unit: str, std: str) -> Text:
+        line = Text(f"{label:<8}", DIM)
+        for name in FINGERS:
+            finger = getattr(self.feed.state, name)
+            value, style = getattr(finger, key), "default" if finger.valid else DIM
+            if key == "temperature":
+                style = BAD if value >= self.feed.warm else style
+                value = value or math.nan  # 0 is not known yet
+            spread = factor * getattr(finger, std) if std else math.nan
+            shown = aligned(factor * value, decimals)
+            beside = "" if math.isnan(spread) else "±" + narrow(spread)
+            line.append(shown, style).append(f"{beside:<{11 - len(shown)}}", DIM)
+        return line.append(f" {unit}", DIM)
+
+    def _object(self) -> Text:
+        pose = self.feed.state.object
+        angle, width = (
+            (math.degrees(pose.angle), 1e3 * pose.width) if pose.valid else [math.nan] * 2
+        )
+        return Text.assemble(
+            (f"{'object':<8}", DIM),
+            (f"{aligned(angle, 2):<6}", "bold"),
+            (f"{' °':<5}", DIM),
+            (f"{aligned(width, 2):<6}", "bold"),
+            (" mm wide", DIM),
+        )
 
     def _goal(self) -> str:
         """The grip's goal in words; empty without a grip."""
-        force = number(self.feed.state, "goal_force")
-        angle = math.degrees(number(self.feed.state, "goal_angle"))
+        force = self.feed.state.goal_force
+        angle = math.degrees(self.feed.state.goal_angle)
         if not math.isfinite(force):
             return ""
         said = f"grip: goal {force:.1f} N"
@@ -286,73 +265,68 @@ class MonitorPage:
             said += f", raised from {asked:.1f} N"
         return said + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
 
-    def _trends(self, width: int, lines: int) -> list[Line]:
+    def _trends(self, width: int, lines: int) -> list[Text]:
         """The recent history of both forces, ``lines`` of bars each."""
         columns = width - 30
-        recent = list(self.feed.history)[-columns:]
-        peak = max((v for pair in recent for v in pair if math.isfinite(v)), default=0.0)
-        full = self._force.follow(peak, 0.0)
-        result: list[Line] = []
+        history = self.feed.history
+        recent = list(islice(history, max(0, len(history) - columns), None))
+        full = self._force.follow(
+            max((v for pair in recent for v in pair if math.isfinite(v)), default=0.0), 0.0
+        )
+        result = []
         for i, name in enumerate(FINGERS):
-            value = aligned(number(self.feed.state, name, "force"), 2)
-            for bar in bars([pair[i] for pair in recent], full, lines):
-                result.append(
-                    [Segment(" " * 23), Segment(f"{bar:>{columns}}", SIDE[name]), Segment(" ")]
-                )
-            result[-1][0] = Segment(f" force {name:<6}", DIM)
-            result[-1].insert(1, Segment(f"{value:<8}"))
-            result[-1].insert(2, Segment("N ", DIM))
-            result[-lines].append(Segment(f"{full:g} N", DIM))
+            for row, bar in enumerate(bars([pair[i] for pair in recent], full, lines)):
+                head = Text(" " * 23)
+                if row == lines - 1:
+                    value = aligned(getattr(self.feed.state, name).force, 2)
+                    head = Text.assemble((f" force {name:<6}", DIM), f"{value:<8}", ("N ", DIM))
+                head.append(f"{bar:>{columns}} ", SIDE[name])
+                result.append(head.append("" if row else f"{full:g} N", DIM))
         return result
 
-    def _ticks(self, width: int) -> Line:
+    def _ticks(self, width: int) -> Text:
         """Rate and overruns, then median, tail and largest times of all ticks.
 
         Until ``hand/stats`` arrives, those of the last second. Shorter in a narrow terminal.
         """
-        now, all_ticks = self._statistics, self.feed.times
-        overruns = number(self.feed.state, "overruns")
-        head = [
-            Segment(f" tick {short(now.rate, 0)} Hz"),
-            Segment("  overruns ", DIM),
-            Segment(short(overruns, 0), WARN if overruns > 0 else PLAIN),
-        ]
-        times: tuple[tuple[str, tuple[float, ...]], ...]
-        words: tuple[str, ...]
-        if all_ticks is None:
-            times = (
-                ("compute", (now.compute, now.compute_max)),
-                ("late", (now.late, now.late_max)),
-            )
+        now, of_all, overruns = self._statistics, self.feed.times, self.feed.state.overruns
+        words: tuple[str, ...] = ("µs", "p99", "max")
+        times: dict[str, tuple[float, ...]]
+        if of_all is None:
             words = ("µs", "max")
+            times = {"compute": (now.compute, now.compute_max), "late": (now.late, now.late_max)}
         else:
-            times = (("compute", all_ticks.compute), ("late", all_ticks.late))
-            words = ("µs", "p99", "max")
-        full, slim = [*head], [*head]
-        for label, values in times:
+            spreads = {"compute": of_all.compute, "late": of_all.wake}
+            times = {name: (each.p50, each.p99, each.max) for name, each in spreads.items()}
+        head = Text(f" tick {short(now.rate, 0)} Hz").append("  overruns ", DIM)
+        known = str(overruns) if self.feed.mode else "—"
+        head.append(known, WARN if overruns > 0 else "default")
+        full, slim = head.copy(), Text()
+        for label, values in times.items():
             said = [micro(value) for value in values]
             tail = "".join(
                 f" {word} {value}" for word, value in zip(words[1:], said[1:], strict=True)
             )
-            full += [Segment(f"  {label} ", DIM), Segment(f"{said[0]} µs"), Segment(tail, DIM)]
-            slim += [Segment(f"  {label} ", DIM), Segment("/".join(said))]
-        slim.append(Segment(" µs", DIM))
-        named = [*slim[:3], Segment(f"  p50/{'/'.join(words[1:])}", DIM), *slim[3:]]
-        return next((line for line in (full, named) if length(line) <= width), slim)
+            full.append(f"  {label} ", DIM).append(f"{said[0]} µs").append(tail, DIM)
+            slim.append(f"  {label} ", DIM).append("/".join(said))
+        slim.append(" µs", DIM)
+        named = Text.assemble(head, (f"  p50/{'/'.join(words[1:])}", DIM), slim)
+        fitting = (line for line in (full, named) if line.cell_len <= width)
+        return next(fitting, Text.assemble(head, slim))
 
-    def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Line]:
+    def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
         """A rule with the commander and the last reply, texts cut above in full, then events."""
-        who = self.feed.commander(now)
-        title = "events" if not who else f"events ─ {cut(who, 16)} commands the hand"
-        said = _reply(reply, now)
-        full: list[Line] = []
-        fault = text(self.feed.state, "fault")
-        if cell_len(fault) > width - len(self._way_out) - 8:
-            full += [[Segment(f" {part}", BAD)] for part in wrapped(fault, width - 2)[:2]]
-        if length(said) > width - len(title) - 9:
-            parts = wrapped(said[0].text, width - 2)
-            full += [[Segment(f" {part}", said[0].style)] for part in parts[:2]]
-            said = []
+        who = cut(Text(self.feed.commander(now)), 16)
+        title = Text(f"events ─ {who} commands the hand" if who else "events")
+        full: list[Text] = []
+        if Text(self.feed.fault).cell_len > width - len(self._way_out) - 8:
+            full = wrapped(Text(self.feed.fault, BAD), width - 2)
+        said = Text()
+        if reply is not None and now - reply.at <= REPLY_TIME:
+            said = Text(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)
+        if said.cell_len > width - len(title) - 9:
+            full += wrapped(said, width - 2)
+            said = Text()
         full = full[:count]
         return [rule(width, title, said), *full, *self._events(width, count - len(full))]
 
@@ -361,51 +335,55 @@ class MonitorPage:
         """What clears a fault."""
         return "c clears it " if self.keys else "softfinger send clear "
 
-    def _events(self, width: int, count: int) -> list[Line]:
-        recent = self.feed.events[-count:] if count else []
-        result: list[Line] = []
-        for event in recent:
-            style = _LEVELS.get(event.level, PLAIN)
-            kind = f" {event.kind:<9}"
-            line = [Segment(f" {event.clock()}", DIM), Segment(kind, style)]
-            said = PLAIN if event.level == "info" else style
-            line.append(Segment(" " + cut(event.text, width - length(line) - 1), said))
-            result.append(line)
-        return result + [[] for _ in range(count - len(result))]
+    def _events(self, width: int, count: int) -> list[Text]:
+        lines = []
+        for event in self.feed.events[-count:] if count else []:
+            style = _LEVELS.get(event.level, "default")
+            line = Text.assemble((f" {event.clock()}", DIM), (f" {event.kind:<9} ", style))
+            lines.append(
+                cut(line.append(event.text, style if event.level != "info" else ""), width)
+            )
+        return lines + [Text() for _ in range(count - len(lines))]
 
-    def _footer(self, width: int) -> Line:
+    def _footer(self, width: int) -> Text:
+        """The keys by name; in a narrow terminal without those that are useless at present."""
         if not self.keys:
-            return [Segment(" no keyboard here: commands go through softfinger send", DIM)]
-        return key_line(width, self.force, bool(text(self.feed.state, "fault")))
+            return Text(" no keyboard here: commands go through softfinger send", DIM)
+        force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"
+        keys = _KEYS | {"+-": force}
+        line = _named(keys)
+        for spare in ("+-", "←→") if self.feed.fault else ("c", "d"):
+            if line.cell_len - 2 > width:
+                del keys[spare]
+                line = _named(keys)
+        return line
+
+
+def _named(keys: dict[str, str]) -> Text:
+    line = Text(" ")
+    for key, what in keys.items():
+        line.append(key, KEY).append(f" {what}  ", DIM)
+    return line
 
 
 def _shares(width: int, height: int) -> tuple[int, int, int]:
     """Lines of (each map, each trend, the events) on a page of this size."""
     spare = height - HEIGHT
     widest = (width - CENTRE - 2) // 4  # the maps' width is twice their height
-    maps = min(widest, MAP_LINES + (2 * spare + 2) // 3)
-    maps = max(MAP_LINES, maps)
+    maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))
     spare -= maps - MAP_LINES
     trend = 1 + min(3, spare // 4)
     spare -= 2 * (trend - 1)
     return maps, trend, 3 + spare
 
 
-def _too_small(width: int, height: int) -> list[Line]:
+def _too_small(width: int, height: int) -> list[Text]:
     said = [
         "softfinger monitor",
         f"needs {WIDTH} × {HEIGHT},",
         f"this is {width} × {height}",
         "q quits, space stops",
     ]
-    above = max(0, (height - len(said)) // 2)
-    lines: list[Line] = [[] for _ in range(above)]
-    lines += [centred([Segment(cut(line, width), WARN)], width) for line in said]
-    lines += [[] for _ in range(height)]
-    return [exactly(line, width) for line in lines[:height]]
-
-
-def _reply(reply: ShownReply | None, now: float) -> Line:
-    if reply is None or now - reply.at > REPLY_TIME:
-        return []
-    return [Segment(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)]
+    lines = [Text() for _ in range(max(0, (height - len(said)) // 2))]
+    lines += [centred(cut(Text(line, WARN), width), width) for line in said]
+    return (lines + [Text() for _ in range(height)])[:height]

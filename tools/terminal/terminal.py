@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import termios
 import tty
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.color import ColorSystem
 from rich.console import Console
 from rich.segment import Segment
+from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.heatmap import Depth
@@ -30,14 +32,17 @@ _COLOUR_SYSTEMS = {
     "256": ColorSystem.EIGHT_BIT,
     "standard": ColorSystem.STANDARD,
 }
+_DEPTHS: dict[Any, Depth] = {"truecolor": "any", "256": "fixed"}  # 16 are too few for a map
 
-_SEQUENCES = {
-    b"\x1b[D": "left",
-    b"\x1b[C": "right",
-    b"\x1bOD": "left",
-    b"\x1bOC": "right",
-}
-_PASTE, _PASTE_END = b"\x1b[200~", b"\x1b[201~"
+_ARROWS = {b"D": "left", b"C": "right"}
+_KEY = re.compile(
+    rb"\x1b\[200~(?s:.)*?\x1b\[201~"  # a paste
+    rb"|(?P<part>\x1b(\[(200~(?s:.)*|[0-?]*[ -/]*)|O)?\Z)"  # cut off: the rest is to come
+    rb"|\x1b[\[O](?P<arrow>[CD])"
+    rb"|\x1b(\[[0-?]*[ -/]*[@-~]|O(?s:.)|(?s:.))"  # a sequence that means nothing here
+    rb"|(?P<character>[ -~])"
+    rb"|(?s:.)"
+)
 
 
 class TerminalGone(SoftfingerError):
@@ -49,57 +54,18 @@ class KeyDecoder:
 
     def __init__(self) -> None:
         self._rest = b""
-        self._pasting = False
 
     def decode(self, data: bytes) -> list[str]:
         """The keys in ``data``: ``left``, ``right`` or the character itself."""
-        data = self._rest + data
-        self._rest = b""
-        keys: list[str] = []
-        at = 0
-        while at < len(data):
-            if self._pasting:
-                end = data.find(_PASTE_END, at)
-                if end < 0:
-                    self._rest = data[max(at, len(data) - len(_PASTE_END) + 1) :]
-                    return keys
-                self._pasting = False
-                at = end + len(_PASTE_END)
-                continue
-            length = _length(data, at)
-            if length == 0:  # a sequence that is cut off: the rest comes with the next bytes
-                self._rest = data[at:]
-                return keys
-            piece = data[at : at + length]
-            at += length
-            if piece == _PASTE:
-                self._pasting = True
-            elif piece in _SEQUENCES:
-                keys.append(_SEQUENCES[piece])
-            elif len(piece) == 1 and 0x20 <= piece[0] < 0x7F:
-                keys.append(piece.decode())
-        return keys
+        keys = list(_KEY.finditer(self._rest + data))
+        self._rest = keys[-1]["part"] or b"" if keys else b""
+        known = (_ARROWS.get(key["arrow"]) or (key["character"] or b"").decode() for key in keys)
+        return [key for key in known if key]
 
     def settle(self) -> None:
         """No more bytes for now: a lone Escape begins nothing."""
-        if not self._pasting:
+        if not self._rest.startswith(b"\x1b[200~"):
             self._rest = b""
-
-
-def _length(data: bytes, at: int) -> int:
-    """Bytes of the key or sequence at ``at``, 0 when its end is still to come."""
-    if data[at] != 0x1B:
-        return 1
-    if at + 1 >= len(data):
-        return 0
-    if data[at + 1] == ord("O"):
-        return 3 if at + 2 < len(data) else 0
-    if data[at + 1] != ord("["):
-        return 2
-    for end in range(at + 2, len(data)):
-        if 0x40 <= data[end] <= 0x7E:
-            return end - at + 1
-    return 0
 
 
 class Terminal:
@@ -114,13 +80,10 @@ class Terminal:
         self._size = (0, 0)
         self.writing = False
         self._stuck = False
-        console = Console()
-        name = None if console.no_color else console.color_system
+        self._console = Console()
+        name = None if self._console.no_color else self._console.color_system
         self._colours = _COLOUR_SYSTEMS.get(name) if name else None
-        # Sixteen colours are too few for a map; shades of one character read better there.
-        self.depth: Depth = "none"
-        if self._colours in (ColorSystem.TRUECOLOR, ColorSystem.EIGHT_BIT):
-            self.depth = "any" if self._colours is ColorSystem.TRUECOLOR else "fixed"
+        self.depth: Depth = _DEPTHS.get(name, "none")
 
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
@@ -130,7 +93,6 @@ class Terminal:
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, ours)
-        self._shown = []
         self._size = (0, 0)
         try:
             self._write(_ENTER)
@@ -159,21 +121,25 @@ class Terminal:
         # A serial console may say 0 × 0.
         return size.columns or 80, size.lines or 24
 
-    def draw(self, lines: Sequence[Sequence[Segment]]) -> None:
+    def draw(self, lines: Sequence[Text]) -> None:
         """Show ``lines``, each exactly as wide as the terminal."""
-        size = self.size()
         parts = []
-        if size != self._size:
+        if (size := self.size()) != self._size:
             self._size = size
             self._shown = []
             parts.append("\x1b[0m\x1b[2J")
-        new = ["".join(map(self._render, line)) for line in lines]
+        new = ["".join(map(self._render, self._segments(line))) for line in lines]
         for row, line in enumerate(new):
             if row >= len(self._shown) or line != self._shown[row]:
                 parts.append(f"\x1b[{row + 1};1H{line}")
         if parts:
             self._write(_HOLD + "".join(parts) + _SHOW)
         self._shown = new
+
+    def _segments(self, line: Text) -> Iterable[Segment]:
+        if line.spans:
+            return line.render(self._console)
+        return [Segment(line.plain, self._console.get_style(line.style))]
 
     def _render(self, segment: Segment) -> str:
         if segment.style is None:

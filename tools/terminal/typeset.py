@@ -6,18 +6,54 @@ Widths are terminal columns: a wide character takes two.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
-from rich.cells import cell_len, set_cell_size
-from rich.segment import Segment
+from rich.console import Console
 from rich.style import Style
+from rich.text import Text
 
-Line = list[Segment]
-
-PLAIN = Style()
-DIM = Style(color="#8b929c")
-FADED = Style(color="#8b929c", bold=False)
+DIM = "#8b929c"
 BARS = " ▁▂▃▄▅▆▇█"
+
+
+def cut(line: Text, room: int) -> Text:
+    """``line`` in at most ``room`` columns, with an ellipsis where it was cut."""
+    line.truncate(max(room, 0), overflow="ellipsis")
+    return line
+
+
+def wrapped(line: Text, room: int) -> list[Text]:
+    """The first two lines of ``room`` columns, one in from the left."""
+    lines = line.wrap(Console(), room)[:2]
+    for each in lines:
+        each.pad_left(1)
+    return list(lines)
+
+
+def apart(left: Text, right: Text, width: int) -> Text:
+    """``left`` and ``right`` at the two ends of ``width`` columns."""
+    return Text.assemble(left, " " * max(1, width - left.cell_len - right.cell_len), right)
+
+
+def centred(line: Text, width: int) -> Text:
+    """``line`` in the middle of ``width`` columns, not padded at its end."""
+    line.pad_left((width - line.cell_len) // 2)
+    return line
+
+
+def rule(width: int, title: Text, note: Text | None = None) -> Text:
+    """A line across the page with a title at its left end and a note at its right end."""
+    head = f"─ {cut(title, width - 4)} " if title else ""
+    if not note:
+        return Text(head + "─" * (width - len(head)), DIM)
+    cut(note, width - len(head) - 6)
+    fill = "─" * (width - len(head) - note.cell_len - 3)
+    return Text.assemble((f"{head}{fill} ", DIM), note, (" ─", DIM))
+
+
+def faded(line: Text) -> Text:
+    """``line`` without colours, except the maps, the only ones with a background: out of date."""
+    maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
+    return Text(line.plain, DIM, spans=maps)
 
 
 def bars(values: list[float], full: float, lines: int) -> list[str]:
@@ -38,9 +74,7 @@ def aligned(value: float, decimals: int) -> str:
     if not math.isfinite(value):
         return "  —"
     shown = f"{value:{4 + decimals}.{decimals}f}"
-    if len(shown) > 7:
-        shown = f"{value:.1e}"
-    return shown
+    return shown if len(shown) <= 7 else f"{value:.1e}"
 
 
 def narrow(value: float) -> str:
@@ -58,58 +92,3 @@ def micro(seconds: float) -> str:
     if not math.isfinite(seconds):
         return "—"
     return f"{1e6 * seconds:.0f}" if seconds < 9.9995e-3 else f"{1e3 * seconds:.0f}ms"
-
-
-def cut(said: str, room: int) -> str:
-    """``said`` in at most ``room`` columns, with an ellipsis where it was cut."""
-    if cell_len(said) <= room:
-        return said
-    return set_cell_size(said, max(0, room - 1)) + ("…" if room > 0 else "")
-
-
-def wrapped(said: str, room: int) -> list[str]:
-    """``said`` in lines of at most ``room`` columns."""
-    lines = [""]
-    for word in said.split(" "):
-        longer = f"{lines[-1]} {word}" if lines[-1] else word
-        if cell_len(longer) <= room:
-            lines[-1] = longer
-        else:
-            lines.append(cut(word, room))
-    return [line for line in lines if line]
-
-
-def length(line: Iterable[Segment]) -> int:
-    """Columns that ``line`` takes."""
-    return sum(segment.cell_length for segment in line)
-
-
-def exactly(line: Line, width: int) -> Line:
-    """``line`` cropped or padded to ``width`` columns."""
-    return Segment.adjust_line_length(line, width, pad=True)
-
-
-def apart(left: Line, right: Line, width: int, between: Style = PLAIN) -> Line:
-    """``left`` and ``right`` at the two ends of ``width`` columns."""
-    space = max(1, width - length(left) - length(right))
-    return [*left, Segment(" " * space, between), *right]
-
-
-def centred(line: Line, width: int) -> Line:
-    """``line`` in the middle of ``width`` columns, not padded at its end."""
-    return [Segment(" " * ((width - length(line)) // 2)), *line]
-
-
-def rule(width: int, title: str = "", note: Line | None = None) -> Line:
-    """A line across the page with a title at its left end and a note at its right end."""
-    head = f"─ {title} " if title else ""
-    if not note:
-        return [Segment(head + "─" * (width - len(head)), DIM)]
-    note = [Segment(cut(s.text, width - len(head) - 6), s.style) for s in note]
-    fill = "─" * (width - len(head) - length(note) - 3)
-    return [Segment(f"{head}{fill} ", DIM), *note, Segment(" ─", DIM)]
-
-
-def faded(line: Line) -> Line:
-    """``line`` without colours, except the maps: it is out of date."""
-    return [s if "▀" in s.text else Segment(s.text, FADED) for s in line]
