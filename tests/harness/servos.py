@@ -80,8 +80,9 @@ def put_fault(bus: ServoBus, text: str, t: float) -> None:
 
 
 def backend_settings(path: str, **servos: Any) -> Settings:
-    """The Dynamixel backend on this port; a bus in a thread shares the interpreter's lock."""
-    values = {"backend": "dynamixel", "port": path, "reply_timeout": 1.0} | servos
+    """The Dynamixel backend on this port, with time for a test that waits for a processor."""
+    waits = {"reply_timeout": 1.0, "watchdog": 2.0}
+    values = {"backend": "dynamixel", "port": path} | waits | servos
     return Settings.model_validate({"servos": values})
 
 

@@ -156,7 +156,7 @@ def test_torque_on_starts_where_the_joint_is(bus: RunningBus, connect: Connect) 
         assert goal == expected
         assert struct.unpack_from("<h", memory, reg.GOAL_CURRENT)[0] == 0
         assert memory[reg.TORQUE_ENABLE] == 1
-        assert memory[reg.BUS_WATCHDOG] == 5  # 0.1 s
+        assert memory[reg.BUS_WATCHDOG] == 100  # of 0.02 s
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
@@ -316,7 +316,7 @@ def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(
     bus: RunningBus, connect: Connect
 ) -> None:
     # As where an adapter held packets up that the port had taken.
-    backend = connect(bus, watchdog=2.0)
+    backend = connect(bus)
     backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
     backend.write(goal)
@@ -329,7 +329,7 @@ def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(
 def test_a_servo_that_lost_its_power_for_a_moment_is_found(
     bus: RunningBus, connect: Connect
 ) -> None:
-    backend = connect(bus, watchdog=2.0)
+    backend = connect(bus)
     backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
     backend.write(goal)
@@ -379,7 +379,7 @@ def test_writes_that_get_lost_are_never_taken_for_done(bus: RunningBus, connect:
 @pytest.mark.parametrize("mode", ["current-based position", "current", "position"])
 def test_goals_that_do_not_arrive_are_noticed(running: Run, mode: str, connect: Connect) -> None:
     bus = running(hand_bus(time.monotonic(), {"mode": mode}))
-    backend = connect(bus, mode=mode, watchdog=2.0)
+    backend = connect(bus, mode=mode)
     backend.torque_on()
     reading, goal = Reading(), Goal(current=[0.2, 0.2])
     sent = 0
