@@ -15,8 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, HandFacts, SensorFacts
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import message_maker
-from softfinger.tools.analysis.contacts import analyse, write_csv
-from softfinger.tools.analysis.sources import open_source
+from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import Inline
 from tests.harness.daemon_process import softfinger

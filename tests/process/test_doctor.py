@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.diagnosis import addresses as sockets
 from softfinger.daemon.diagnosis import devices, machine, ports
 from softfinger.daemon.diagnosis import machine as kernels
 from softfinger.daemon.diagnosis.result import Result
@@ -356,7 +355,7 @@ def profile(addresses: tuple[str, str]) -> Settings:
 def test_free_and_taken_sockets(addresses, monkeypatch):
     settings = profile(addresses)
     assert [each.status for each in check(settings)] == ["pass", "pass"]
-    monkeypatch.setattr("softfinger.daemon.diagnosis.addresses._PATIENCE", 0.05)
+    monkeypatch.setattr("softfinger.daemon.diagnosis.ports._PATIENCE", 0.05)
     host, port = addresses[0].removeprefix("tcp://").split(":")
     with socket.create_server((host, int(port))):
         taken, free = check(settings)
@@ -374,15 +373,15 @@ def test_a_running_daemon_is_recognised(addresses):
 
 
 def check(settings: Settings) -> list[Result]:
-    return sockets.check_addresses(settings)
+    return ports.check_addresses(settings)
 
 
 def test_ipc_addresses(tmp_path):
     place = f"ipc://{tmp_path / 'commands'}"
-    assert sockets.why_not_free(place) == ""
+    assert ports.why_not_free(place) == ""
     with Served(commands=place):
-        assert sockets.why_not_free(place) == "in use"
-    assert sockets.why_not_free(place) == ""
-    assert "is not there" in sockets.why_not_free("ipc:///nowhere/at/all")
-    assert "expected tcp or ipc" in sockets.why_not_free("udp://1")
-    assert sockets.why_not_free("tcp://127.0.0.1:x") == "has no port number"
+        assert ports.why_not_free(place) == "in use"
+    assert ports.why_not_free(place) == ""
+    assert "is not there" in ports.why_not_free("ipc:///nowhere/at/all")
+    assert "expected tcp or ipc" in ports.why_not_free("udp://1")
+    assert ports.why_not_free("tcp://127.0.0.1:x") == "has no port number"

@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.known import ShownHand
-from softfinger.tools.viewing.planar import HeldObject, touch
+from softfinger.tools.viewing.planar import SPRINGS, HeldObject, touch
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 
@@ -164,7 +164,7 @@ def check_scene(client: Client) -> None:
     named = {each[3][0].decode(): each for each in entities}
     assert list(named) == ["palm", "left", "right", "object", "simulated"]
     for finger in ("left", "right"):
-        assert len(named[finger][11]) == 6  # link, base, skin, springs, face, normal
+        assert len(named[finger][11]) == 5 + SPRINGS  # link, base, skin, springs, face, normal
         (label,) = (fields(text)[6][0].decode() for text in named[finger][13])
         assert 8.0 <= float(label.removesuffix(" N")) <= 12.0
         (arrow,) = map(fields, named[finger][7])

@@ -178,7 +178,7 @@ def test_frames_are_the_boards_with_the_footprint_over_them(recorded: Path, show
 
 
 def test_the_hand_moves_and_the_object_is_between_its_tips(recorded: Path, shown: Shown) -> None:
-    assert len(shown.rows["/hand/fingers", "strips"]) > 40
+    assert len(shown.rows["/hand/left", "strips"]) > 40
     released = next(when for when, row in shown.rows["/mode", "state"] if row == ["releasing"])
     outlines = shown.rows["/hand/object", "strips"]
     held = [(when, row[0]) for when, row in outlines if row and when < released]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from softfinger.tools.viewing.colours import COLOURS
+from softfinger.tools.viewing.planar import COLOURS
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask
 from tests.harness.headless_browser import Browser, browser_path

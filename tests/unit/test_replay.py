@@ -9,8 +9,7 @@ from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.tactile.recording import load_recording
-from softfinger.daemon.tactile.replay import ReplayTactile
+from softfinger.daemon.tactile.replay import ReplayTactile, load_recording
 
 FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)
 

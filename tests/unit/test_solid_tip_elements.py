@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softfinger.tools.solid_tip.evaluate import SolidTip, rms_difference
+from softfinger.tools.solid_tip.fit import SolidTip, rms_difference
 from tests.unit.test_solid_tip_data import CELLS, FILE, PITCH
 
 pytest.importorskip("scipy")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.tactile.recording import load_recording
+from softfinger.daemon.tactile.replay import load_recording
 from softfinger.daemon.tactile.tekscan import TekscanError, parse
 
 EXPORT = """\

@@ -15,8 +15,7 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.bridge import statistics_table
-from softfinger.tools.viewing.known import read_settings
-from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, Landscape
+from softfinger.tools.viewing.known import HEIGHT, THETA_END, WIDTH, Landscape, read_settings
 from softfinger.tools.viewing.planar import (
     HeldObject,
     Touch,

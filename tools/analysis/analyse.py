@@ -32,8 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse and write. Raises SoftfingerError or OSError."""
     settings = profile(arguments)
     from softfinger.daemon.loop.warm_up import FRAMES
-    from softfinger.tools.analysis.contacts import analyse, draw, write_csv
-    from softfinger.tools.analysis.sources import open_source
+    from softfinger.tools.analysis.contacts import analyse, draw, open_source, write_csv
     from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
     from softfinger.tools.terminal.progress import Progress
 

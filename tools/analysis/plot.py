@@ -59,8 +59,7 @@ def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
     """What draws each page; matplotlib is imported when one is drawn."""
     from softfinger.tools.analysis.plots_error import draw_error
     from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
-    from softfinger.tools.analysis.plots_time import draw_joints, draw_time
-    from softfinger.tools.analysis.plots_timing import draw_timing
+    from softfinger.tools.analysis.plots_time import draw_joints, draw_time, draw_timing
 
     functions = draw_time, draw_angle, draw_landscape, draw_error, draw_joints, draw_timing
     return dict(zip(PAGES, functions, strict=True))

@@ -21,7 +21,7 @@ from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
-from softfinger.daemon.tactile.recording import TRUTHS, load_recording
+from softfinger.daemon.tactile.replay import TRUTHS, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.kinematics.estimation.calibration import CalibrationError
 

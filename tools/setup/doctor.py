@@ -9,7 +9,6 @@ import argparse
 from collections.abc import Iterator
 
 from softfinger.daemon.backends import KINDS, SERVOS, TACTILE, installed, source
-from softfinger.daemon.diagnosis.addresses import check_addresses, daemon_mode
 from softfinger.daemon.diagnosis.devices import (
     check_board,
     check_servos,
@@ -17,7 +16,13 @@ from softfinger.daemon.diagnosis.devices import (
     repair_servos,
 )
 from softfinger.daemon.diagnosis.machine import check_kernels, check_machine
-from softfinger.daemon.diagnosis.ports import check_latency_timer, check_port, note_ports
+from softfinger.daemon.diagnosis.ports import (
+    check_addresses,
+    check_latency_timer,
+    check_port,
+    daemon_mode,
+    note_ports,
+)
 from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softfinger.tools.solid_tip import fit
 from softfinger.tools.solid_tip.contact import TiltedPlane
-from softfinger.tools.solid_tip.evaluate import SolidTip, rms_difference
+from softfinger.tools.solid_tip.fit import SolidTip, rms_difference
 from softfinger.tools.solid_tip.green import green, shear_response
 
 Arrays = dict[str, NDArray[Any]]

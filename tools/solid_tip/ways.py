@@ -18,8 +18,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from softfinger.tools.solid_tip.contact import TiltedPlane
-from softfinger.tools.solid_tip.green import Green, green
-from softfinger.tools.solid_tip.meridian import FloatArray
+from softfinger.tools.solid_tip.green import FloatArray, Green, green
 
 TILTED, ROLLED = np.radians(11.5), np.radians(20.7)  # the paper's path
 TILTS = range(0, 35, 5)  # [°]

@@ -21,10 +21,10 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.terminal.feed import field, number, printable, text
 from softfinger.tools.viewing import views
-from softfinger.tools.viewing.colours import GOAL, LEVELS
 from softfinger.tools.viewing.drawing import Drawing
 from softfinger.tools.viewing.known import ShownHand, read_settings
 from softfinger.tools.viewing.live_stream import TOPICS
+from softfinger.tools.viewing.planar import GOAL, LEVELS
 
 _EVENTS = 500  # kept for one drawing
 _SETTINGS_WAIT = 100  # states that the layout waits for the settings

@@ -15,54 +15,42 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from softfinger.daemon.client.records import read
-from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.terminal.feed import number
-from softfinger.tools.viewing.colours import COLOURS, GOAL, LEVELS, OBJECT, SPRING, between
-from softfinger.tools.viewing.known import ShownHand
-from softfinger.tools.viewing.landscape import Landscape
+from softfinger.tools.viewing.known import Landscape, ShownHand
 from softfinger.tools.viewing.planar import (
-    FingerLines,
+    COLOURS,
+    GOAL,
     Footprint,
-    HeldObject,
+    HandPart,
+    HandScene,
+    Push,
     Touch,
-    finger_lines,
     footprint,
     grid_of,
     tip_circle,
     touch,
-    true_outline,
 )
 
 _TRAIL = 160  # points in a trail on the landscape
-_ARROW = 1.6e-3  # m of a force's arrow a newton
-_ARROW_LONGEST = 0.045  # m
 _FADE = 0.995  # of the colour range with each frame, so that a single peak does not stay
 _LEAST_PEAK = 8.0  # standard deviations of the noise: the least end of the colour range
 
 
 class Drawing:
-    """One hand's pictures. Logs at once what stands still: the palm and the landscape."""
+    """One hand's pictures. Logs at once what stands still: the landscape."""
 
     def __init__(self, recording: rr.RecordingStream, hand: ShownHand) -> None:
         self._recording = recording
         self._hand = hand
-        self._object = HeldObject(hand.geometry)
+        self._scene = HandScene(hand)
         self._trails: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=_TRAIL) for name in hand.fingers
         }
         self._floor = _LEAST_PEAK * hand.settings.tactile.noise
         self._peak = self._floor
         self._grids: dict[str, Any] = {}
-        self._height = hand.settings.simulation.object_height
         self.landscape = hand.landscape()
-        half = 1e3 * hand.geometry.half_separation
-        self._still(
-            "hand/palm",
-            rr.LineStrips2D(
-                [[(-half - 12.0, 0.0), (half + 12.0, 0.0)]], colors=[SPRING], radii=[1.2]
-            ),
-        )
         if self.landscape is not None:
             self._draw_landscape(self.landscape)
 
@@ -97,79 +85,40 @@ class Drawing:
         """Another daemon's states follow: no trail leads to them."""
         for trail in self._trails.values():
             trail.clear()
-        self._object.lose()
+        self._scene.held.lose()
         self._peak = self._floor
-
-    def state(self, state: dict[str, Any]) -> None:
-        """Draw the hand, and its points on the landscape."""
-        contacts = [touch(state, name) for name in self._hand.fingers]
-        lines: list[FingerLines] = []
-        for name, contact in zip(self._hand.fingers, contacts, strict=True):
-            q = number(state, name, "q")
-            q = q if math.isfinite(q) else 0.0
-            lines.append(finger_lines(self._hand.geometry, FINGERS.index(name), q, contact))
-        self._fingers(lines)
-        self._contacts(lines, contacts)
-        self._held(state, contacts)
-        self._points(contacts)
-
-    def _fingers(self, lines: list[FingerLines]) -> None:
-        strips, colours, radii = [], [], []
-        for name, finger in zip(self._hand.fingers, lines, strict=True):
-            for strip, radius in ((finger.link, 2.6), (finger.base, 1.2), (finger.skin, 0.5)):
-                strips.append(_view(strip))
-                colours.append((*COLOURS[name], 255))
-                radii.append(radius)
-            for spring, strain in zip(finger.springs, finger.strain, strict=True):
-                share = min(4.0 * float(strain), 1.0)
-                strips.append(_view(spring))
-                colours.append((*between(SPRING, LEVELS["error"], share), 200))
-                radii.append(0.25 + 0.35 * share)
-        self._recording.log("hand/fingers", rr.LineStrips2D(strips, colors=colours, radii=radii))
-
-    def _contacts(self, lines: list[FingerLines], contacts: list[Touch | None]) -> None:
-        faces, origins, vectors, labels, colours, normals = [], [], [], [], [], []
-        touching = zip(self._hand.fingers, lines, contacts, strict=True)
-        for name, finger, contact in touching:
-            if contact is None or finger.face is None or finger.push is None:
-                continue
-            faces.append(_view(finger.face))
-            normals.append(_view(finger.normal))
-            at, direction = finger.push
-            length = min(_ARROW * contact.force, _ARROW_LONGEST)
-            origins.append(_view(at[None])[0])
-            vectors.append(_view(length * direction[None])[0])
-            labels.append(f"{contact.force:.1f} N")
-            colours.append(COLOURS[name])
-        strips = [*faces, *normals]
-        shades = [OBJECT] * len(faces) + [GOAL] * len(normals)
-        radii = [1.0] * len(faces) + [0.35] * len(normals)
-        self._recording.log(
-            "hand/contact", rr.LineStrips2D(strips, colors=shades, radii=radii, draw_order=2)
-        )
-        self._recording.log(
-            "hand/force",
-            rr.Arrows2D(
-                origins=origins,
-                vectors=vectors,
-                labels=labels,
-                show_labels=True,
-                colors=colours,
-                radii=[0.9] * len(origins),
-                draw_order=3.0,
-            ),
-        )
-
-    def _held(self, state: dict[str, Any], contacts: list[Touch | None]) -> None:
-        outline = self._object.shown(state, contacts, self._height)
-        outlines = [] if outline is None else [_view(outline)]
-        self._recording.log("hand/object", rr.LineStrips2D(outlines, colors=[OBJECT], radii=[0.7]))
 
     def truth(self, truth: dict[str, Any]) -> None:
         """Draw the simulated object's true pose."""
-        outline = true_outline(self._hand.settings.simulation, truth)
-        strips = [] if outline is None else [_view(outline)]
-        self._recording.log("hand/simulated", rr.LineStrips2D(strips, colors=[GOAL], radii=[0.3]))
+        self._part("simulated", self._scene.simulated(truth))
+
+    def _part(self, name: str, part: HandPart) -> None:
+        lines = rr.LineStrips2D(
+            [_view(strip.points) for strip in part.strips],
+            colors=[strip.colour for strip in part.strips],
+            radii=[0.5 * strip.width for strip in part.strips],
+        )
+        self._recording.log(f"hand/{name}", lines)
+
+    def state(self, state: dict[str, Any]) -> None:
+        """Draw the hand, and its points on the landscape."""
+        pushes: list[Push] = []
+        for name, part in self._scene.parts(state).items():
+            pushes += part.pushes
+            self._part(name, part)
+        self._recording.log(
+            "hand/force",
+            rr.Arrows2D(
+                origins=[_view(push.at) for push in pushes],
+                vectors=[_view(push.way) for push in pushes],
+                labels=[push.text for push in pushes],
+                show_labels=True,
+                colors=[push.colour for push in pushes],
+                radii=[0.9] * len(pushes),
+                draw_order=30.0,
+            ),
+        )
+        self._points([touch(state, name) for name in self._hand.fingers])
 
     def _points(self, contacts: list[Touch | None]) -> None:
         if self.landscape is None:
@@ -263,8 +212,7 @@ class Drawing:
         self._recording.log(entity, what, static=True)
 
 
-def _view(points: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def _view(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The hand's plane [m, y up] → Rerun's 2-D view [mm, y down]."""
-    assert points is not None
     shown: NDArray[np.float64] = points * (1e3, -1e3)
     return shown

@@ -27,18 +27,16 @@ from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.channels import schema_of
 from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.colours import COLOURS, GOAL, LEVELS, OBJECT, SPRING, between
 from softfinger.tools.viewing.known import ShownHand, read_settings
 from softfinger.tools.viewing.live_stream import NICE, TOPICS, follow
 from softfinger.tools.viewing.page import LOOPBACK, ViewError
+from softfinger.tools.viewing.planar import Colour
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 SCENE = "hand/scene"
 _NUMBERS = (schema.STATE, schema.TRUTH, schema.STATS)  # sent whole, as JSON
 _FRAME = "hand"  # x from the left pivot to the right one, y away from the palm [m]
 _EVENTS = 50  # kept for the first who looks at them, as many as the daemon repeats
-_ARROW = 1.6e-3  # m of a force's arrow a newton
-_ARROW_LONGEST = 0.045  # m
 _LEVELS = {"info": fm.LogLevel.Info, "warning": fm.LogLevel.Warning, "error": fm.LogLevel.Error}
 
 
@@ -111,13 +109,16 @@ class FoxgloveServer:
         self._frames.clear()
         state = self._newest.pop(schema.STATE, None)
         if state is not None and self._scene.has_sinks():
-            self._scene.log(self._drawn(state), log_time=_ns(self.time))
+            simulated = self._parts.simulated(self._newest.get(schema.TRUTH))
+            parts = self._parts.parts(state) | {"simulated": simulated}
+            entities = [_entity(name, part) for name, part in parts.items()]
+            self._scene.log(fm.SceneUpdate(entities=entities), log_time=_ns(self.time))
         while self._log.has_sinks() and self._events:
             self._event(self._events.popleft())
 
     def _know(self, hand: ShownHand) -> None:
         self._hand = hand
-        self._object = planar.HeldObject(hand.geometry)
+        self._parts = planar.HandScene(hand)
 
     def _image(self, frame: schema.TactileFrame) -> None:
         self._images[frame.finger].log(
@@ -144,95 +145,48 @@ class FoxgloveServer:
         now = stamp if math.isnan(self.time) else max(stamp, self.time)
         self._log.log(line, log_time=_ns(now))
 
-    def _drawn(self, state: dict[str, Any]) -> fm.SceneUpdate:
-        """The hand by a state and the newest truth: each entity whole, empty where it isn't."""
-        hand = self._hand
-        half = hand.geometry.half_separation + 0.012
-        entities = [_entity("palm", [_line(((-half, 0.0), (half, 0.0)), SPRING, 2.4)])]
-        contacts = [planar.touch(state, name) for name in hand.fingers]
-        for name, contact in zip(hand.fingers, contacts, strict=True):
-            q = number(state, name, "q")
-            lines = planar.finger_lines(
-                hand.geometry, FINGERS.index(name), q if math.isfinite(q) else 0.0, contact
-            )
-            entities.append(_finger(name, lines, contact))
-        held = self._object.shown(state, contacts, hand.settings.simulation.object_height)
-        entities.append(_entity("object", [] if held is None else [_line(held, OBJECT, 1.4)]))
-        truth = self._newest.get(schema.TRUTH)
-        true = None if truth is None else planar.true_outline(hand.settings.simulation, truth)
-        entities.append(_entity("simulated", [] if true is None else [_line(true, GOAL, 0.6)]))
-        return fm.SceneUpdate(entities=entities)
 
-
-def _finger(name: str, finger: planar.FingerLines, contact: planar.Touch | None) -> fm.SceneEntity:
-    """One finger with its tip, and where it touches the face and the force's arrow."""
-    colour = COLOURS[name]
-    strips = ((finger.link, 5.2), (finger.base, 2.4), (finger.skin, 1.0))
-    lines = [_line(strip, colour, width) for strip, width in strips]
-    shades = [
-        _colour(between(SPRING, LEVELS["error"], min(4.0 * float(strain), 1.0)))
-        for strain in finger.strain
+def _entity(name: str, part: planar.HandPart) -> fm.SceneEntity:
+    lines = [
+        fm.LinePrimitive(
+            type=fm.LinePrimitiveLineType.LineStrip,
+            thickness=1e-3 * strip.width,
+            points=[fm.Point3(x=float(x), y=float(y)) for x, y in strip.points],
+            color=_colour(strip.colour),
+        )
+        for strip in part.strips
     ]
-    springs = fm.LinePrimitive(
-        type=fm.LinePrimitiveLineType.LineList,
-        thickness=0.6e-3,
-        points=_points(finger.springs.reshape(-1, 2)),
-        colors=[shade for shade in shades for _ in range(2)],
-    )
-    lines.append(springs)
-    if contact is None or finger.face is None or finger.normal is None or finger.push is None:
-        return _entity(name, lines)
-    lines += [_line(finger.face, OBJECT, 2.0), _line(finger.normal, GOAL, 0.7)]
-    at, direction = finger.push
-    length = min(_ARROW * contact.force, _ARROW_LONGEST)
-    half = 0.5 * math.atan2(direction[1], direction[0])
-    arrow = fm.ArrowPrimitive(
-        pose=_pose(at, fm.Quaternion(z=math.sin(half), w=math.cos(half))),
-        shaft_length=0.75 * length,
-        shaft_diameter=1.8e-3,
-        head_length=0.25 * length,
-        head_diameter=4e-3,
-        color=_colour(colour),
-    )
-    label = fm.TextPrimitive(
-        pose=_pose(at + length * direction, fm.Quaternion(w=1.0)),
-        billboard=True,
-        font_size=12.0,
-        scale_invariant=True,
-        color=_colour(colour),
-        text=f"{contact.force:.1f} N",
-    )
-    return _entity(name, lines, [arrow], [label])
-
-
-def _entity(
-    name: str,
-    lines: list[fm.LinePrimitive],
-    arrows: list[fm.ArrowPrimitive] | None = None,
-    texts: list[fm.TextPrimitive] | None = None,
-) -> fm.SceneEntity:
+    arrows, texts = [], []
+    for push in part.pushes:
+        length, half = math.hypot(*push.way), 0.5 * math.atan2(push.way[1], push.way[0])
+        arrows.append(
+            fm.ArrowPrimitive(
+                pose=_pose(push.at, fm.Quaternion(z=math.sin(half), w=math.cos(half))),
+                shaft_length=0.75 * length,
+                shaft_diameter=1.8e-3,
+                head_length=0.25 * length,
+                head_diameter=4e-3,
+                color=_colour(push.colour),
+            )
+        )
+        texts.append(
+            fm.TextPrimitive(
+                pose=_pose(push.at + push.way, fm.Quaternion(w=1.0)),
+                billboard=True,
+                font_size=12.0,
+                scale_invariant=True,
+                color=_colour(push.colour),
+                text=push.text,
+            )
+        )
     return fm.SceneEntity(id=name, frame_id=_FRAME, lines=lines, arrows=arrows, texts=texts)
-
-
-def _line(points: Any, colour: tuple[int, int, int], width: float) -> fm.LinePrimitive:
-    """A strip of points [n, 2] m, ``width`` mm thick."""
-    return fm.LinePrimitive(
-        type=fm.LinePrimitiveLineType.LineStrip,
-        thickness=1e-3 * width,
-        points=_points(points),
-        color=_colour(colour),
-    )
-
-
-def _points(points: Any) -> list[fm.Point3]:
-    return [fm.Point3(x=float(x), y=float(y)) for x, y in points]
 
 
 def _pose(place: planar.FloatArray, turn: fm.Quaternion) -> fm.Pose:
     return fm.Pose(position=fm.Vector3(x=float(place[0]), y=float(place[1])), orientation=turn)
 
 
-def _colour(colour: tuple[int, int, int]) -> fm.Color:
+def _colour(colour: Colour) -> fm.Color:
     red, green, blue = (part / 255.0 for part in colour)
     return fm.Color(r=red, g=green, b=blue, a=1.0)
 

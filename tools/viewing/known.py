@@ -1,23 +1,123 @@
-"""The hand by its settings, from ``hand/settings``.
+"""The hand by its settings, from ``hand/settings``, and its energy landscape U(d, θ) as a picture.
 
 Keys of another version that can't be read keep their defaults, so that the rest is shown.
+
+The picture has θ to the right and d upwards; its coordinates are pixels from the upper left corner,
+as an image's are. Colour goes with the cube root of U, which grows in proportion to d, so that the
+valley along θ = 0 shows at every depth.
 """
 
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
-from softfinger.tools.viewing.landscape import Landscape
+
+FloatArray = NDArray[np.float64]
+
+WIDTH, HEIGHT = 480, 400  # pixels
+THETA_END = math.radians(45.0)  # the picture's, to both sides
+# Dark to light in even steps, from blue over green to yellow: in order in grey, too.
+_RAMP = np.array(
+    [(38, 32, 84), (45, 70, 130), (38, 110, 142), (38, 148, 136), (84, 184, 112), (236, 226, 88)]
+)
+_APART = 0.1  # of the picture's height, from one contour line to the next
+_OUTSIDE = (112, 112, 116)
+_LEVELS = 1e-3 * np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])  # J
+
+
+@dataclass(frozen=True)
+class Contour:
+    """A line of equal energy [J], [n, 2] pixels."""
+
+    energy: float
+    line: FloatArray
+
+
+class Landscape:
+    """The landscape of one tip up to a displacement of ``d_end`` [m]."""
+
+    def __init__(self, table: ContactTable, radius: float, d_end: float) -> None:
+        self._table = table
+        self._radius = radius
+        self.d_end = min(d_end, 0.95 * radius)
+        # Force and energy upright: `energy_of` interpolates them.
+        self._d = np.linspace(1e-6 * radius, self.d_end, 400)
+        upright = table(self._d, np.zeros_like(self._d))
+        self._force, self._energy = np.asarray(upright.force), np.asarray(upright.energy)
+
+    def place(self, d: FloatArray | float, theta: FloatArray | float) -> FloatArray:
+        """Pixels [..., 2] of displacements [m] and angles [rad]; NaN stays NaN."""
+        x = (np.asarray(theta) / THETA_END + 1.0) * 0.5 * WIDTH
+        y = (1.0 - np.asarray(d) / self.d_end) * HEIGHT
+        return np.stack(np.broadcast_arrays(x, y), axis=-1)
+
+    def energy_of(self, force: FloatArray) -> FloatArray:
+        """U [J] of upright contacts that press with ``force`` [N]; NaN beyond the picture."""
+        energy: FloatArray = np.interp(
+            force, self._force, self._energy, left=math.nan, right=math.nan
+        )
+        return energy
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Colours [HEIGHT, WIDTH, 3]; grey where no such contact can be."""
+        theta = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * THETA_END
+        d = (1.0 - (np.arange(HEIGHT) + 0.5) / HEIGHT) * self.d_end
+        depth, angle = np.meshgrid(d, theta, indexing="ij")
+        contact = self._table(depth, angle, edge=True)
+        share = np.cbrt(np.asarray(contact.energy) / self._energy[-1])
+        share = np.clip(share, 0.0, 1.0) * (len(_RAMP) - 1)
+        stops = np.arange(len(_RAMP))
+        colours = [np.interp(share, stops, _RAMP[:, channel]) for channel in range(3)]
+        picture = np.stack(colours, axis=-1)
+        picture[~contact.inside] = _OUTSIDE
+        return picture.astype(np.uint8)
+
+    def contours(self) -> list[Contour]:
+        """Lines of equal energy at round values, as far as the contact's domain goes."""
+        theta = np.linspace(-THETA_END, THETA_END, 121)
+        depth, angle = np.meshgrid(self._d, theta, indexing="ij")
+        energy = np.asarray(self._table(depth, angle, edge=True).energy)
+        contours: list[Contour] = []
+        last = 0.0
+        for level in _LEVELS[self._energy[-1] > _LEVELS]:
+            upright = float(np.interp(level, self._energy, self._d))
+            if upright - last < _APART * self.d_end:
+                continue
+            last = upright
+            # U grows with d: one depth for each angle.
+            d = np.array([np.interp(level, energy[:, k], self._d) for k in range(len(theta))])
+            inside = np.abs(theta) <= Fingertip(self._radius).theta_limit(d)
+            contours.append(Contour(float(level), self.place(d[inside], theta[inside])))
+        return contours
+
+    def ticks(self) -> list[tuple[FloatArray, str]]:
+        """Where the axes' numbers stand [2], and what they say."""
+        ticks = []
+        for degrees in (-40, -20, 0, 20, 40):
+            x, y = self.place(0.0, math.radians(degrees))
+            ticks.append((np.array([x, y + 14.0]), f"{degrees:+d}°" if degrees else "θ = 0°"))
+        step = next((step for step in (1, 2, 5) if self.d_end <= 0.0065 * step), 10)
+        for millimetres in range(0, int(1e3 * self.d_end) + 1, step):
+            x, y = self.place(1e-3 * millimetres, -THETA_END)
+            name = f"{millimetres} mm" if millimetres else "d = 0"
+            ticks.append((np.array([x - 22.0, y]), name))
+        return ticks
+
 
 _TOLERANCE = 1e-6  # relative error of a table for a picture
 

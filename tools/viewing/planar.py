@@ -9,19 +9,42 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import SimulationSettings
+from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.terminal.feed import field, number
+from softfinger.tools.terminal import feed
+from softfinger.tools.terminal.feed import number
+from softfinger.tools.viewing.known import ShownHand
+
+# The left finger is blue, the right one orange, goals are grey: distinguishable for colour-blind
+# people, on light and on dark ground.
+Colour = tuple[int, int, int]
+
+COLOURS = {"left": (51, 136, 221), "right": (230, 126, 0)}
+GOAL = (140, 140, 140)
+OBJECT = (0, 158, 115)
+LATE = (204, 96, 150)
+SPRING = (150, 150, 150)
+LEVELS = {"info": (120, 120, 120), "warning": (214, 140, 0), "error": (214, 54, 40)}
+
+
+def between(first: Colour, second: Colour, share: float) -> Colour:
+    """A mixture of two colours with ``share`` of the second."""
+    red, green, blue = (round(a + share * (b - a)) for a, b in zip(first, second, strict=True))
+    return red, green, blue
+
 
 FloatArray = NDArray[np.float64]
 
+_ARROW = 1.6e-3  # m of a force's arrow a newton
+_ARROW_LONGEST = 0.045  # m
 SPRINGS = 17  # drawn in a tip, of the continuum that the model has
 _ANGLES = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 
@@ -37,7 +60,7 @@ class Touch:
 
 def touch(state: dict[str, Any] | None, name: str) -> Touch | None:
     """One tip's contact in a ``hand/state``, None where there is none."""
-    if field(state, name, "contact") is not True:
+    if feed.field(state, name, "contact") is not True:
         return None
     d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))
     if not (math.isfinite(d) and math.isfinite(theta) and d > 0.0):
@@ -136,7 +159,7 @@ class HeldObject:
         """Its outline [5, 2] m by a ``hand/state``; None, and lost, where both don't hold it."""
         left, right = contacts if len(contacts) == 2 else (None, None)
         width = number(state, "object", "width")
-        valid = field(state, "object", "valid") is True and math.isfinite(width)
+        valid = feed.field(state, "object", "valid") is True and math.isfinite(width)
         if left is None or right is None or not valid:
             self.lose()
             return None
@@ -191,6 +214,77 @@ def true_outline(simulated: SimulationSettings, truth: dict[str, Any]) -> FloatA
     cosine, sine = math.cos(angle), math.sin(angle)
     turned: FloatArray = own @ np.array([(cosine, sine), (-sine, cosine)]) + (x, y)
     return turned if np.isfinite(turned).all() else None
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A line to draw: points [n, 2] m, colour, and ``width`` [mm]."""
+
+    points: FloatArray
+    colour: Colour
+    width: float
+
+
+@dataclass(frozen=True)
+class Push:
+    """A force's arrow: from where, its way [2] m, and what stands at its end."""
+
+    at: FloatArray
+    way: FloatArray
+    text: str
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class HandPart:
+    """A part of the picture, empty where it isn't there now."""
+
+    strips: list[Strip]
+    pushes: list[Push] = field(default_factory=list)
+
+
+class HandScene:
+    """The moving hand: its parts by name, always all of them."""
+
+    def __init__(self, hand: ShownHand) -> None:
+        self._hand = hand
+        self.held = HeldObject(hand.geometry)
+
+    def parts(self, state: dict[str, Any]) -> dict[str, HandPart]:
+        """All but the simulated object, by a ``hand/state``."""
+        hand = self._hand
+        half = hand.geometry.half_separation + 0.012
+        parts = {"palm": HandPart([Strip(np.array([(-half, 0.0), (half, 0.0)]), SPRING, 2.4)])}
+        contacts = [touch(state, name) for name in hand.fingers]
+        for name, contact in zip(hand.fingers, contacts, strict=True):
+            q = number(state, name, "q")
+            index, angle = FINGERS.index(name), q if math.isfinite(q) else 0.0
+            parts[name] = _part(finger_lines(hand.geometry, index, angle, contact), name, contact)
+        outline = self.held.shown(state, contacts, hand.settings.simulation.object_height)
+        parts["object"] = HandPart([] if outline is None else [Strip(outline, OBJECT, 1.4)])
+        return parts
+
+    def simulated(self, truth: dict[str, Any] | None) -> HandPart:
+        """The simulated object's true pose, by a ``hand/truth`` if there is any."""
+        outline = None if truth is None else true_outline(self._hand.settings.simulation, truth)
+        return HandPart([] if outline is None else [Strip(outline, GOAL, 0.6)])
+
+
+def _part(finger: FingerLines, name: str, contact: Touch | None) -> HandPart:
+    """One finger with its tip, and where it touches the face and the force's arrow."""
+    colour = COLOURS[name]
+    lines = ((finger.link, 5.2), (finger.base, 2.4), (finger.skin, 1.0))
+    strips = [Strip(line, colour, width) for line, width in lines]
+    for spring, strain in zip(finger.springs, finger.strain, strict=True):
+        share = min(4.0 * float(strain), 1.0)
+        shade = between(SPRING, LEVELS["error"], share)
+        strips.append(Strip(spring, shade, 0.5 + 0.7 * share))
+    if contact is None or finger.face is None or finger.normal is None or finger.push is None:
+        return HandPart(strips)
+    strips += [Strip(finger.face, OBJECT, 2.0), Strip(finger.normal, GOAL, 0.7)]
+    at, direction = finger.push
+    way = min(_ARROW * contact.force, _ARROW_LONGEST) * direction
+    return HandPart(strips, [Push(at, way, f"{contact.force:.1f} N", colour)])
 
 
 # A picture's coordinates are cells: x along the columns, y along the rows, from the corner of the

@@ -8,9 +8,8 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from softfinger.tools.viewing.colours import COLOURS, GOAL, LATE, OBJECT
-from softfinger.tools.viewing.known import ShownHand
-from softfinger.tools.viewing.landscape import HEIGHT, WIDTH
+from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand
+from softfinger.tools.viewing.planar import COLOURS, GOAL, LATE, OBJECT
 
 TIME = "time"  # the timeline: Unix time of the daemon
 SECONDS = 12.0  # of the past in the plots
