@@ -114,8 +114,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not (called or words[0].startswith("-")):
         import difflib
 
-        near = difflib.get_close_matches(words[0], SUBCOMMANDS, n=1, cutoff=0.0)
-        parser.error(f"found {words[0]!r}, expected a subcommand; nearest: {near[0]}")
+        near = difflib.get_close_matches(words[0], SUBCOMMANDS, n=1)
+        hint = f"nearest: {near[0]}" if near else "`softfinger help` lists them"
+        parser.error(f"found {words[0]!r}, expected a subcommand; {hint}")
     arguments = parser.parse_args(words)
     module = modules[called]
     try:

@@ -15,10 +15,11 @@ _EXTRAS = {  # what the message says, and the modules
     "view": ("the viewer needs rerun-sdk from 0.32 on", ("rerun", "rerun_cli")),
     "foxglove": ("Foxglove's server needs foxglove-sdk and orjson", ("foxglove", "orjson")),
     "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
+    "gym": ("the environments need gymnasium", ("gymnasium",)),
 }
 
 
-class MissingExtra(SoftfingerError):
+class MissingExtra(SoftfingerError, ImportError):
     """A package that an extra installs is missing. The message says what to install."""
 
 

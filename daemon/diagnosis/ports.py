@@ -17,7 +17,7 @@ from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.port import latency_file
+from softfinger.daemon.servos.port import bring_it, latency_file
 from softfinger.daemon.wire.keys import load_client
 
 _PROC = Path("/proc")
@@ -47,7 +47,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
     except OSError as error:
         dangling = Path(path).is_symlink()
         why = "leads nowhere" if dangling else (error.strerror or "not found").lower()
-        fix = f"plug the adapter in, or set {key} to one of the ports there are"
+        fix = f"{bring_it(path)}, or set {key} to one of the ports there are"
         return Result("FAIL", path, why, fix)
     if not stat.S_ISCHR(mode.st_mode):
         return Result("FAIL", path, "is not a serial port", f"set {key}")

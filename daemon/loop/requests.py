@@ -61,6 +61,8 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
         numbers[key] = float(value)
     if mode not in heard:
         hint = _FIRST.get(mode) or f"possible while {', '.join(sorted(heard))}"
+        if name == "clear":
+            hint = "there is no fault"
         raise Refused(f"{name}: not while {mode.value}; {hint}")
     return Command(name, numbers, client)
 

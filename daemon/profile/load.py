@@ -103,7 +103,8 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         return {key: _tuples(item) for key, item in raw.items()}
     except OSError as error:
-        raise SettingsError(f"{name}: can't be read: {error.strerror}") from None
+        hint = f"; {path.stem} alone names the packaged one" if path.stem in names() else ""
+        raise SettingsError(f"{name}: can't be read: {error.strerror}{hint}") from None
     except UnicodeDecodeError as error:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:

@@ -129,11 +129,16 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         )
 
 
+def bring_it(path: str) -> str:
+    """What brings a port that is not there: outside /dev it is an emulated hand's."""
+    return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
+
+
 def _why_not(path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code == errno.ENOENT or not Path(path).exists():
         return (
-            f"{path}: no such port: plug the adapter in, or set servos.port; "
+            f"{path}: no such port: {bring_it(path)}, or set servos.port; "
             "`softfinger doctor` lists the ports there are"
         )
     if code == errno.EACCES:

@@ -6,7 +6,11 @@ Importing this registers them, and the hand is loaded when the first is made:
 
 from __future__ import annotations
 
-from gymnasium.envs.registration import register
+from softfinger.tools.extras import require
+
+require("gym")
+
+from gymnasium.envs.registration import register  # noqa: E402 - after what says how to install it
 
 TASKS = ("grasp", "rotate", "push")
 SECONDS = 4.0  # of an episode

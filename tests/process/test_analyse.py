@@ -153,6 +153,9 @@ def test_frames_alone_need_settings_that_fit(
     assert done.returncode == 2
     assert "small.npy: frames of 5 × 5 cells, expected 44 × 44: set tactile.rows" in done.stderr
     assert list(tmp_path.iterdir()) == [path]
+    np.save(tmp_path / "one.npy", counts[-1])
+    done = inline("analyse", tmp_path / "one.npy", "--config", "paper")
+    assert (done.returncode, done.stderr) == (0, "")  # no word of the drawing's about one point
 
 
 def test_wrong_settings_and_a_missing_extra(

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
+from softfinger import Hand
 from tests.harness.daemon_process import Running
 
 Start = Callable[..., Running]
@@ -33,6 +34,8 @@ def test_grasp_and_turn(
     daemon = start("--config", str(profile("")))
     stream, commands = addresses
     picture = tmp_path / "picture.png"
+    with Hand(stream, commands) as hand:  # a program before it, as the README's, left it armed
+        hand.arm()
     done = example("--stream", stream, "--commands", commands, "--picture", str(picture))
     assert done.returncode == 0, done.stderr
     assert re.sub(r"no hand/state from .* yet, waiting up to .* s\n", "", done.stderr) == ""

@@ -159,7 +159,8 @@ def test_the_wrong_rate_is_met_with_silence(running: Callable[..., RunningBus]) 
 
 
 def test_ports_that_can_not_be_used(bus: RunningBus) -> None:
-    assert "no such port" in refusal("/dev/does-not-exist")[0]
+    assert "no such port: plug the adapter in" in refusal("/dev/does-not-exist")[0]
+    assert "no such port: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
     first = connected(bus)
     assert "in use by another process" in refusal(bus.path)[0]
     reading = Reading()

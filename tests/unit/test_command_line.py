@@ -21,9 +21,10 @@ def test_no_words_name_the_first_steps_and_help_all_subcommands(inline: Inline) 
     assert shown.returncode == 0
     assert all(f"\n    {name}" in shown.stdout for name in SUBCOMMANDS)
     assert "Exit status: 0 " in shown.stdout
-    wrong = inline("recrod", "run.mcap")
-    assert wrong.returncode == 2
-    assert "found 'recrod', expected a subcommand; nearest: record" in wrong.stderr
+    for word, hint in (("recrod", "nearest: record"), ("7", "`softfinger help` lists them")):
+        wrong = inline(word, "run.mcap")
+        assert wrong.returncode == 2
+        assert f"found {word!r}, expected a subcommand; {hint}" in wrong.stderr
 
 
 @pytest.mark.parametrize(

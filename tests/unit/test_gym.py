@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+import softfinger.gym
 from softfinger.gym import TASKS
 from softfinger.gym.__main__ import at_random, by_law, episode
 from softfinger.gym.environment import SoftFingerEnv
@@ -19,6 +23,14 @@ def test_gymnasiums_checker_has_nothing_to_say(task: str) -> None:
     env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
+
+
+def test_without_gymnasium_the_import_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(ImportError, match=r"pip install 'softfinger\[gym\]'"):
+        importlib.reload(softfinger.gym)
 
 
 def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:

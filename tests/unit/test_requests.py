@@ -42,6 +42,7 @@ def test_a_good_request_is_parsed() -> None:
         ({"command": "rotate"}, Mode.HOLDING, "rotate: angle is missing"),
         ({"command": "grasp"}, Mode.DISARMED, "grasp: not while disarmed; arm first"),
         ({"command": "arm"}, Mode.FAULT, "arm: not while fault; clear the fault first"),
+        ({"command": "clear"}, Mode.DISARMED, "clear: not while disarmed; there is no fault"),
         ({"command": "rotate", "angle": 0.1}, Mode.ARMED, "possible while grasping, holding, r"),
         ({"command": "arm", "client": 7}, Mode.DISARMED, "client: expected a text"),
         ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),

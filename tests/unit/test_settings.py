@@ -157,6 +157,8 @@ def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path: Path) -> None:
         load(path)
     with pytest.raises(SettingsError, match=r"absent\.toml: can't be read"):
         load(tmp_path / "absent.toml")
+    with pytest.raises(SettingsError, match=r"No such file .*; hil alone names the packaged one"):
+        load(tmp_path / "config" / "hil.toml")
 
 
 def test_dir_fills_the_ports(tmp_path: Path) -> None:

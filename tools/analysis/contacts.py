@@ -226,7 +226,14 @@ def draw(contacts: list[Contacts], title: str, path: Path) -> None:
                 shown = np.where(sound, each.values[value] * factor, np.nan)
                 colour = style.KINDS[k]
                 line = "-" if k == 0 else (0, (5, 1.5))
-                panel.plot(each.t, shown, color=colour, linestyle=line, label=each.finger)
+                panel.plot(
+                    each.t,
+                    shown,
+                    color=colour,
+                    linestyle=line,
+                    marker="o" if each.t.size == 1 else "",
+                    label=each.finger,
+                )
                 if spread:
                     band = 2.0 * factor * each.values[spread]
                     panel.fill_between(
@@ -245,7 +252,6 @@ def draw(contacts: list[Contacts], title: str, path: Path) -> None:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper right", ncols=4)
         axes[-1].set_xlabel("time [s]")
-        axes[-1].set_xlim(
-            0.0, max([float(each.t.max()) for each in contacts if each.t.size] or [1])
-        )
+        last = max((float(each.t.max()) for each in contacts if each.t.size), default=0.0)
+        axes[-1].set_xlim(0.0, last or 1.0)  # a single frame is at 0
         style.save(figure, path)

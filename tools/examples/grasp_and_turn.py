@@ -38,7 +38,7 @@ def settled(state: HandState) -> bool:
 
 
 recorded: list[HandState] = []
-with Hand(where.stream, where.commands, client="grasp_and_turn") as hand:
+with Hand(where.stream, where.commands) as hand:
     with hand.stream(hand.timeout) as states:
         recorded.append(next(states))  # the stream is there before anything moves
         try:
