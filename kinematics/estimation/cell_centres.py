@@ -117,6 +117,15 @@ def sums_inside(
 
 
 @fast_inner_kernel
+def _any_reads(frame: Pointer, start: int, level: float) -> bool:
+    """Whether one of 64 cells does, in reach or not: half of the memory."""
+    found = False
+    for k in range(start, start + 64):
+        found |= frame[k] >= level
+    return found
+
+
+@fast_inner_kernel
 def _any_of_64(frame: Pointer, height: Pointer, start: int, level: float) -> bool:
     found = False
     for k in range(start, start + 64):
@@ -135,7 +144,9 @@ def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool
 @fast_inner_kernel
 def next_above(frame: Pointer, height: Pointer, start: int, last: int, level: float) -> int:
     """The first cell in start..last that reads ``level`` or more; ``last`` if there is none."""
-    while start + 64 <= last and not _any_of_64(frame, height, start, level):
+    while start + 64 <= last and not (
+        _any_reads(frame, start, level) and _any_of_64(frame, height, start, level)
+    ):
         start += 64
     while start + 8 <= last and not _any_of_8(frame, height, start, level):
         start += 8

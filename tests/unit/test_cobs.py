@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from softfinger.daemon.tactile.cobs import CobsDecoder, encode, longest_frame, unstuff
+from softfinger.daemon.tactile.cobs import CobsDecoder, crc16, encode, longest_frame, unstuff
 from softfinger.daemon.tactile.serial_reader import SensorClock
 
 
@@ -72,6 +72,13 @@ def test_a_packet_is_refused_or_right(packet):
     found = unstuffed(packet)
     # A last block of 254 bytes may have an empty one behind it, which the shortest form leaves out.
     assert found is None or packet in (plain_stuff(found), plain_stuff(found) + b"\x01")
+
+
+@given(st.binary(max_size=80))
+def test_the_crc_is_its_definitions(message):
+    assert crc16(np.frombuffer(bytearray(message + b"\x01"), np.uint8), len(message)) == plain_crc(
+        message
+    )
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
