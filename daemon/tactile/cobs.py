@@ -88,11 +88,11 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     ``out`` needs the packet's length. Returns the message's, or -1 where the packet ends within a
     block. No branch depends on the bytes, whose zeros nothing foresees.
     """
-    code = _BLOCK + 1  # of the block at work
-    left = 0  # bytes of it still to come
+    code = np.int64(_BLOCK + 1)  # of the block at work
+    left = np.int64(0)  # bytes of it still to come
     size = 0
     for byte in packet:
-        value = int(byte)
+        value = np.int64(byte)
         inside = left > 0
         out[size] = value if inside else 0
         size += 1 if inside | (code <= _BLOCK) else 0
