@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -84,18 +83,3 @@ class Watched:
             normal = self._friction * np.maximum(plant.normal, 1e-9)
             used = np.where(plant.normal > 0.1, np.abs(plant.tangential) / normal, 0.0)
             yield self.now, tuple(plant.force), float(plant.object_pose[2]), float(used.max())
-
-
-def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> float:
-    """Push the object along its faces from ``start`` to ``force`` [N], ``rate`` [N/s].
-
-    Positive is away from the palm; the push stays. Returns the largest share of friction used.
-    """
-    dt, used = 0.02, 0.0
-    count = max(round(abs(force - start) / (rate * dt)), 1)
-    for k in range(1, count + 1):
-        now = start + (force - start) * k / count
-        angle = float(hand.plant.object_pose[2])
-        hand.plant.push(-now * math.sin(angle), now * math.cos(angle))
-        used = max(used, float(hand.watch(dt).slip.max()))
-    return used

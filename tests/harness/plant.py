@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools.watched import Watched
 
 MODULUS = 0.304e6
 WIDTH = 0.040
@@ -50,3 +53,18 @@ def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) ->
     for joint in range(2):
         hand.drive(joint, BOUNDED, True, goals[joint], current)
     run(hand, seconds)
+
+
+def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> float:
+    """Push the object along its faces from ``start`` to ``force`` [N], ``rate`` [N/s].
+
+    Positive is away from the palm; the push stays. Returns the largest share of friction used.
+    """
+    dt, used = 0.02, 0.0
+    count = max(round(abs(force - start) / (rate * dt)), 1)
+    for k in range(1, count + 1):
+        now = start + (force - start) * k / count
+        angle = float(hand.plant.object_pose[2])
+        hand.plant.push(-now * math.sin(angle), now * math.cos(angle))
+        used = max(used, float(hand.watch(dt).slip.max()))
+    return used

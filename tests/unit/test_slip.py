@@ -13,7 +13,7 @@ from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import ObjectPose, Reading
 from softfinger.tools.watched import Watched as Hand
-from softfinger.tools.watched import push_along
+from tests.harness.plant import push_along
 from tests.unit.test_control import PAPER, grasped
 
 FORCE = 10.0

@@ -13,8 +13,8 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_share, upright_spring
-from softfinger.tools.watched import Watched, push_along
-from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make
+from softfinger.tools.watched import Watched
+from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
 LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
 START = math.radians(5.0)

@@ -216,8 +216,6 @@ def _histogram(panel: Axes, values: FloatArray) -> None:
     if wide:
         edges = np.geomspace(low, high * 1.0001, _BINS + 1)
         panel.set_xscale("log")
-        if high < 100.0 * low:  # else the decades are enough
-            _name_ticks(panel, low, high)
     else:
         reach = max(high - low, 0.02 * high)
         edges = np.linspace(low - 0.02 * reach, high + 0.02 * reach, _BINS + 1)
@@ -237,43 +235,18 @@ def _histogram(panel: Axes, values: FloatArray) -> None:
     panel.set_ylim(top=panel.get_ylim()[1] * 12.0)  # room for the legend
 
 
-def _name_ticks(panel: Axes, low: float, high: float) -> None:
-    """Few round numbers on a logarithmic axis of less than two decades."""
-    from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
-
-    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    parts = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if high < 4.0 * low else (1.0, 2.0, 5.0)
-    round_numbers = np.concatenate([part * decades for part in parts])
-    shown = np.sort(round_numbers[(round_numbers >= low) & (round_numbers <= high)])
-    panel.xaxis.set_major_locator(FixedLocator(shown.tolist()))
-    panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    panel.xaxis.set_minor_locator(NullLocator())
-    panel.xaxis.set_minor_formatter(NullFormatter())
-
-
 def _table(panel: Axes, stats: dict[str, Any]) -> None:
     panel.set_axis_off()
-    rows = []
-    for part in _PARTS:
-        times = stats.get(part)
-        known = times if isinstance(times, dict) else {}
-        rows.append([_shown(known.get(share)) for share, _ in _SHARES])
-    table = panel.table(
-        rows,
+    parts = [each if isinstance(each := stats.get(part), dict) else {} for part in _PARTS]
+    panel.table(
+        [[_shown(times.get(share)) for share, _ in _SHARES] for times in parts],
         rowLabels=list(_PARTS),
         colLabels=[f"{title} [µs]" for _, title in _SHARES],
         loc="center",
-        cellLoc="right",
         edges="horizontal",
     )
-    table.auto_set_font_size(False)
-    table.set_fontsize(7.5)
-    for cell in table.get_celld().values():
-        cell.set_linewidth(0.5)
     ticks, overruns = stats.get("ticks"), stats.get("overruns")
-    panel.set_title(
-        f"all ticks since the daemon's start: {ticks} ticks, {overruns} overruns", fontsize=8.0
-    )
+    panel.set_title(f"all ticks since the daemon's start: {ticks} ticks, {overruns} overruns")
 
 
 def _shown(value: object) -> str:

@@ -7,7 +7,7 @@ eq. 19 one over a length.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -22,13 +22,9 @@ from softfinger.tools.paper.sheets import (
     Sheet,
     sheet,
 )
-from softfinger.tools.style import GREY, INK, KINDS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from softfinger.tools.style import INK, KINDS
 
 _NODES = 64
-_SHOWN = 8.0  # mm, the drawing's displacement
 _TERMS = ("first", "second", "third")
 
 
@@ -96,44 +92,6 @@ def _appendix() -> tuple[Sheet, ...]:
     return (sheet("fig11", *columns),)
 
 
-def _section(_: Sheet) -> Iterator[DrawnCurve]:
-    """The tip cut along its axis, pressed to 8 mm."""
-    a, h = 1e3 * TIP.radius, 1e3 * TIP.radius - _SHOWN
-    angle = np.linspace(0.0, np.pi, 181)
-    x, z = a * np.cos(angle), a * np.sin(angle)
-    yield DrawnCurve(x, np.minimum(z, h), {"color": INK})
-    above = z >= h
-    yield DrawnCurve(x[above], z[above], {"color": GREY, "linestyle": ":"})
-    yield DrawnCurve([-a, a], [0.0, 0.0], {"color": INK})
-    yield DrawnCurve([-1.1 * a, 1.1 * a], [h, h], {"color": KINDS[1], "linewidth": 0.9})
-    rim = np.sqrt(a**2 - h**2)
-    yield DrawnCurve([0.0, 0.0], [0.0, a], {"color": GREY, "linewidth": 0.7})
-    yield DrawnCurve([0.0, rim], [0.0, h], {"color": KINDS[0], "linewidth": 0.9})
-    yield DrawnCurve([0.0, 0.55 * rim], [0.0, h], {"color": KINDS[0], "linewidth": 0.9})
-
-
-def _names(axes: Axes, _: Sheet) -> None:
-    a, h = 1e3 * TIP.radius, 1e3 * TIP.radius - _SHOWN
-    rim = np.sqrt(a**2 - h**2)
-    arrow = {"arrowstyle": "<->", "lw": 0.7, "color": GREY, "shrinkA": 0, "shrinkB": 0}
-    for start, stop in (
-        ((0.0, h + 1.2), (0.55 * rim, h + 1.2)),
-        ((-4, h), (-4, 0)),
-        ((-4, a), (-4, h)),
-    ):
-        axes.annotate("", start, stop, arrowprops=arrow)
-    for x, y, text in (
-        (0.4, a + 2.5, "r = (a − d) tan θ"),
-        (-9.5, 0.5 * h, "a − d"),
-        (-6.5, 0.45 * (a + h), "d"),
-        (0.8, 0.6 * h, "θ"),
-        (9.0, 0.3 * h, "rim: θ_max"),
-    ):
-        axes.text(x, y, text, fontsize=7.5, color=INK, va="center")
-    axes.plot([5.0, 4.5], [a + 1.4, h + 1.6], color=GREY, linewidth=0.5)
-    axes.set(aspect="equal", ylim=(-1.5, a + 4.5))
-
-
 def _sums(numbers: Sheet) -> Iterator[DrawnCurve]:
     d = numbers["d"]
     for name, color, dash in zip(_TERMS, KINDS, ("--", "-.", ":"), strict=False):
@@ -148,17 +106,10 @@ def _sums(numbers: Sheet) -> Iterator[DrawnCurve]:
 
 PAGES = {
     "fig11": FigurePage(
-        "Fig. 11 and the appendix: U(d, 0) = πEd³/3 from eq. 12's three terms",
-        (7.4, 4.0),
+        "Appendix: U(d, 0) = πEd³/3 from eq. 12's three terms",
+        (5.2, 4.2),
         _appendix,
         (
-            Panel(
-                _section,
-                "r [mm]",
-                "z [mm]",
-                "coordinates of eq. 13, d = 8 mm",
-                annotate=_names,
-            ),
             Panel(
                 _sums,
                 "displacement d [mm]",
@@ -168,7 +119,6 @@ PAGES = {
                 legend={"loc": "upper left", "ncols": 2, "columnspacing": 1.0},
             ),
         ),
-        layout={"width_ratios": (1.0, 1.15)},
         errata=(
             Erratum(
                 "eq. 18",

@@ -6,15 +6,16 @@ another (`loop.warm_up`); parts that need the contact table wait for it.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
-import selectors
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
@@ -66,14 +67,15 @@ def build_kernels(
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels, on the first start only: {names}")
     started = time.monotonic()
-    workers = _Workers(settings, missing, tell, bar)
-    try:
-        workers.work()
-    finally:
-        workers.close()
-    if not workers.failed:
+    build = _Build(settings, missing, tell, Progress("compiling kernels", _kernels(missing), bar))
+    build.run()
+    if not build.failed:
         tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
-    return Built(len(missing), workers.failed)
+    return Built(len(missing), build.failed)
+
+
+def _kernels(missing: list[Part]) -> int:
+    return sum(part.kernels for part in missing)
 
 
 def _jobs(missing: list[Part]) -> int:
@@ -88,47 +90,41 @@ def _available() -> float:
     return 1024.0 * float(rest.split()[0])
 
 
-class _Workers:
-    """The processes and the parts that are left."""
+class _Build:
+    """The parts that are left, and a thread for each process that builds some of them."""
 
-    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: bool) -> None:
+    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
+        self._head = f"{settings.model_dump_json()}\n{table_cache() or ''}\n"
         self._waiting = list(missing)
-        self._total = sum(part.kernels for part in missing)
-        self._begun = 0  # kernels
+        self._under_way: dict[Part, str] = {}  # and the kernel at work
+        self._changed = threading.Condition()
+        self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
-        self._bar = Progress("compiling kernels", self._total, bar)
-        self._tell = tell
-        self.failed = False
-        self._workers: dict[int, _Worker] = {}  # by the file that it is read from
-        self._selector = selectors.DefaultSelector()
+        self._bar, self._tell = bar, tell
+        self._processes: list[subprocess.Popen[str]] = []
+        self.failed = self._over = False
+
+    def run(self) -> None:
+        """Build all parts; when interrupted, end every process."""
+        threads = []
         try:
-            for _ in range(_jobs(missing)):
-                worker = _Worker(settings)
-                self._workers[worker.output] = worker
-                self._selector.register(worker.output, selectors.EVENT_READ)
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        for worker in self._workers.values():
-            worker.close()
-        self._selector.close()
-
-    def work(self) -> None:
-        """Hand out parts until all are built, or no process is left to build them."""
-        with self._bar as show:
-            while self._hand_out():
-                for key, _ in self._selector.select(_LOOK):
-                    worker = self._workers[key.fd]
-                    lines = worker.read()
-                    if lines is None:
-                        self._lost(worker)
-                    else:
-                        for line in lines:
-                            self._take(worker, line)
-                at = "; ".join(filter(None, (each.at for each in self._workers.values())))
-                show(self._begun, f"{self._so_far()}: {at}")
+            for _ in range(_jobs(self._waiting)):
+                self._processes.append(_start())
+                threads.append(threading.Thread(target=self._work, args=self._processes[-1:]))
+                threads[-1].start()
+            with self._bar as show:
+                while alive := [each for each in threads if each.is_alive()]:
+                    alive[0].join(_LOOK)
+                    at = "; ".join(f"{part.name}: {k}" for part, k in list(self._under_way.items()))
+                    show(self._begun, f"{self._so_far()}: {at}")
+            for part in self._waiting:
+                self._fail(part, "no process is left to build it")
+        finally:
+            self._over = True
+            for process in self._processes:
+                process.kill()
+            for thread in threads:
+                thread.join()
 
     def _so_far(self) -> str:
         return (
@@ -136,100 +132,80 @@ class _Workers:
             f"{time.monotonic() - self._started:.0f} s"
         )
 
-    def _hand_out(self) -> bool:
-        """Give each idle process the next part that need not wait; False when none has one."""
-        for worker in self._workers.values():
-            if worker.part is not None:
-                continue
-            under_way = {each.part.name for each in self._workers.values() if each.part}
-            under_way.update(part.name for part in self._waiting)
-            free = [part for part in self._waiting if part.after not in under_way]
-            if free:
-                self._waiting.remove(free[0])
-                worker.build(free[0])
-        return any(worker.part is not None for worker in self._workers.values())
+    def _work(self, process: subprocess.Popen[str]) -> None:
+        """Hand parts to a process until none is left, or it has ended."""
+        assert process.stdin is not None
+        assert process.stdout is not None
+        part = None
+        try:
+            process.stdin.write(self._head)
+            while part := self._next():
+                process.stdin.write(f"{part.name}\n")
+                process.stdin.flush()
+                self._follow(part, process.stdout)
+        except BrokenPipeError:
+            pass
+        process.kill()
+        status = process.wait()
+        if part is not None:
+            self._done(part, f"its process ended with status {status}")
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        process.stdout.close()
 
-    def _take(self, worker: _Worker, line: str) -> None:
-        word, _, rest = line.partition(" ")
-        if word == "kernel":
-            self._begun += 1
-            worker.kernel = rest
-        elif word in ("done", "failed") and worker.part is not None:
-            if word == "failed":
-                self._fail(worker.part, rest)
-            elif not self._bar.on:
-                self._tell("info", "compile", f"{worker.part.name}: {self._so_far()}")
-            worker.part = None
+    def _next(self) -> Part | None:
+        """The next part that need not wait for one that is waiting or under way; None: no more."""
+        with self._changed:
+            while self._waiting:
+                names = {part.name for part in (*self._waiting, *self._under_way)}
+                free = [part for part in self._waiting if part.after not in names]
+                if free:
+                    self._waiting.remove(free[0])
+                    self._under_way[free[0]] = ""
+                    return free[0]
+                self._changed.wait()
+        return None
 
-    def _lost(self, worker: _Worker) -> None:
-        self._selector.unregister(worker.output)
-        status = worker.close()
-        del self._workers[worker.output]
-        if worker.part is not None:
-            self._fail(worker.part, f"its process ended with status {status}")
+    def _follow(self, part: Part, output: IO[str]) -> None:
+        """Read what a process says of a part, until it is built. Raises BrokenPipeError."""
+        for line in output:
+            word, _, rest = line.rstrip("\n").partition(" ")
+            if word == "kernel":
+                self._begun += 1
+                self._under_way[part] = rest
+            else:
+                return self._done(part, rest if word == "failed" else "")
+        raise BrokenPipeError
+
+    def _done(self, part: Part, failure: str) -> None:
+        with self._changed:
+            del self._under_way[part]
+            self._changed.notify_all()
+        if failure:
+            self._fail(part, failure)
+        elif not self._bar.on:
+            self._tell("info", "compile", f"{part.name}: {self._so_far()}")
 
     def _fail(self, part: Part, reason: str) -> None:
+        if self._over:  # interrupted
+            return
         self.failed = True
         self._tell("warning", "compile", f"{part.name} was not compiled ahead: {reason}")
 
 
-class _Worker:
-    """One process, which runs `main`."""
-
-    def __init__(self, settings: Settings) -> None:
-        # -P: a folder named tools where this was started is not ours.
-        command = [sys.executable, "-P", "-m", "softfinger.tools.processes.kernel_build"]
-        path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": path},
-            process_group=0,  # Ctrl-C is for this process, which ends it
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._input, self._output = self._process.stdin, self._process.stdout
-        self.output = self._output.fileno()
-        self.part: Part | None = None
-        self.kernel = ""
-        self._rest = b""
-        self._send(f"{settings.model_dump_json()}\n{table_cache() or ''}\n")
-
-    @property
-    def at(self) -> str:
-        """Part and kernel that it is compiling."""
-        return "" if self.part is None else f"{self.part.name}: {self.kernel}"
-
-    def build(self, part: Part) -> None:
-        self.part, self.kernel = part, ""
-        self._send(f"{part.name}\n")
-
-    def _send(self, text: str) -> None:
-        try:
-            self._input.write(text.encode())
-            self._input.flush()
-        except BrokenPipeError:
-            pass  # it has died, which `read` finds
-
-    def read(self) -> list[str] | None:
-        """The lines that have come; None when it has ended."""
-        data = os.read(self.output, 65536)
-        if not data:
-            return None
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        return [line.decode() for line in lines]
-
-    def close(self) -> int:
-        """End it; its exit status."""
-        self._process.kill()
-        status = self._process.wait()
-        try:
-            self._input.close()
-        except BrokenPipeError:
-            pass
-        self._output.close()
-        return status
+def _start() -> subprocess.Popen[str]:
+    """A process that runs `main`."""
+    # -P: a folder named tools where this was started is not ours.
+    command = [sys.executable, "-P", "-m", "softfinger.tools.processes.kernel_build"]
+    path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": path},
+        text=True,
+        process_group=0,  # Ctrl-C is for this process, which ends it
+    )
 
 
 def main() -> None:
