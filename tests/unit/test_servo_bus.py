@@ -286,6 +286,28 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
     assert run() == run()
 
 
+def test_a_reading_may_lag_behind_the_plant_but_neither_writes_nor_watchdogs_do() -> None:
+    c = client(prepared=True)
+    bus = c.bus
+    bus.lag = 0.0005
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.BUS_WATCHDOG, 1, 1)
+    t = bus.now
+
+    def read(after: float) -> float:
+        ask = framing.frame(1, framing.READ, struct.pack("<HH", reg.BUS_WATCHDOG, 1))
+        assert bus.feed(ask, t + after)
+        return bus.now - t
+
+    assert read(0.0004) == 0.0
+    assert read(0.0006) == pytest.approx(0.0006)
+    bus.feed(framing.frame(1, framing.WRITE, struct.pack("<HH", reg.GOAL_CURRENT, 5)), t + 0.001)
+    assert bus.now - t == pytest.approx(0.001)
+    bus.advance(t + 0.0208)
+    assert read(0.021) == pytest.approx(0.021)
+    assert bus.servos[0].report(bus.now)["stopped_by_watchdog"]
+
+
 # --- anything at all -------------------------------------------------------------------------
 
 

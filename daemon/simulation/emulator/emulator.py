@@ -2,7 +2,8 @@
 
 One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
 due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
-before it looks for bytes again.
+before it looks for bytes again. Where requests come at even intervals, slower things wait until the
+next one is answered.
 """
 
 from __future__ import annotations
@@ -226,14 +227,23 @@ class Emulator:
     # --- the event loop --------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
+        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most.
+
+        Shortly before a request is expected the hand is brought up to date, and nothing slow is
+        begun until it has come: its reply waits for no physics.
+        """
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
+        start = self.clock.now()
         if servos is not None:
+            begin, end = servos.rush
+            if start < begin:
+                due = min(due, begin)
+            elif start < end:
+                due = max(due, end)
             due = min(due, servos.next_event())
         if self._watched is None:
             self._watched = self._watch()
-        start = self.clock.now()
         ready, _, _ = select.select(self._watched, (), (), max(due - start, 0.0))
         t = self.clock.now()
         if servos is not None and (servos.fileno() in ready or servos.next_event() <= t):
@@ -244,6 +254,10 @@ class Emulator:
             elif isinstance(each, socket.socket):
                 self._control.serve([each])
                 self._watched = None
+        if servos is not None and servos.rush[0] <= t < servos.rush[1]:
+            if start < servos.rush[0]:
+                self._advance(t)
+            return
         late = [board for board in boards if board.next_event() <= t]
         if late:
             self._advance(t)

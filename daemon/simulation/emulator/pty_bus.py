@@ -8,7 +8,6 @@ ever loses, does not count.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import heapq
 import math
@@ -31,6 +30,13 @@ _GAP = 0.02  # s of silence within a packet that drop it: the reader may be held
 # s: about what a pseudo-terminal takes from one process's write to the other's read, woken by it.
 # A paced bus takes it off both ways, since it stands for a wire that has its own time already.
 PASSAGE = 15e-6
+# s by which what a reading shows may be older than its reply, as in a servo, which measures at
+# intervals of its own: so that the physics is computed beside the exchange, not within it.
+_LAG = 0.0005
+# A client that asks at even intervals, no shorter than _SELDOM, finds the servos waiting from _SOON
+# before each request is expected until _LATE after it [s].
+_SELDOM, _SOON, _LATE = 0.0009, 0.0003, 0.0002
+_NEVER = -math.inf, -math.inf
 _SCHEDSTAT = Path("/proc/thread-self/schedstat")  # ns run, ns waited for a processor, times run
 
 
@@ -70,6 +76,7 @@ class PtyServoBus:
     ) -> None:
         self.bus = bus
         bus.parser.gap = _GAP
+        bus.lag = _LAG
         self._baud = baud
         self._latency = latency
         self._spin = spin
@@ -78,6 +85,10 @@ class PtyServoBus:
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
+        self._asked = -math.inf  # when the last request came
+        # When the next request is likely, by the interval of the last two: from then until then no
+        # longer work ought to be begun.
+        self.rush = _NEVER
         self.plug()
 
     def fileno(self) -> int:
@@ -125,8 +136,12 @@ class PtyServoBus:
                     data = os.read(self._master, _READ_SIZE)
                 except OSError:  # nothing there
                     break
-                self._receive(data, t, arrived)
-                # A client's next request often comes while its last write is being done.
+                if self._receive(data, t, arrived):
+                    expected, often = 2.0 * t - self._asked, t - self._asked < _SELDOM
+                    self.rush = _NEVER if often else (expected - _SOON, expected + _LATE)
+                    self._asked = t
+                    break  # the client takes some time for the reply
+                # Its next request often comes while its last write is being done.
                 arrived = t = max(t, self._clock())
         self.bus.advance(t)
         self._send()
@@ -140,26 +155,30 @@ class PtyServoBus:
         last, self._waited = self._waited, waited
         return t if last is None else min(t, max(since, t - (waited - last)))
 
-    def _receive(self, data: bytes, t: float, arrived: float) -> None:
+    def _receive(self, data: bytes, t: float, arrived: float) -> bool:
+        """Let the servos act on ``data``; whether there is a reply."""
         if not self._baud:
-            for reply in self.bus.exchange(data, t):
+            replies = self.bus.exchange(data, t)
+            for reply in replies:
                 if reply.late:
                     self._queue(t + reply.late, reply.data)
                 else:
                     self._write(reply.data)
-            return
+            return bool(replies)
         baud = self.client_baud()
         if baud <= 0:
-            return
+            return False
         byte_time = _BITS_PER_BYTE / baud
         free_at = max(self._free_at, arrived - PASSAGE) + len(data) * byte_time
-        for reply in self.bus.exchange(data, t, baud):
+        replies = self.bus.exchange(data, t, baud)
+        for reply in replies:
             free_at += reply.delay + len(reply.data) * byte_time
             due = free_at + reply.late
             if self._latency > 0.0:
                 due = math.ceil(due / self._latency) * self._latency
             self._queue(due - PASSAGE, reply.data)
         self._free_at = free_at
+        return bool(replies)
 
     def _queue(self, due: float, data: bytes) -> None:
         heapq.heappush(self._due, (due, self._order, data))
@@ -177,5 +196,7 @@ class PtyServoBus:
 
     def _write(self, data: bytes) -> None:
         # A client that never reads fills the terminal; a wire would lose those bytes too.
-        with contextlib.suppress(BlockingIOError):
+        try:
             os.write(self._master, data)
+        except BlockingIOError:
+            pass

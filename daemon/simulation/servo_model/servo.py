@@ -73,6 +73,7 @@ class EmulatedServo:
         self.firmware = model.firmware if firmware is None else firmware
         self.fast_reads = model.fast_read(self.firmware)  # answers fast sync and fast bulk read
         self.table = ControlTable(model, self.firmware)
+        self._memory = self.table.memory
         self.silent = self.frozen = self.refuses = False
         self.health = ServoHealth(model)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
@@ -91,44 +92,50 @@ class EmulatedServo:
 
     @property
     def id(self) -> int:
-        return self.table.memory[reg.ID]
+        return self._memory[reg.ID]
 
     @property
     def shadow_id(self) -> int:
         """The second ID it obeys without answering; above 252 it has none."""
-        return self.table.memory[reg.SHADOW_ID]
+        return self._memory[reg.SHADOW_ID]
 
     @property
     def baud(self) -> int:
-        return reg.BAUD_RATES[self.table.memory[reg.BAUD_RATE]]
+        return reg.BAUD_RATES[self._memory[reg.BAUD_RATE]]
 
     @property
     def return_delay(self) -> float:
         """Seconds between an instruction and its reply."""
-        return self.table.memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
+        return self._memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
 
     @property
     def status_return_level(self) -> int:
         """0 answers pings only, 1 reads too, 2 everything."""
-        return self.table.memory[reg.STATUS_RETURN_LEVEL]
+        return self._memory[reg.STATUS_RETURN_LEVEL]
 
-    def answers_reads(self, fast: bool) -> bool:
-        """Whether it answers group reads."""
-        return self.status_return_level >= 1 and (self.fast_reads or not fast)
+    def obeys(self, servo_id: int) -> bool:
+        """Whether it does what is asked of ``servo_id``."""
+        return servo_id == self._memory[reg.ID] or servo_id == self._memory[reg.SHADOW_ID]
+
+    def answers_reads(self, servo_id: int, fast: bool) -> bool:
+        """Whether it answers group reads from ``servo_id``."""
+        memory = self._memory
+        asked = memory[reg.ID] == servo_id and memory[reg.STATUS_RETURN_LEVEL] >= 1
+        return asked and (self.fast_reads or not fast)
 
     @property
     def alert(self) -> int:
         """The alert bit of its status packets."""
-        return framing.ALERT if self.table.memory[reg.HARDWARE_ERROR_STATUS] else 0
+        return framing.ALERT if self._memory[reg.HARDWARE_ERROR_STATUS] else 0
 
     @property
     def torque_on(self) -> bool:
         """Whether the motor is driven."""
-        return bool(self.table.memory[reg.TORQUE_ENABLE])
+        return bool(self._memory[reg.TORQUE_ENABLE])
 
     @property
     def mode(self) -> int:
-        return self.table.memory[reg.OPERATING_MODE]
+        return self._memory[reg.OPERATING_MODE]
 
     def awake(self, t: float) -> bool:
         """Whether it hears and answers at time t: neither silent nor rebooting."""
@@ -143,12 +150,13 @@ class EmulatedServo:
 
     def next_event(self) -> float:
         """When :meth:`act` next has something to do [s]."""
-        due = min(self._next_step, self._next_sense)
+        due = self._next_step if self._next_step < self._next_sense else self._next_sense
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
-        ticks = self.table.memory[reg.BUS_WATCHDOG]
-        if 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on:
-            due = min(due, self._watched + ticks * reg.WATCHDOG_UNIT)
+        memory = self._memory
+        ticks = memory[reg.BUS_WATCHDOG]
+        if 0 < ticks <= reg.WATCHDOG_MAX and memory[reg.TORQUE_ENABLE]:
+            return min(due, self._watched + ticks * reg.WATCHDOG_UNIT)
         return due
 
     def act(self, t: float) -> None:
@@ -159,7 +167,7 @@ class EmulatedServo:
                 return
             self._boot_at = -math.inf
             self._start(t)
-        ticks = self.table.memory[reg.BUS_WATCHDOG]
+        ticks = self._memory[reg.BUS_WATCHDOG]
         armed = 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on
         if armed and t >= self._watched + ticks * reg.WATCHDOG_UNIT:
             self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
@@ -180,7 +188,7 @@ class EmulatedServo:
     def read(self, address: int, length: int, t: float) -> bytes | None:
         """The bytes of a span, or None when it does not lie inside the table."""
         table = self.table
-        if not table.holds(address, length) or self.refuses:
+        if self.refuses or not table.holds(address, length):
             return None
         if self.frozen:
             return table.read(address, length)
@@ -195,19 +203,20 @@ class EmulatedServo:
         error, plan = self._checked(address, data)
         if error:
             return error
-        limp = not self.torque_on
+        limp = not self._memory[reg.TORQUE_ENABLE]
         for item, value in plan:
             self.table.put(item, value)
         for item, value in plan:
             if item.address in _EFFECTIVE:
                 self._effect(item.address, value, t)
-        if self.torque_on and self._joint.moves_by_itself():
+        torque = self._memory[reg.TORQUE_ENABLE]
+        if torque and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)
-        if limp and self.torque_on:
+        if limp and torque:
             current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
             goals = self.table.get(reg.GOAL_POSITION), current
             self.recorder.torque_on(t, self._joint, self.mode, goals)
-        elif not limp and not self.torque_on:
+        elif not limp and not torque:
             self.recorder.torque_off(t)
         self._joint.drive()
         return framing.OK
@@ -256,7 +265,7 @@ class EmulatedServo:
         if parameters != _CLEAR_KEY:
             return framing.DATA_RANGE
         self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
-        if self.table.memory[reg.MOVING]:
+        if self._memory[reg.MOVING]:
             return framing.RESULT_FAIL
         shift = self._joint.forget_turns()
         self.table.set(reg.GOAL_POSITION, self.table.get(reg.GOAL_POSITION) - shift)
@@ -282,12 +291,12 @@ class EmulatedServo:
 
     def report(self, t: float) -> dict[str, Any]:
         """Its state, and the record of what it was sent."""
-        ticks = self.table.memory[reg.BUS_WATCHDOG]
+        ticks = self._memory[reg.BUS_WATCHDOG]
         return {
             "id": self.id,
             "torque": self.torque_on,
             "mode": self.mode,
-            "hardware_error": self.table.memory[reg.HARDWARE_ERROR_STATUS],
+            "hardware_error": self._memory[reg.HARDWARE_ERROR_STATUS],
             "watchdog": ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else None,
             "stopped_by_watchdog": ticks == reg.WATCHDOG_ERROR,
             "q": self._joint.goal_angle(self._joint.position()),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import zip_longest
 from operator import and_
 from typing import Any, NamedTuple
@@ -31,9 +31,10 @@ from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
 
-_GROUP_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
-_BULK_READS = frozenset((framing.BULK_READ, framing.FAST_BULK_READ))
-_READS = frozenset((framing.PING, framing.READ, *_GROUP_READS, *_BULK_READS))
+_SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
+_GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
+_FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
+_READS = _GROUP_READS | {framing.PING, framing.READ}
 _TO_ALL = frozenset(  # what a broadcast may ask besides reads, without an answer
     (
         framing.WRITE,
@@ -72,6 +73,9 @@ class ServoBus:
         self.plant = plant
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
+        self.lag = (
+            0.0  # s by which what a reading shows may be older than it, to be answered sooner
+        )
         self.packets = 0  # that came through
         self._now = -math.inf
         self._due = -math.inf  # no servo does anything by itself before then
@@ -143,21 +147,23 @@ class ServoBus:
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
         """As :meth:`feed`, reply by reply with their delays. ``baud`` 0 is heard by every servo."""
-        self.advance(t)
+        if t >= self._due or t > self._now + self.lag:
+            self.advance(t)
         replies: list[TimedReply] = []
         for packet in self.parser.feed(data, t):
             self.packets += 1
-            if self.faults.loses(packet.instruction in _READS):
+            reads = packet.instruction in _READS
+            if self.faults.loses(reads) or not packet.valid:
                 continue
-            if not packet.valid:
-                continue
-            listening = [
-                servo for servo in self.servos if servo.awake(t) and baud in (0, servo.baud)
-            ]
-            for servo in listening:
-                servo.heard(t)
+            if not reads:
+                self.advance(t)
+            listening = []
+            for servo in self.servos:
+                if servo.awake(t) and (not baud or baud == servo.baud):
+                    servo.heard(t)
+                    listening.append(servo)
             replies += self._answers(packet, listening, t)
-            if packet.instruction not in _READS:
+            if not reads:
                 self._due = min([servo.next_event() for servo in self.servos])
         if not self.faults.active:
             return replies
@@ -219,13 +225,8 @@ class ServoBus:
                 answers = [_status(each, *_execute(each, instruction, data, t)) for each in same]
                 replies += _at_once(answers)
             return replies
-        if instruction in _GROUP_READS and len(data) >= 5:
-            address, length = _SPAN.unpack_from(data)
-            wanted = [(servo_id, address, length) for servo_id in data[4:]]
-            return self._group_read(wanted, servos, t, instruction == framing.FAST_SYNC_READ)
-        if instruction in _BULK_READS and len(data) % _ITEM.size == 0:
-            wanted = list(_ITEM.iter_unpack(data))
-            return self._group_read(wanted, servos, t, instruction == framing.FAST_BULK_READ)
+        if instruction in _GROUP_READS:
+            return self._group_read(instruction, data, servos, t)
         if instruction == framing.SYNC_WRITE:
             _write_each(_sync_items(data), servos, t)
         elif instruction == framing.BULK_WRITE:
@@ -238,40 +239,54 @@ class ServoBus:
         return []
 
     def _group_read(
-        self,
-        wanted: list[tuple[int, int, int]],
-        servos: list[EmulatedServo],
-        t: float,
-        fast: bool,
+        self, instruction: int, data: bytes, servos: list[EmulatedServo], t: float
     ) -> list[TimedReply]:
-        if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
-            return []  # an ID may stand in the list once only
+        wanted, piece = _wanted(instruction, data)
+        fast = instruction in _FAST_READS
         replies: list[TimedReply] = []
-        piece = framing.fast_head(1 + sum([length + 4 for _, _, length in wanted]))
         block = b""
         crc, delay = 0, 0.0
         for servo_id, address, length in wanted:
-            same = [servo for servo in servos if servo.id == servo_id and servo.answers_reads(fast)]
+            same = [servo for servo in servos if servo.answers_reads(servo_id, fast)]
             if not same or (fast and len(same) > 1):
                 break
             if not fast:
-                data = struct.pack("<HH", address, length)
+                span = _SPAN.pack(address, length)
                 replies += _at_once(
-                    [_status(servo, *_execute(servo, framing.READ, data, t)) for servo in same]
+                    [_status(servo, *_execute(servo, framing.READ, span, t)) for servo in same]
                 )
                 continue
             # Each CRC goes over all bytes before it, the earlier CRCs too.
-            values = same[0].read(address, length, t)
+            (servo,) = same
+            values = servo.read(address, length, t)
             error = framing.ACCESS if values is None else framing.OK
-            piece += bytes((error | same[0].alert, servo_id)) + (values or bytes(length))
+            piece += bytes((error | servo.alert, servo_id)) + (values or bytes(length))
             crc = crc16(piece, crc)
             block += piece
             piece = crc.to_bytes(2, "little")
-            delay += same[0].return_delay
+            delay += servo.return_delay
         if not block:
             return replies
         # The blocks follow each other as one packet; the delays before them add up.
         return [TimedReply(delay, block + piece)]
+
+
+@lru_cache(maxsize=32)
+def _wanted(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
+    """ID, address and length of each span that a group read asks for, and how a fast reply begins.
+
+    There are none where it is cut, or an ID stands in it twice.
+    """
+    wanted: list[tuple[int, int, int]] = []
+    if instruction not in _SYNC_READS:
+        if len(data) % _ITEM.size == 0:
+            wanted = list(_ITEM.iter_unpack(data))
+    elif len(data) >= 5:
+        address, length = _SPAN.unpack_from(data)
+        wanted = [(servo_id, address, length) for servo_id in data[4:]]
+    if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
+        return [], b""
+    return wanted, framing.fast_head(1 + sum(length + 4 for _, _, length in wanted))
 
 
 def _write_each(
@@ -280,7 +295,7 @@ def _write_each(
     """What a group write asks of each servo: ID, address, data."""
     for servo_id, address, data in items:
         for servo in servos:
-            if servo_id in (servo.id, servo.shadow_id):
+            if servo.obeys(servo_id):
                 servo.write(address, data, t)
 
 

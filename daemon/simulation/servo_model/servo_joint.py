@@ -32,6 +32,7 @@ _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi
 _ARRIVED = 20  # counts from the goal that count as there
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 _MOTION = struct.Struct("<hii")  # registers 126 … 135
+_PROFILE = struct.Struct("<II").unpack_from  # registers 108 … 115: acceleration, velocity
 _U32 = struct.Struct("<I").unpack_from
 _I32 = struct.Struct("<i").unpack_from
 _I16 = struct.Struct("<h").unpack_from
@@ -51,6 +52,7 @@ class ServoJoint:
         self.profile = Profile()
         self._model = model
         self._table = table
+        self._memory = table.memory
         self._plant = plant
         self._joint = joint
         self._scale = scale
@@ -63,7 +65,7 @@ class ServoJoint:
     @property
     def sign(self) -> int:
         """-1 in reverse drive mode."""
-        return -1 if self._table.memory[reg.DRIVE_MODE] & 1 else 1
+        return -1 if self._memory[reg.DRIVE_MODE] & 1 else 1
 
     @property
     def current(self) -> float:
@@ -94,13 +96,14 @@ class ServoJoint:
     def position(self) -> int:
         """Present position in counts, as register 132 has it."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
-        memory = self._table.memory
+        memory = self._memory
         if memory[reg.DRIVE_MODE] & 1:
             within = -within
-        return within + int(_I32(memory, reg.HOMING_OFFSET)[0])
+        (offset,) = _I32(memory, reg.HOMING_OFFSET)
+        return within + int(offset)
 
     def _angle(self, position: float) -> float:
-        within = self.sign * (position - _I32(self._table.memory, reg.HOMING_OFFSET)[0])
+        within = self.sign * (position - _I32(self._memory, reg.HOMING_OFFSET)[0])
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_angle(self, counts: int) -> float:
@@ -119,29 +122,28 @@ class ServoJoint:
 
     def aim(self) -> None:
         """Start the trajectory to the goal position as the profile registers ask."""
-        table, profile = self._table, self.profile
-        if table.memory[reg.OPERATING_MODE] not in POSITION_MODES:
+        memory, profile = self._memory, self.profile
+        if memory[reg.OPERATING_MODE] not in POSITION_MODES:
             return
-        target = float(_I32(table.memory, reg.GOAL_POSITION)[0])
-        speed = _U32(table.memory, reg.PROFILE_VELOCITY)[0]
-        acceleration = _U32(table.memory, reg.PROFILE_ACCELERATION)[0]
+        target = float(_I32(memory, reg.GOAL_POSITION)[0])
+        acceleration, speed = _PROFILE(memory, reg.PROFILE_ACCELERATION)
         if not speed and not acceleration:
             profile.hold(target)
-        elif table.memory[reg.DRIVE_MODE] & 4:
+        elif memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
         else:
             profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
 
     def moves_by_itself(self) -> bool:
         """Whether :meth:`follow` has work while torque is on."""
-        mode = self._table.memory[reg.OPERATING_MODE]
+        mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             return self.profile.busy
         return mode in (reg.VELOCITY_MODE, reg.PWM_MODE)
 
     def follow(self) -> None:
         """One STEP of whatever moves by itself."""
-        mode = self._table.memory[reg.OPERATING_MODE]
+        mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             self.profile.step(STEP)
         elif mode == reg.VELOCITY_MODE:
@@ -153,12 +155,12 @@ class ServoJoint:
 
     def drive(self) -> None:
         """Command the plant as the registers say."""
-        table, joint = self._table, self._joint
-        mode = table.memory[reg.OPERATING_MODE]
-        if not table.memory[reg.TORQUE_ENABLE]:
+        memory, table, joint = self._memory, self._table, self._joint
+        mode = memory[reg.OPERATING_MODE]
+        if not memory[reg.TORQUE_ENABLE]:
             self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
-            bound = abs(_I16(table.memory, reg.GOAL_CURRENT)[0]) * self._model.current_unit
+            bound = abs(_I16(memory, reg.GOAL_CURRENT)[0]) * self._model.current_unit
             goal = self._angle(self.profile.position)
             self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
@@ -188,15 +190,17 @@ class ServoJoint:
         else:  # the register is present load, 0.1 %
             current = round(sign * 1000.0 * self._load * ampere)
         velocity = sign * scale.velocity_counts(plant.dq.item(joint))
-        return max(-32768, min(32767, current)), velocity, self.position()
+        if not -32768 <= current <= 32767:
+            current = -32768 if current < 0 else 32767
+        return current, velocity, self.position()
 
     def refresh_motion(self) -> None:
         """Bring registers 126 … 135 up to date, which is all that most reads ask for."""
-        _MOTION.pack_into(self._table.memory, reg.PRESENT_CURRENT, *self._motion())
+        _MOTION.pack_into(self._memory, reg.PRESENT_CURRENT, *self._motion())
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
         """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
-        profile, memory = self.profile, self._table.memory
+        profile, memory = self.profile, self._memory
         current, velocity, position = self._motion()
         pwm = 0
         if memory[reg.TORQUE_ENABLE]:
