@@ -44,9 +44,20 @@ _SETTINGS = """\
 
 A profile is a TOML file that names what differs from these defaults, the built-in simulated hand.
 Any key may be set for one run, as `--set loop.rate=1000`. SI units; pairs are [left, right].
-Unknown keys, wrong types and numbers out of range are errors, all in one report.
-`softfinger config reference SECTION` prints a section in the terminal, and
-`softfinger config show hil > my.toml` begins a profile of your own.
+The hand's parts are settings, too: one finger or two, sensors without servos, servos without
+sensors.
+
+Unknown keys, wrong types and numbers out of range are errors, all in one report. What only building
+shows is told after that: whether a contact table can reach `table.tolerance`, how far a measured
+law is off its points, and whether a calibration file fits.
+
+`softfinger config reference SECTION` prints a section in the terminal.
+
+## Profiles
+
+`--config hil` finds one of these by its name, wherever softfinger is installed; a path names a
+profile of your own, which `softfinger config show hil > my.toml` begins.
+
 """
 
 
@@ -60,7 +71,7 @@ def configuration() -> str:
         for node in ast.parse(source).body
         if isinstance(node, ast.ClassDef)
     }
-    parts = [_SETTINGS]
+    parts = [_SETTINGS, _head("profile", "what it is"), *_profiles()]
     for section, field in settings.Settings.model_fields.items():
         model: Any = field.annotation
         schema = model.model_json_schema()["properties"] if model.model_fields else {}
@@ -75,6 +86,14 @@ def configuration() -> str:
             meaning = comments[model.__name__].get(key, "")
             parts.append(_row(f"`{key}`", f"`{value}`", allowed, meaning))
     return "".join(parts)
+
+
+def _profiles() -> list[str]:
+    """A row of the table for each profile that comes with the package."""
+    from softfinger.daemon.profile.load import names
+    from softfinger.tools.setup.config import subject
+
+    return [_row(f"`{name}`", subject(Path(name))) for name in names()]
 
 
 def _comments(lines: list[str], node: ast.ClassDef) -> dict[str, str]:
@@ -250,6 +269,8 @@ _LINKS = {
     "CHANGELOG.md": "changelog.md",
     "daemon/wire/STREAM.md": "stream.md",
     "config/sim.toml": "configuration.md",
+    "daemon/control/modes.py": "commands.md",
+    "softfinger/__init__.py": "api.md",
     "tools/examples/grasp_and_turn.py": "example.md",
     "daemon/tactile/cobs.py": "contributing.md#a-tactile-board",
 }

@@ -21,6 +21,7 @@ from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.estimation.calibration import CalibrationError
+from softfinger.tools.arguments import own_runtime_folder
 from softfinger.tools.calibration.calibration_frames import bring
 
 _POSES = {
@@ -124,7 +125,7 @@ def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) 
     """Put ``new`` into the file, or into a copy of the profile; nothing else in it changes."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
-    load(source, arguments.dir, [*arguments.set, *changes])
+    load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])
     before = text = find(source).read_text(encoding="utf-8-sig")
     for section, values in new.items():
         text = put(text, section, values)

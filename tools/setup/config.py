@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "list":
         width = max(map(len, names()))
         for name in names():
-            print(f"{name:{width}}  {_subject(_text(Path(name)))}")
+            print(f"{name:{width}}  {subject(Path(name))}")
     elif arguments.action == "show":
         print(_text(arguments.profile), end="")
     else:
@@ -42,9 +42,9 @@ def _text(profile: Path) -> str:
     return find(profile).read_text(encoding="utf-8-sig")
 
 
-def _subject(text: str) -> str:
+def subject(profile: Path) -> str:
     """The comment that a profile begins with, up to its first stop."""
-    comment = re.match(r"(#.*\n)+", text)
+    comment = re.match(r"(#.*\n)+", _text(profile))
     words = "" if comment is None else comment[0].replace("#", " ")
     return re.split(r"[:.] ", " ".join(words.split()))[0]
 

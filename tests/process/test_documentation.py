@@ -1,0 +1,191 @@
+"""Every block of README and docs runs as it stands: shell, Python, profiles.
+
+A page is run from its top in a folder of its own, beside one simulated hand; `harness.documented`
+is its `softfinger`, and says what is only parsed. Above a block may stand what excuses it:
+
+    <!-- not run: why -->                  it can't be, and why
+    <!-- not run without gymnasium -->     it needs a package that isn't installed here
+    <!-- exits 1: why -->                  its last command has to fail
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import re
+import select
+import shlex
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from softfinger.daemon.client.command_client import send
+from softfinger.daemon.profile.load import find, load
+from softfinger.kinematics.compiled.kernel_folder import kernel_folder
+from tests.conftest import own_addresses
+from tests.harness import documented
+from tests.harness.daemon_process import Running
+
+ROOT = Path(__file__).parents[2]
+SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+PAGES = [page for page in SOURCES if re.search(r"(?m)^ *(```\w|<!--)", page.read_text("utf-8"))]
+USUAL = ("tcp://127.0.0.1:9872", "tcp://127.0.0.1:9873")
+MARK = re.compile(r"^ *<!-- (?:not run|exits)\b.*-->$", re.M)
+REASON = re.compile(r"not run: \S.*|not run without \w+|exits 1: \S.*")
+FENCE = re.compile(r"(?ms)^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$")
+PRINTS = 20  # of a program without an end
+PATIENCE = 300.0  # s for a block
+
+
+class Block(NamedTuple):
+    """A fenced block, the line it begins at, and the mark above it."""
+
+    line: int
+    language: str
+    text: str
+    mark: str
+
+
+def blocks(page: Path) -> list[Block]:
+    """A page's blocks of code. Every mark must stand right above one, and have its form."""
+    text = page.read_text(encoding="utf-8")
+    marks = {found.end() + 1: found[0].strip()[5:-4] for found in MARK.finditer(text)}
+    found = []
+    for fence in FENCE.finditer(text):
+        mark = marks.pop(fence.start(), "")
+        line = text.count("\n", 0, fence.start()) + 1
+        if mark:
+            assert REASON.fullmatch(mark), f"{page.name}:{line}: {mark!r}"
+            assert fence["language"], f"{page.name}:{line}: a mark on a block that isn't run"
+        if fence["language"]:
+            code = textwrap.dedent(fence["text"])
+            found.append(Block(line, fence["language"], code, mark))
+    assert not marks, f"{page.name}: marks above no block: {[*marks.values()]}"
+    return found
+
+
+class Shell:
+    """One shell for a page's blocks, whose variables stay; it tells which commands failed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.log = folder / "shell.log"
+        self._told, told = os.pipe()
+        with self.log.open("w") as log:
+            self._process = subprocess.Popen(
+                ["bash", "--norc"], stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=folder,
+                env=os.environ | {"HOME": str(folder)}, pass_fds=[told], text=True,
+            )  # fmt: skip
+        os.close(told)
+        self._tell = told
+
+    def run(self, text: str) -> str:
+        """The exit statuses that were not 0, and their commands."""
+        (self._folder / "block.sh").write_text(text)
+        assert self._process.stdin is not None
+        print(
+            "failed=; trap 'failed+=\"$? $BASH_COMMAND; \"' ERR; "
+            f'. ./block.sh </dev/null {self._tell}>&-; echo "$failed" >&{self._tell}',
+            file=self._process.stdin,
+            flush=True,
+        )
+        assert select.select([self._told], [], [], PATIENCE)[0], f"too long: {text}"
+        return os.read(self._told, 4096).decode().strip()
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+        os.close(self._told)
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """The one simulated hand, its addresses in the environment."""
+    place = tmp_path_factory.mktemp("hand")
+    place.chmod(0o700)
+    stream, commands = addresses = own_addresses()
+    command = place / "bin" / "softfinger"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m {documented.__name__} "$@"\n')
+    command.chmod(0o755)
+    kernels = kernel_folder()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(place))
+        patch.setenv("SOFTFINGER_ADDRESS", ",".join(addresses))
+        patch.setenv("PATH", f"{command.parent}:{os.environ['PATH']}")
+        patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setenv(documented.REAL_HOME, os.environ.get("HOME", "/"))
+        if kernels is not None:
+            patch.setenv("NUMBA_CACHE_DIR", str(kernels.parent))
+        words = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
+        daemon = Running(*words)
+        yield addresses
+        assert daemon.end() == 0
+
+
+def run_python(text: str, addresses: tuple[str, str]) -> None:
+    """In this process; one that has no end is ended after some lines."""
+    for usual, own in zip(USUAL, addresses, strict=True):
+        text = text.replace(usual, own)
+
+    class Enough(Exception):
+        pass
+
+    lines = iter(range(PRINTS))
+
+    def show(*_: object) -> None:
+        if next(lines, None) is None:
+            raise Enough
+
+    with contextlib.suppress(Enough):
+        exec(compile(text, "block", "exec"), {"__name__": "__main__", "print": show})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_blocks(
+    page: Path, hand: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my.toml").write_text(find(Path("hil")).read_text(encoding="utf-8"))
+    shell = Shell(tmp_path)
+    try:
+        for block in blocks(page):
+            at = f"{page.name}:{block.line}"
+            missing = re.fullmatch(r"not run without (\w+)", block.mark)
+            if missing:
+                assert missing[1] in block.text, f"{at}: {block.mark}: doesn't need it"
+            if block.mark.startswith("not run") and not (
+                missing and importlib.util.find_spec(missing[1])
+            ):
+                parse_only(block, at)
+            elif block.language in ("sh", "bash"):
+                failed = shell.run(block.text)
+                status = 1 if block.mark else 0
+                assert int(failed.split()[0] if failed else 0) == status, (
+                    f"{at}: {failed}\n{shell.log.read_text()}"
+                )
+            elif block.language == "python":
+                run_python(block.text, hand)
+            else:
+                assert block.language == "toml", f"{at}: {block.language}: nothing runs this"
+                Path("block.toml").write_text(block.text)
+                load(Path("block.toml"))
+    finally:
+        shell.close()
+        send(hand[1], {"command": "stop"}, timeout=120.0)
+
+
+def parse_only(block: Block, at: str) -> None:
+    """A marked block's own commands and code are at least words that are understood."""
+    if block.language == "python":
+        compile(block.text, at, "exec")
+    for line in block.text.replace("\\\n", "").splitlines():
+        if line.startswith("softfinger "):
+            words = shlex.split(line, comments=True)[1:]
+            documented.parse([word for word in words if not re.fullmatch(r"\$\w+", word)])

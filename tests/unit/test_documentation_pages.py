@@ -1,0 +1,68 @@
+"""The site's pages are made, and each link of README and docs leads somewhere, in the repository
+and on the site; without MkDocs, which `make docs` has."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)]*))?\)")
+
+
+@pytest.fixture(scope="module")
+def site() -> tuple[ModuleType, dict[str, str]]:
+    """The module docs/pages.py, and the site's pages as MkDocs gets them."""
+    spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    texts = {name: make() for name, make in module.PAGES.items()}
+    texts |= {path.name: path.read_text(encoding="utf-8") for path in ROOT.glob("docs/*.md")}
+    return module, {name: module.on_page_markdown(text) for name, text in texts.items()}
+
+
+def written(text: str) -> str:
+    """The text without its code, in which a bracket is no link."""
+    return re.sub(r"(?ms)^ *```.*?^ *```$|`[^`\n]*`", "", text)
+
+
+def anchors(text: str) -> set[str]:
+    """What a page's headings can be linked by."""
+    headings = re.findall(r"(?m)^#+ (.*)$", re.sub(r"(?ms)^ *```.*?^ *```$", "", text))
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+def test_every_page_is_made(site: tuple[ModuleType, dict[str, str]]) -> None:
+    _, pages = site
+    for name, text in pages.items():
+        assert text.startswith("# ") or "\n# " in text, name
+        assert len(text) > 500, name
+    nav = set(re.findall(r": ([\w-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
+    assert nav == set(pages)
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
+def test_links_in_the_repository(source: Path) -> None:
+    for target, anchor in LINK.findall(written(source.read_text(encoding="utf-8"))):
+        path = (source.parent / target).resolve() if target else source
+        assert path.exists(), target
+        if anchor:
+            assert anchor in anchors(path.read_text(encoding="utf-8")), f"{target}#{anchor}"
+
+
+def test_links_on_the_site(site: tuple[ModuleType, dict[str, str]]) -> None:
+    _, pages = site
+    for name, text in pages.items():
+        for target, anchor in LINK.findall(written(text)):
+            assert target in pages or not target or (ROOT / "docs" / target).exists(), (
+                f"{name}: {target}"
+            )
+            if anchor:
+                assert anchor in anchors(pages[target or name]), f"{name}: {target}#{anchor}"
