@@ -1,4 +1,4 @@
-"""The tick: back to back, in place, over ptys; and how late it wakes up, beside cyclictest.
+"""The tick: back to back, in place; and how late it wakes up, beside cyclictest.
 
 Back to back the pipeline's ticks follow each other; in place each wakes from the sleep before it,
 as in a running daemon. Both take turns, on canned readings and the same hand.
@@ -6,37 +6,25 @@ as in a running daemon. Both take turns, on canned readings and the same hand.
 
 from __future__ import annotations
 
-import contextlib
 import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.clock import RealClock
-from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
-from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, Row, figure, timed
-from softfinger.tools.benchmarks.rigs import (
-    HIL,
-    can,
-    emulator,
-    hold,
-    must_hold,
-    virtual_daemon,
-)
+from softfinger.tools.benchmarks.rigs import can, hold, must_hold, virtual_daemon
 
 Samples = NDArray[np.float64]
 
@@ -58,13 +46,8 @@ def measure(brief: bool = False) -> list[Report]:
         figure("the plant alone", "ms", 1e-3 * np.array(alone), 5.0),
     ]
     rows.append(row)
-    notes: tuple[str, ...] = ()
-    try:
-        rows.append(_over_ptys(3.0 if brief else 10.0))
-    except SoftfingerError as error:  # as on a machine that is busy elsewhere
-        notes = (f"over ptys: {error}",)
     return [
-        Report("tick", rows, page=("",), notes=notes, failed=bool(notes)),
+        Report("tick", rows, page=("",)),
         Report("a second on virtual time", second, page=("",)),
         wake_ups(*(3, 0.5) if brief else (8, 2.0)),
     ]
@@ -118,26 +101,6 @@ def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
         machine.sleep_until(deadline)
         samples += ticks(daemon, 1)
     return samples
-
-
-def _over_ptys(seconds: float) -> Row:
-    """Ticks of a hand that grasps and holds over unpaced ptys: real SDK, emulated hand."""
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stack.enter_context(emulator(folder, HIL))
-        daemon = stack.enter_context(Daemon(load(HIL, folder), wire=False))
-        stack.enter_context(RealTime(daemon.settings))
-        loop, clock, samples = daemon.loop, daemon.clock, []
-        hold(daemon)
-        deadline = clock.now()
-        for _ in range(round(seconds / loop.period)):
-            clock.sleep_until(deadline)
-            samples += timed(lambda: loop.tick(clock.now()))
-            deadline = max(deadline + loop.period, clock.now())
-        must_hold(daemon)
-        loop.command({"command": "stop"})
-        loop.tick(clock.now())
-    return figure("over ptys, emulated hand", "µs", samples)
 
 
 # Wake-ups
