@@ -35,13 +35,11 @@ def add_profile(parser: argparse.ArgumentParser) -> None:
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """``--config`` and ``--set``, for a subcommand whose ``--dir`` is its own."""
-    from softfinger.daemon.profile.load import names
-
     parser.add_argument(
         "--config",
         type=Path,
         metavar="PROFILE",
-        help=f"settings: a TOML file, or one of {', '.join(names())}",
+        help="settings: a TOML file, or a name that `softfinger config list` has",
     )
     parser.add_argument(
         "--set",

@@ -106,25 +106,10 @@ def test_signal_ends_it_while_the_terminal_takes_nothing(fake: FakeDaemon) -> No
         assert page.is_restored()
 
 
-def test_suspended_and_continued(fake: FakeDaemon) -> None:
-    with TerminalProcess(command(fake)) as page:
-        page.shows("HOLDING")
-        page.type(b"\x1a")
-        status = Path(f"/proc/{page.process.pid}/stat")
-        page.wait(lambda: status.read_text().rsplit(")", 1)[1].split()[0] == "T")
-        assert page.is_restored()
-        page.screen.reset()
-        page.process.send_signal(signal.SIGCONT)
-        page.shows("HOLDING", "kPa")
-        page.type(b"q")
-        assert page.ended() == 0
-        assert page.is_restored()
-
-
 def test_keys_command_the_hand(fake: FakeDaemon) -> None:
     fake.replies["clear"] = {"ok": False, "error": "clear: not while holding"}
     fake.replies["arm"] = b"not what a reply is"
-    with TerminalProcess(command(fake)) as page:
+    with TerminalProcess(command(fake, "--client", "bench")) as page:
         page.shows("HOLDING")
         for key, sent, shown in (
             (b"g", {"command": "grasp"}, "✓ grasp: ok"),
@@ -136,7 +121,7 @@ def test_keys_command_the_hand(fake: FakeDaemon) -> None:
         ):
             page.type(key)
             page.shows(shown)
-            assert fake.requests[-1] == sent
+            assert fake.requests[-1] == sent | {"client": "bench"}
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
         page.type(b"\x1b[C")  # from the target on, although the object is still at 4.98°
@@ -187,14 +172,6 @@ def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake: FakeDaemon) 
         page.type(b"--")
         page.shows("✓ grasp with 5 N: ok")
         assert asked() == [4.0, 6.0, 5.0]
-
-
-def test_named_client(fake: FakeDaemon) -> None:
-    with TerminalProcess(command(fake, "--client", "bench")) as page:
-        page.shows("HOLDING")
-        page.type(b"g")
-        page.shows("✓ grasp: ok")
-        assert fake.requests == [{"command": "grasp", "client": "bench"}]
 
 
 def test_beside_another_commander_of_a_real_daemon(
@@ -259,7 +236,7 @@ def test_unreadable_messages_are_counted_and_harmless(fake: FakeDaemon) -> None:
         assert b"\x07" not in page.written
 
 
-def test_resized(fake: FakeDaemon) -> None:
+def test_resized_suspended_and_continued(fake: FakeDaemon) -> None:
     with TerminalProcess(command(fake), 120, 40) as page:
         page.shows("HOLDING", "▀" * 42)
         page.resize(60, 20)
@@ -269,6 +246,16 @@ def test_resized(fake: FakeDaemon) -> None:
         page.wait(lambda: fake.requests == [{"command": "stop"}])
         page.resize(80, 24)
         page.shows("HOLDING", "q quit")
+        page.type(b"\x1a")
+        status = Path(f"/proc/{page.process.pid}/stat")
+        page.wait(lambda: status.read_text().rsplit(")", 1)[1].split()[0] == "T")
+        assert page.is_restored()
+        page.screen.reset()
+        page.process.send_signal(signal.SIGCONT)
+        page.shows("HOLDING", "kPa")
+        page.type(b"q")
+        assert page.ended() == 0
+        assert page.is_restored()
 
 
 def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
@@ -287,16 +274,7 @@ def test_plain_lines_through_a_pipe(fake: FakeDaemon) -> None:
         assert "goal 10.0 N  object +5.0°" in text
         assert "tick 500 Hz" in text
         assert any("warning mode: grasping → holding" in line for line in lines)
-        plain.terminate()
-        assert plain.wait(60.0) == 0
-
-
-def test_plain_ends_when_nobody_reads(fake: FakeDaemon) -> None:
-    process = subprocess.Popen(command(fake), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    with ending(process) as plain:
-        assert plain.stdout is not None
-        plain.stdout.readline()
-        plain.stdout.close()
+        plain.stdout.close()  # nobody reads any more
         assert plain.wait(60.0) == 0
         assert plain.stderr is not None
         assert plain.stderr.read() == b""

@@ -27,8 +27,8 @@ from softfinger.daemon.wire.packer import pack
 from softfinger.tools import cli
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.bridge import Bridge
-from softfinger.tools.viewing.live_stream import TOPICS, LiveStream
-from softfinger.tools.viewing.page import ViewError, WebPage, policy
+from softfinger.tools.viewing.live_stream import TOPICS, LiveStream, ViewError
+from softfinger.tools.viewing.viewer import WebPage, policy
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state

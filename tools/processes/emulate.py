@@ -7,11 +7,14 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 from softfinger.tools.ending import Interrupted, Signals
+
+if TYPE_CHECKING:
+    from softfinger.daemon.profile.settings import Settings
 
 _CYCLE = "depth=4mm speed=4mm/s hold=1s"  # of a bare --press: what `calibrate modulus` asks for
 _LOOK = 0.1  # s between two looks at a plate's way

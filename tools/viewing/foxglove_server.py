@@ -28,8 +28,7 @@ from softfinger.tools.recordings.channels import schema_of
 from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing import planar
 from softfinger.tools.viewing.known import ShownHand, read_settings
-from softfinger.tools.viewing.live_stream import NICE, TOPICS, follow
-from softfinger.tools.viewing.page import LOOPBACK, ViewError
+from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, TOPICS, ViewError, follow
 from softfinger.tools.viewing.planar import Colour
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")

@@ -11,13 +11,14 @@ from typing import Any, Protocol
 import zmq
 
 from softfinger.daemon.client.connection import drain, subscribe, unpack
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.daemon.wire.schema import TACTILE
 from softfinger.tools.arguments import PATIENCE, no_stream, waiting
 from softfinger.tools.ending import Ending
-from softfinger.tools.viewing.page import ViewError
 
+LOOPBACK = "127.0.0.1"
 TOPICS = (
     schema.SETTINGS,
     schema.EVENT,
@@ -32,6 +33,10 @@ _REST = 1.0  # s between two pictures at most, where drawing is slow
 _QUEUE = 40_000  # messages: 40 MB, 20 s of state and truth at 1 kHz
 _FRAMES = 1_000  # frames: 4 MB, 5 s of two sensors at 100 Hz; 131 MB of the largest grid
 _AT_ONCE = 4_000  # messages read before the other socket has its turn
+
+
+class ViewError(SoftfingerError):
+    """Nothing can be shown. The message says why, and what to do."""
 
 
 class Taker(Protocol):

@@ -25,8 +25,7 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.progress import Progress
 from softfinger.tools.viewing.bridge import Bridge
 from softfinger.tools.viewing.known import warm_up
-from softfinger.tools.viewing.live_stream import NICE, TOPICS, follow
-from softfinger.tools.viewing.page import ViewError
+from softfinger.tools.viewing.live_stream import NICE, TOPICS, ViewError, follow
 from softfinger.tools.viewing.viewer import Viewer, is_free, resident
 
 _PORT = 9090  # of the page, when it is free

@@ -1,27 +1,119 @@
 """Rerun's viewer as a child process: its window, or its web viewer behind our page.
 
 All its sockets are on the loopback, its memory is bounded, and it ends with this process, whatever
-ends that. It reaches no other machine, for news, examples or usage statistics: the window by its
-environment, the web viewer by the page's policy (`viewing.page`).
+ends that. It reaches no other machine, for fonts, news, examples or usage statistics: the window by
+its environment, the web viewer by a policy. A proxy of the viewer's own server adds it, by which
+the browser reaches this machine only.
 """
 
 from __future__ import annotations
 
 import ctypes
+import http.client
 import os
+import re
 import resource
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import IO
+from urllib.parse import quote, urlsplit
 
 import rerun_cli
 
-from softfinger.tools.viewing.page import LOOPBACK, ViewError, WebPage
+from softfinger.tools.viewing.live_stream import LOOPBACK, ViewError
+
+_FILE = re.compile(r"/([\w-]+(\.[\w-]+)*)?")
+_PASSED_ON = ("Content-Type", "Content-Length", "rerun-final-length")
+_HOSTS = ("127.0.0.1", "localhost")
+
+
+class WebPage:
+    """Serves in a thread of its own until closed. ``port`` is the one it got."""
+
+    def __init__(self, port: int, source: int, receiver: int) -> None:
+        """Serve on ``port`` (0: a free one) what the viewer serves on ``source``.
+
+        ``receiver`` is the port from which the page gets its data. Raises ViewError when the port
+        is taken.
+        """
+        handler = type("Handler", (_PageHandler,), {"source": source, "receiver": receiver})
+        try:
+            self._server = ThreadingHTTPServer((LOOPBACK, port), handler)
+        except (OSError, OverflowError) as error:
+            raise ViewError(f"port {port} can't be used: {error}") from None
+        self._server.daemon_threads = True
+        self.port: int = self._server.server_address[1]
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Serve no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(5.0)
+
+
+def policy(receiver: int) -> str:
+    """The Content-Security-Policy: scripts of the page itself, data from this machine."""
+    data = " ".join(f"http://{host}:{receiver}" for host in _HOSTS)
+    return (
+        "default-src 'self' data: blob:; "
+        "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
+        f"style-src 'self' 'unsafe-inline'; connect-src 'self' data: blob: {data}"
+    )
+
+
+class _PageHandler(BaseHTTPRequestHandler):
+    source = 0
+    receiver = 0
+    protocol_version = "HTTP/1.0"  # one answer a connection: its end is the answer's
+    timeout = 30.0
+
+    def do_GET(self) -> None:
+        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
+        target = urlsplit(self.path)
+        if host not in _HOSTS:  # another site's name that points here
+            self.send_error(403)
+        elif not _FILE.fullmatch(target.path):
+            self.send_error(404)
+        elif target.path == "/" and not target.query:
+            data = quote(f"rerun+http://{host}:{self.receiver}/proxy", safe="")
+            self.send_response(302)
+            self.send_header("Location", f"/?url={data}&persist=0&notebook=0&hide_welcome_screen")
+            self.end_headers()
+        else:
+            self._forward(target.path)
+
+    def _forward(self, path: str) -> None:
+        connection = http.client.HTTPConnection(LOOPBACK, self.source, timeout=self.timeout)
+        try:
+            connection.request("GET", path)
+            answer = connection.getresponse()
+            self.send_response(answer.status)
+            for name in _PASSED_ON:
+                value = answer.getheader(name)
+                if value is not None:
+                    self.send_header(name, value)
+            self.send_header("Content-Security-Policy", policy(self.receiver))
+            self.send_header("Referrer-Policy", "no-referrer")
+            self.end_headers()
+            shutil.copyfileobj(answer, self.wfile, 1 << 20)
+        except (OSError, http.client.HTTPException):
+            self.close_connection = True  # one of both ends has gone
+        finally:
+            connection.close()
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
 
 _START = 20.0  # s that a viewer may take until it listens
 _NOWHERE = f"http://{LOOPBACK}:9"  # no proxy listens there: nothing gets out
