@@ -4,7 +4,7 @@ What these sensors show, and what they don't:
 
 - A pressure grid feels normal pressure only; shear does not change it.
 - The joints' currents show a load along the faces: what pressure does not explain of a torque is
-  shear (`hand.external_load`). A joint's friction hides a load of its torque over W turn, 1.7 N a
+  shear (`hand.grasp_state`). A joint's friction hides a load of its torque over W turn, 1.7 N a
   tip at the default hand. Up to that, what is seen when holding begins, and what changes slower
   than in a second, is taken as friction. Less than half of it is no sign of a load; a load that is
   seen is taken for more by what friction may hide. So a grip whose tips' friction bears less than
@@ -37,7 +37,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_SHARE
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
-from softfinger.kinematics.hand.external_load import load_of
+from softfinger.kinematics.hand.grasp_state import load_of
 
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
 _SUDDEN = 0.5  # of what friction bears with its margin: a load that comes at once, and may go on

@@ -1,7 +1,7 @@
 """The calibration file of one sensor: read, checked against the sensor, written, applied.
 
 One JSON file a sensor. A step that was not done yet is null, and the settings' value is taken
-instead. What the numbers mean is in `estimation.calibration`.
+instead. What the numbers mean is in `kinematics.calibration`.
 """
 
 from __future__ import annotations

@@ -87,10 +87,6 @@ class ContactFilter:
         self._live = [False, False]  # tips that touch and are carried on by the joints
         self._sound = [False, False]  # the newest frame's estimate can be used
 
-    def switch_off(self) -> None:
-        """Take frames as they are, late and rare, for comparison."""
-        self._state.raw = True
-
     def advance(self, reading: Reading) -> None:
         """Carry the estimates on to the instant of a good reading."""
         self._read = True

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.external_load import load_torques
 from softfinger.kinematics.hand.grasp_state import (
     Motion,
     Two,
     held_motion,
     holding_levers,
+    load_torques,
     total_tilt,
 )
 
@@ -107,7 +107,6 @@ class FilterState(Record):
     torque_constant: float  # [N·m/A]
     assumed_taper: float  # `object.taper` [rad]
     alone: bool  # one finger
-    raw: bool  # frames as they are, carried on by nothing
     t: float  # of the last reading [s]
     newest: int  # row of the history
     tip: Annotated[Records[TrackedTip], 2]
@@ -193,7 +192,7 @@ def advance(
     seen1 = _credited(left, f.slow, way1, dq[0] * dt, dt)
     seen2 = _credited(right, f.slow, way2, dq[1] * dt, dt)
     both = left.live and right.live
-    if (both or f.alone) and not f.raw:
+    if both or f.alone:
         arm1, arm2, turn1, turn2, slide, _, _ = _motion(f)
         if both:
             turn = turn1 * seen1 - turn2 * seen2
@@ -246,15 +245,13 @@ def _rows_at(history: Records[Past], newest: int, t: float) -> tuple[int, int, f
 
 
 @inner_kernel
-def _weigh(
-    quantity: Quantity, step: float, raw: bool, moved: float, found: float, variance: float
-) -> float:
+def _weigh(quantity: Quantity, step: float, moved: float, found: float, variance: float) -> float:
     """Correct d by what a frame ``found``, ``moved`` ago by the joints; the frame's weight."""
     own = _variance(quantity, step)
     miss = found - (quantity.mean - moved)
     if miss * miss > _OUTLIER * (own + variance):
         own = miss * miss
-    weight = 1.0 if raw else own / (own + variance)
+    weight = own / (own + variance)
     quantity.mean += weight * miss
     quantity.variance = weight * variance
     quantity.since = abs(moved)
@@ -266,15 +263,6 @@ def _weigh_angle(
     f: FilterState, sense: float, turned: float, found: float, variance: float
 ) -> None:
     """Correct φ and α by the angle of one face that a frame ``found``, ``turned`` ago."""
-    if f.raw:
-        other = f.angle.mean - 0.5 * sense * f.taper
-        f.angle.mean = 0.5 * (found + other)
-        f.taper = sense * (found - other)
-        f.angle.variance = 0.5 * variance
-        f.taper_variance = 2.0 * variance
-        f.taper_covariance = 0.0
-        f.angle.since = abs(turned)
-        return
     own = _variance(f.angle, f.count)
     joint = f.taper_covariance
     spread = f.taper_variance
@@ -341,7 +329,7 @@ def correct(
         _keep_covariance(f, finger, 1.0, covariance, systematic)
         return
     # The errors of d and gain in a frame make up for each other: both get the same weight.
-    weight = _weigh(tip.d, f.count * f.length, f.raw, moved, d, d_variance)
+    weight = _weigh(tip.d, f.count * f.length, moved, d, d_variance)
     tip.gain += weight * (gain - tip.gain)
     predicted = f.angle.mean
     _weigh_angle(f, sense, turned, angle, angle_variance)

@@ -1,23 +1,41 @@
-"""Numba's compiler with the passes that kernels need, and without asking it the same thing twice.
+"""How Numba compiles kernels and keeps them; this module alone uses its private parts.
 
-Left out are the passes for closures, `with`, parallel loops, branches on constants (LLVM's part)
-and the listing of types, which filled the cache. What an operation makes of its arguments' types,
-and the size of LLVM's types, are remembered: at each place in the source Numba looks through
-dozens of candidates for the one, and has LLVM parse a module for the other.
+`pyproject.toml` bounds Numba's version for that. `KernelCompiler` has the passes that kernels need,
+and doesn't ask the same thing twice: left out are the passes for closures, `with`, parallel loops,
+branches on constants (LLVM's part) and the listing of types, which filled the cache. What an
+operation makes of its arguments' types, and the size of LLVM's types, are remembered: at each place
+in the source Numba looks through dozens of candidates for the one, and has LLVM parse a module for
+the other.
 
-This module, `inner_kernels` and `kernel_cache` alone reach into Numba; `pyproject.toml` bounds it.
+`InnerKernel`s, which only kernels call, are compiled to LLVM's bitcode alone, never to machine
+code. Numba compiles every function that a kernel calls as if Python might call it, too: optimised
+with all it calls, made into machine code, wrapped twice, kept in the cache. Their callers take the
+bitcode and do all that again. Here the bitcode is all there is, which takes a third off the time of
+compiling and leaves a quarter of the cache.
+
+`KernelCache` keeps of a kernel its machine code, and nothing that compiles. Numba keeps bitcode as
+well, for kernels that call this one; here they compile it anew. And to load a kernel Numba first
+imports all that it could compile: a third of a second, 50 MB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 from typing import Any, ClassVar
 
+import llvmlite.binding
+import numba
 from numba import types
 from numba.core.base import BaseContext
-from numba.core.compiler import CompilerBase
-from numba.core.compiler_machinery import PassManager
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, _LowerResult
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.runtime import nrt
 from numba.core.typed_passes import (
     IRLegalization,
     NativeLowering,
@@ -35,6 +53,8 @@ from numba.core.untyped_passes import (
     RewriteSemanticConstants,
     TranslateByteCode,
 )
+
+from softfinger.kinematics.compiled.kernel_folder import ROOT, kernel_folder, text
 
 _operation: Any = types.Function
 _resolve = _operation.get_call_type
@@ -113,3 +133,164 @@ def _remembering(flags: Any) -> Iterator[None]:
         yield
     finally:
         _operation.get_call_type, _context.get_abi_sizeof = outer
+
+
+_njit: Any = numba.njit
+_make_function: Any = numba._dynfunc.make_function  # type: ignore[attr-defined]
+
+
+class InnerKernel:
+    """What stands for an inner kernel in Python: Numba sees the kernel, a call is refused."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.py_func = function
+        self.__name__ = function.__name__
+        self.__doc__ = function.__doc__
+        self.__module__ = function.__module__
+        self.dispatcher: Any = _njit(
+            pipeline_class=_InnerCompiler,
+            no_cpython_wrapper=True,
+            no_cfunc_wrapper=True,
+            **options,
+        )(function)
+        # Numba would compile it anew for each literal among the arguments; LLVM folds them anyway.
+        resolve = self.dispatcher.get_call_template
+        self.dispatcher.get_call_template = lambda args, kws: resolve(
+            tuple(types.unliteral(each) for each in args), kws
+        )
+
+    def also(self, other: InnerKernel, takes: Callable[[Any], bool]) -> None:
+        """Let ``other`` be compiled instead where ``takes`` the type of the first argument."""
+        mine, others = self.dispatcher, other.dispatcher
+        template, overload = mine.get_call_template, mine.get_overload
+        mine.get_call_template = lambda args, kws: (
+            others.get_call_template if takes(args[0]) else template
+        )(args, kws)
+        mine.get_overload = lambda sig: (others.get_overload if takes(sig[0]) else overload)(sig)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """By this Numba knows what a compiled caller means."""
+        return self.dispatcher._numba_type_
+
+    def __call__(self, *values: Any) -> Any:
+        """Refused: there is no machine code for Python to call."""
+        raise TypeError(
+            f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
+            "what Python calls is marked @kernel"
+        )
+
+
+class _Bitcode(JITCodeLibrary):
+    """A library that is linked into those of its callers and never becomes machine code."""
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        # Numba does this for what is only declared here, too.
+        ll_module.data_layout = self._codegen._data_layout
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes, builder = self._codegen._function_pass_manager()
+                passes.run(function, builder)
+
+    def finalize(self) -> None:
+        for library in dict.fromkeys(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _InnerLowering(NativeLowering):
+    """Lowering into such a library, with an entry point that stands for the kernel, but is null."""
+
+    _name = "inner_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        name = state.func_id.func_qualname
+        state.library = _Bitcode(state.targetctx.codegen(), name)
+        state.flags.no_compile = True
+        try:
+            super().run_pass(state)
+        finally:
+            state.flags.no_compile = False
+        lowered = state["cr"]
+        fndesc, env = lowered.fndesc, lowered.env
+        # Numba knows an overload by its entry point, so each has one of its own.
+        entry = _make_function(fndesc.lookup_module(), name, "", 0, env, (state.library,))
+        state.targetctx.insert_user_function(entry, fndesc, [state.library])
+        state["cr"] = _LowerResult(fndesc, lowered.call_helper, cfunc=entry, env=env)
+        return True
+
+
+class _InnerCompiler(KernelCompiler):
+    """The compiler with that lowering."""
+
+    lowering = _InnerLowering
+
+
+_llvm: Any = llvmlite.binding
+
+
+class KernelFolder:
+    """Tells Numba where a kernel is kept: one of its cache locators."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._py_file = file
+        self._line = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> KernelFolder | None:
+        """None where there is no folder: then nothing is kept."""
+        return None if kernel_folder() is None else cls(function, file)
+
+    def get_cache_path(self) -> str:
+        """The one folder."""
+        return str(kernel_folder())
+
+    def ensure_cache_path(self) -> None:
+        """Nothing to do: `kernel_folder` has made and checked it."""
+
+    def get_source_stamp(self) -> str:
+        """The kernel's own file; what the folder's name covers is the same by its being there."""
+        return hashlib.sha256(text(Path(self._py_file))).hexdigest()
+
+    def get_disambiguator(self) -> str:
+        """Tells apart kernels of the same name in modules of the same name."""
+        file = Path(self._py_file)
+        inside = file.is_relative_to(ROOT)
+        place = file.relative_to(ROOT).parent if inside else file.parent
+        return f"{hashlib.sha256(str(place).encode()).hexdigest()[:8]}-{self._line}"
+
+
+class _MachineCode(CompileResultCacheImpl):
+    """A compiled kernel as it is kept."""
+
+    _locator_classes: Any = (KernelFolder,)
+
+    def reduce(self, cres: Any) -> Any:
+        """Instead of the bitcode the names of what it defines, by which Numba finds it."""
+        (name, kind, (code, bitcode)), *rest = super().reduce(cres)
+        module = _llvm.parse_bitcode(bitcode)
+        defined = (*module.functions, *module.global_variables)
+        names = [f'@"{each.name}" = global i8 0' for each in defined if not each.is_declaration]
+        names_alone = _llvm.parse_assembly("\n".join(names)).as_bitcode()
+        return ((name, kind, (code, names_alone)), *rest)
+
+
+class KernelCache(FunctionCache):
+    """Where Numba looks for a kernel. Raises RuntimeError where there is no folder."""
+
+    _impl_class = _MachineCode
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """As Numba does, without importing first all that it can compile."""
+        _add_symbols()
+        return self._load_overload(sig, target_context)
+
+
+@cache
+def _add_symbols() -> None:
+    """Tell LLVM of Numba's memory functions, which machine code calls."""
+    for name, address in nrt._nrt.c_helpers.items():  # type: ignore[attr-defined]
+        _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)

@@ -13,9 +13,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from softfinger.kinematics.compiled.compiler import KernelCompiler
-from softfinger.kinematics.compiled.inner_kernels import InnerKernel
-from softfinger.kinematics.compiled.kernel_cache import KernelCache
+from softfinger.kinematics.compiled.compiler import InnerKernel, KernelCache, KernelCompiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

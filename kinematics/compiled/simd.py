@@ -1,12 +1,14 @@
-"""Polynomials in two variables, five at a time in SIMD lanes; and nothing of what they mean.
+"""Polynomials in two variables, and weighted sums of rows or columns, in SIMD lanes.
 
-Numba vectorises loops, not a Horner scheme over neighbouring coefficients, so this one is written
-as LLVM instructions: each coefficient of all five polynomials is one vector load and one fused
-multiply-add. LLVM splits the vectors where the machine's are narrower.
+And nothing of what they mean. Numba vectorises long loops, not a Horner scheme over neighbouring
+coefficients, of which each of all five polynomials is here one vector load and one fused
+multiply-add, and hardly short sums of a few dozen. So these are written as LLVM instructions. LLVM
+splits the vectors where the machine's are narrower.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -17,7 +19,7 @@ from numba.core.extending import intrinsic
 from numpy.typing import NDArray
 
 LANES = 5  # polynomials
-STRIDE = 8  # numbers stored for each coefficient: the lanes, padded to a vector register
+STRIDE = 8  # numbers of a vector register, and stored for each coefficient: the lanes, padded
 
 # Shapes by number: how many powers of x each power of y has, the lowest first. Squares, then
 # shapes cut to what an analytic function needs for one precision after the other, the shape for a
@@ -45,28 +47,30 @@ _VECTOR = ir.VectorType(_DOUBLE, STRIDE)
 _INDEX = ir.IntType(64)
 
 
+def _fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """a b + c of vectors; llvmlite's own takes scalars only."""
+    function = cast(Any, cgutils).get_or_insert_function(
+        builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fma.v{STRIDE}f64"
+    )
+    return builder.call(function, [a, b, c])
+
+
+def _spread(builder: Any, value: Any) -> Any:
+    """A vector of the one value."""
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    single = builder.insert_element(undefined, value, ir.Constant(_INDEX, 0))
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), STRIDE), [0] * STRIDE)
+    return builder.shuffle_vector(single, undefined, mask)
+
+
 def _polynomials(context: Any, data: Any, at: Any, shape: Any, x: Any, y: Any) -> Any:
     """Signature and code generator; see :data:`polynomials`."""
     signature = cast(Any, types).UniTuple(types.float64, LANES)(data, types.intp, shape, x, y)
 
     def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         start, at, _, x, y = arguments
-        # llvmlite's own fma takes scalars only.
-        function = cast(Any, cgutils).get_or_insert_function(
-            builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fma.v{STRIDE}f64"
-        )
-
-        def fma(a: Any, b: Any, c: Any) -> Any:
-            return builder.call(function, [a, b, c])
-
-        def spread(value: Any) -> Any:
-            single = builder.insert_element(
-                ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(_INDEX, 0)
-            )
-            mask = ir.Constant(ir.VectorType(ir.IntType(32), STRIDE), [0] * STRIDE)
-            return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), mask)
-
-        xs, ys = spread(x), spread(y)
+        fma = partial(_fma, builder)
+        xs, ys = _spread(builder, x), _spread(builder, y)
         pointer = builder.bitcast(builder.gep(start, [at]), _VECTOR.as_pointer())
         # All powers of y are independent, and the machine may work on them before y is known.
         rows = []
@@ -106,6 +110,37 @@ def _in_powers(builder: Any, fma: Any, rows: list[Any], y: Any) -> Any:
     return fma(fma(sums[3], y, sums[2]), y2, fma(sums[1], y, sums[0]))
 
 
+def _weighted(
+    context: Any,
+    start: Any,
+    source: Any,
+    at: Any,
+    stride: Any,
+    weights: Any,
+    first: Any,
+    count: Any,
+) -> Any:
+    """Signature and code generator; see :data:`weighted`."""
+    whole = types.intp
+    signature = types.void(start, source, whole, whole, weights, whole, whole)
+
+    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        out, source, at, stride, weights, first, count = arguments
+        place = builder.bitcast(out, _VECTOR.as_pointer())
+        total = cast(Any, cgutils).alloca_once_value(builder, builder.load(place, align=8))
+        with cast(Any, cgutils).for_range(builder, count) as loop:
+            weight = builder.load(builder.gep(weights, [builder.add(first, loop.index)]))
+            moved = builder.add(at, builder.mul(stride, loop.index))
+            row = builder.bitcast(builder.gep(source, [moved]), _VECTOR.as_pointer())
+            value = builder.load(row, align=8)
+            more = _fma(builder, _spread(builder, weight), value, builder.load(total))
+            builder.store(more, total)
+        builder.store(builder.load(total), place, align=8)
+        return codegen.get_dummy_value()
+
+    return signature, generate
+
+
 def _address(context: Any, array: Any) -> Any:
     """Signature and code generator; see :data:`address`."""
     signature = cast(Any, types).CPointer(array.dtype)(array)
@@ -129,6 +164,10 @@ def _further(context: Any, start: Any, number: Any) -> Any:
 # number is a literal. From pointer[at] on stand, for j = 0, 1, …, the coefficients of falling
 # powers of x, STRIDE numbers each.
 polynomials = cast(Any, intrinsic(prefer_literal=True))(_polynomials)
+
+# weighted(out, source, at, stride, weights, first, count): adds Σ weights[first + k]
+# source[at + k stride : … + STRIDE] over k < count to out[0 : STRIDE], all addresses of float64.
+weighted = cast(Any, intrinsic)(_weighted)
 
 # address(array): where a contiguous array starts. Numba counts the references to an array
 # wherever a function that has it returns in several ways, and each count is an atomic instruction

@@ -27,6 +27,9 @@ FloatArray = NDArray[np.float64]
 TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
 TABLE_I_MAXIMUM = 0.304e6
+# Of σ, by the integral of the polynomial of least degree that has these slopes and starts with none
+# of its own: c_1, c_2, … [Pa], exact.
+_TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
 
 _PIECE_DEGREE = 8  # up to here one expansion about 0 keeps all digits
 _PIECES = 8
@@ -108,12 +111,7 @@ class Material:
         0.304 MPa, lies beyond 100 %. Through them goes the polynomial of least degree that starts
         with zero slope, as its least value must; it never falls on [0, 1].
         """
-        nodes = [Fraction(i, 5) for i in range(6)]
-        values = [Fraction(value) for value in TABLE_I_MODULUS]
-        rows = [[node**j for j in range(7)] for node in nodes]
-        rows.append([Fraction(int(j == 1)) for j in range(7)])
-        modulus = _solve(rows, [*values, Fraction(0)])
-        return cls(tuple(_integral(modulus)[1:]), name="table_i")
+        return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 
     @classmethod
     def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
@@ -234,18 +232,3 @@ def _shift(polynomial: Sequence[Fraction], start: Fraction) -> list[Fraction]:
         for j in range(len(work) - 2, first - 1, -1):
             work[j] += start * work[j + 1]
     return work
-
-
-def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
-    """Solve a small linear system exactly by Gauss-Jordan elimination."""
-    size = len(right)
-    system = [[*row, value] for row, value in zip(rows, right, strict=True)]
-    for i in range(size):
-        pivot = next(k for k in range(i, size) if system[k][i] != 0)
-        system[i], system[pivot] = system[pivot], system[i]
-        system[i] = [value / system[i][i] for value in system[i]]
-        for k in range(size):
-            if k != i and system[k][i] != 0:
-                factor = system[k][i]
-                system[k] = [x - factor * y for x, y in zip(system[k], system[i], strict=True)]
-    return [row[size] for row in system]

@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
-from softfinger.kinematics.compiled.simd_sums import LANES, weighted
+from softfinger.kinematics.compiled.simd import STRIDE, IntPointer, Pointer, further, weighted
 from softfinger.kinematics.estimation.packing import PLACE_BITS
 from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
@@ -100,7 +99,7 @@ def spread(state: EstimatorState, frame: Pointer, arena: Pointer, places: IntPoi
     top = min((high - 1) // parts_y + 1, state.grid.rows)
     wide = last - first
     # The columns of ``between`` that the box needs, of each phase; what lies right of them is 0.
-    ahead = wide + n_x + LANES
+    ahead = wide + n_x + STRIDE
     packed = further(arena, state.at.packed)
     source = further(arena, state.at.fine)
     between = further(arena, state.at.half)
@@ -118,11 +117,11 @@ def spread(state: EstimatorState, frame: Pointer, arena: Pointer, places: IntPoi
             _clear(between, 0, width)
             for p in range(parts_x):
                 at = p * phase + first
-                for j in range(at, min(at + ahead, (p + 1) * phase - LANES + 1), LANES):
+                for j in range(at, min(at + ahead, (p + 1) * phase - STRIDE + 1), STRIDE):
                     here = further(between, j)
                     skip = begin - parts_y * i
                     weighted(here, source, begin * width + j, width, along, skip, number)
-            for j in range(0, wide, LANES):
+            for j in range(0, wide, STRIDE):
                 for p in range(parts_x):
                     at = p * phase + first + j
                     weighted(further(out, j), between, at, 1, across, p * n_x, n_x)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.compiled.simd_sums import LANES
+from softfinger.kinematics.compiled.simd import STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import parts_to_fit, weights
@@ -184,7 +184,6 @@ class ContactEstimator:
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = tip.physics == "springs" if free_gain is None else free_gain
-        options.fixed_gain = 1.0
         options.tolerance = _TOLERANCE
         options.iterations = _ITERATIONS
         options.moments_only = method == "moments"
@@ -381,7 +380,7 @@ def _lay_out(
         along = weights(along, number[1])
         blur.parts_x, blur.parts_y = number
         blur.weights_x, blur.weights_y = across.shape[1], len(along)
-        blur.width = number[0] * (grid.cols + 2 * LANES) + across.size
+        blur.width = number[0] * (grid.cols + 2 * STRIDE) + across.size
         fine, half = np.zeros((finer.rows + 1, blur.width)), np.zeros(blur.width)
         arrays |= {"parts": parts, "across": across, "along": along, "fine": fine, "half": half}
         places = np.zeros(finer.rows * finer.cols, dtype=np.int64)

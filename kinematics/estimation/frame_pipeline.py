@@ -11,10 +11,13 @@ import math
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address, further
-from softfinger.kinematics.estimation.detection import presses_outside
+from softfinger.kinematics.estimation.detection import (
+    presses_outside,
+    restore_outliers,
+    without_outliers,
+)
 from softfinger.kinematics.estimation.gauss_newton import energy_of, fit, judge, linearise, solve
 from softfinger.kinematics.estimation.moments import start, track
-from softfinger.kinematics.estimation.outliers import restore_outliers, without_outliers
 from softfinger.kinematics.estimation.solid_projection import SolidFit, presses, solid_kernel
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_face
@@ -73,7 +76,7 @@ def _likelihood(
         if attempt == 1:
             start(solid, state, frame, arena, places)
         if not options.free_gain:
-            estimate.gain = options.fixed_gain
+            estimate.gain = 1.0
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
         if fit(solid, state, frame, arena, places, tolerance):
             misfit, scatter = _explain(state)
@@ -96,8 +99,7 @@ def _is_this_tip(state: EstimatorState) -> bool:
     estimate = state.estimate
     if estimate.shared > SHARED_MAX:
         return False
-    near = GAIN_FAR * state.options.fixed_gain > estimate.gain
-    near = near and GAIN_FAR * estimate.gain > state.options.fixed_gain
+    near = 1.0 / GAIN_FAR < estimate.gain < GAIN_FAR
     return bool(estimate.hidden <= (HIDDEN_MAX if near else HIDDEN_MAX_FAR))
 
 
@@ -275,7 +277,7 @@ def estimate_frame(
         estimate.d = 0.0
         estimate.n_x = 0.0
         estimate.n_y = 0.0
-        estimate.gain = state.options.fixed_gain
+        estimate.gain = 1.0
     # A baseline far below zero is a sensor to tare, not a tip in the air.
     sound = signal.finite and signal.mean > -3.0 * signal.noise and rejected < OUTLIERS_MAX
     estimate.valid = sound and (done or not signal.contact)

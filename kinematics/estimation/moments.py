@@ -306,9 +306,9 @@ def _set_contact(state: EstimatorState) -> None:
     if state.options.free_gain:
         d = max(_d_from_extent(m, a, math.hypot(m.x, m.y)), 1e-4 * a)
     else:
-        m.gain = state.options.fixed_gain
+        m.gain = 1.0
         cosine = math.sqrt(1.0 - m.n_x * m.n_x - m.n_y * m.n_y)
-        plain = force * cosine / (math.pi * modulus * m.gain)
+        plain = force * cosine / (math.pi * modulus)
         for _ in range(4):
             d = math.sqrt(plain / _ratio(m, a, d, 0))
             d = min(max(d, 1e-4 * a), 0.95 * a)

@@ -173,7 +173,7 @@ def _start(
         for m in range(5):
             solid.n_x = tilt if m == 1 else -tilt if m == 2 else 0.0
             solid.n_y = tilt if m == 3 else -tilt if m == 4 else 0.0
-            fit.gain = state.options.fixed_gain
+            fit.gain = 1.0
             cost = _set_sums(state, solid)
             if state.options.free_gain:
                 gain = fit.gain + fit.sums.right[0] / fit.sums.normal[0]

@@ -35,7 +35,6 @@ class Options(Record):
     noise: float  # of a cell [Pa]
     saturation: float  # [counts]
     floor: float  # least count sent, less a half
-    fixed_gain: float
     tolerance: float
     peak_level: float  # [noise]
     patch_level: float

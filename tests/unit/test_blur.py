@@ -14,7 +14,7 @@ from softfinger.daemon.profile.factory import make_grid, make_material
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
-from softfinger.kinematics.compiled.simd_sums import LANES
+from softfinger.kinematics.compiled.simd import STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
@@ -116,7 +116,7 @@ def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
     frame = rng.random((rows, cols))
     cells = np.zeros((rows, CELL_PLANES, cols))
     cells[:, LIVE] = rng.random((rows, cols)) > 0.1
-    padded = parts * (cols + 2 * LANES) + len(whole)
+    padded = parts * (cols + 2 * STRIDE) + len(whole)
     state = EstimatorState()
     state.grid.rows, state.grid.cols = rows, cols
     state.model.rows, state.model.cols = high, wide

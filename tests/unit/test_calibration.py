@@ -8,9 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.calibration import (
+from softfinger.kinematics.calibration.calibration import (
     CalibrationError,
     cleared,
     equilibrate,
@@ -20,6 +18,8 @@ from softfinger.kinematics.estimation.calibration import (
     fit_modulus,
     tare,
 )
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 

@@ -9,8 +9,13 @@ import pytest
 
 from softfinger import ContactTable, Fingertip, Material
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.external_load import load_of, load_torques
-from softfinger.kinematics.hand.grasp_state import held_motion, holding_levers, sheared_gradient
+from softfinger.kinematics.hand.grasp_state import (
+    held_motion,
+    holding_levers,
+    load_of,
+    load_torques,
+    sheared_gradient,
+)
 from tests.harness.called import called
 from tests.harness.grasp import Grasp, GraspState
 from tests.harness.reference_hand import ReferenceHand

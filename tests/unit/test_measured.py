@@ -21,13 +21,13 @@ from softfinger.daemon.perception.calibration_file import (
 )
 from softfinger.daemon.perception.finger_model import make_estimator, make_models
 from softfinger.daemon.profile.load import load
-from softfinger.kinematics.contact.tip_curves import TipCurves
-from softfinger.kinematics.estimation.measured import MeasuredEstimator
-from softfinger.kinematics.estimation.measured_fit import (
+from softfinger.kinematics.calibration.measured_fit import (
     CurvesError,
     PressSums,
     fit_measured,
 )
+from softfinger.kinematics.contact.tip_curves import TipCurves
+from softfinger.kinematics.estimation.measured import MeasuredEstimator
 
 A = 0.020
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"

@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"joints: {calibrate_joints(arguments, settings)}\n  written to {arguments.file}")
         return 0
     from softfinger.daemon.perception.calibration_file import save_calibration
-    from softfinger.kinematics.estimation.calibration import CalibrationError
+    from softfinger.kinematics.calibration.calibration import CalibrationError
     from softfinger.tools.calibration.calibration_frames import gather
     from softfinger.tools.calibration.calibration_plot import draw
     from softfinger.tools.calibration.steps import Step, begin, done

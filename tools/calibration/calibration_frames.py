@@ -23,7 +23,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.tactile.replay import TRUTHS, load_recording
 from softfinger.daemon.types import FINGERS, Frame
-from softfinger.kinematics.estimation.calibration import CalibrationError
+from softfinger.kinematics.calibration.calibration import CalibrationError
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 3.0  # s without a new frame

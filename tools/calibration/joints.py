@@ -20,7 +20,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.estimation.calibration import CalibrationError
+from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import own_runtime_folder
 from softfinger.tools.calibration.calibration_frames import bring
 

@@ -1,6 +1,6 @@
 """The steps of a calibration: from loads to what is written into the file.
 
-The mathematics is in `kinematics.estimation.calibration`, the file in
+The mathematics is in `kinematics.calibration.calibration`, the file in
 `daemon.perception.calibration_file`.
 """
 
@@ -33,11 +33,7 @@ from softfinger.daemon.perception.finger_model import calibrated_grid
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable
-from softfinger.kinematics.contact.tip_curves import TipCurves
-from softfinger.kinematics.estimation.calibration import (
+from softfinger.kinematics.calibration.calibration import (
     CalibrationError,
     cleared,
     equilibrate,
@@ -48,9 +44,13 @@ from softfinger.kinematics.estimation.calibration import (
     tare,
     without_end,
 )
+from softfinger.kinematics.calibration.measured_fit import CurvesError, PressSums, fit_measured
+from softfinger.kinematics.calibration.press_fit import Presses, TipFit, compare_tips
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.estimation.measured import MeasuredEstimator
-from softfinger.kinematics.estimation.measured_fit import CurvesError, PressSums, fit_measured
-from softfinger.kinematics.estimation.press_fit import Presses, TipFit, compare_tips
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
 
