@@ -6,24 +6,7 @@ neither Numba nor ZeroMQ.
 
 from __future__ import annotations
 
-from softfinger import SoftfingerError
-
-__all__ = [
-    "AddressError",
-    "HandClosed",
-    "HandFault",
-    "KeyFileError",
-    "NoDescriptor",
-    "NoStream",
-    "NotInTime",
-    "PluginError",
-    "RecordingError",
-    "Refused",
-    "ServoError",
-    "SettingsError",
-    "SoftfingerError",
-    "TactileError",
-]
+from softfinger import SoftfingerError as SoftfingerError
 
 
 class SettingsError(SoftfingerError):

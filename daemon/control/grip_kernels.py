@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.control import setpoint, slip_monitor
 from softfinger.daemon.control.setpoint import SetpointState
-from softfinger.daemon.control.slip_monitor import SlipState
+from softfinger.daemon.control.slip_monitor import SlipState, mean
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
@@ -93,7 +93,7 @@ def start(
     setpoint.reset(g.force, force_windows, felt)
     g.integral = g.shift = g.closing_friction = g.shaken = 0.0
     g.offset = 0.5 * (q[0] - q[1])
-    g.closed = 0.5 * (q[0] + q[1])
+    g.closed = mean(q)
     g.steering = False
     g.seen = grasps[0].t
 
@@ -126,7 +126,7 @@ def squeeze(
         if g.slip.reflex and g.force.target > g.force.value:
             setpoint.reset(g.force, force_windows, g.force.target)
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
-    g.push = wanted + _correction(g, wanted, _felt(grasp))
+    g.push = wanted + _correction(g, wanted, mean(grasp.force))
     if g.law.blind and not g.steering:
         torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
         return torque1, torque2, g.force.target, g.slip.turned
@@ -187,31 +187,18 @@ def place(
     """Goals of both joints [rad] of pure position control: both setpoints moved into angles."""
     g = grips[0]
     grasp = grasps[0]
-    error = setpoint.advance(g.force, force_windows, g.force_rate) - _felt(grasp)
+    error = setpoint.advance(g.force, force_windows, g.force_rate) - mean(grasp.force)
     lean = 0.0
     if g.steering:
         lean = _steer(g, angle_windows, grasp, turned)
-    way = g.law.force_bandwidth * error / (_mean_stiffness(grasp) * _mean_arm(grasp))
+    way = g.law.force_bandwidth * error / (_mean_stiffness(grasp) * mean(grasp.arm))
     g.closed += (_closing(grasp, g.force.speed, lean) + way) * g.law.dt
     return g.closed + g.offset, g.closed - g.offset
 
 
 @inner_kernel
-def _felt(grasp: GraspState) -> float:
-    felt: float = 0.5 * (grasp.force[0] + grasp.force[1])
-    return felt
-
-
-@inner_kernel
-def _mean_arm(grasp: GraspState) -> float:
-    mean: float = 0.5 * (grasp.arm[0] + grasp.arm[1])
-    return mean
-
-
-@inner_kernel
 def _mean_stiffness(grasp: GraspState) -> float:
-    mean: float = 0.5 * (grasp.stiffness[0] + grasp.stiffness[1])
-    return max(mean, _STIFFNESS_MIN)
+    return max(mean(grasp.stiffness), _STIFFNESS_MIN)
 
 
 @inner_kernel
@@ -258,7 +245,7 @@ def _share_out(g: GripState, grasp: GraspState) -> None:
     The force law holds their mean; friction may keep the object where one tip is pressed more.
     Both fingers then shift sideways by a little, less than the object's angle is held to.
     """
-    off = 0.5 * (grasp.normal[0] - grasp.normal[1]) / (_mean_stiffness(grasp) * _mean_arm(grasp))
+    off = 0.5 * (grasp.normal[0] - grasp.normal[1]) / (_mean_stiffness(grasp) * mean(grasp.arm))
     most = _SHARE_ANGLE / _turning(grasp)
     shift = g.shift - 2.0 * math.pi * _SHARE_BANDWIDTH * off * g.law.dt
     shift = min(max(shift, -most), most)
@@ -283,7 +270,7 @@ def _torques(
 ) -> tuple[float, float]:
     """Torques of two fingers at rates [rad/s] of closing and leaning that are wanted."""
     law = g.law
-    arm = _mean_arm(grasp)
+    arm = mean(grasp.arm)
     calm = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
     calm *= close - 0.5 * (dq[0] + dq[1])
     error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
@@ -308,8 +295,8 @@ def _equal_torques(
     close = _closing(grasp, g.force.speed, 0.0)
     g.lean = 0.0
     g.closing_friction = min(max(close / law.friction_speed, -1.0), 1.0)
-    mean = 0.5 * (q[0] + q[1])
-    arm = law.length * math.cos(mean) - law.offset * math.sin(mean)
+    closed = mean(q)
+    arm = law.length * math.cos(closed) - law.offset * math.sin(closed)
     calm = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
     push = arm * g.push + calm * (close - 0.5 * (dq[0] + dq[1])) + _friction(law, close)
     lean = 0.5 * (q[0] - q[1])
@@ -318,8 +305,10 @@ def _equal_torques(
         g.offset = lean
     elif g.shaken < law.dither_time:
         lengths = (law.half_separation, law.length, law.offset, law.radius)
-        depth = 0.5 * (grasp.d[0] + grasp.d[1])
-        spring = min(upright_spring(mean, depth, wanted, grasp.turning, lengths), g.joint_stiffness)
+        depth = mean(grasp.d)
+        spring = min(
+            upright_spring(closed, depth, wanted, grasp.turning, lengths), g.joint_stiffness
+        )
         # What then holds the fingers begins with the torque that the spring has come to.
         g.offset = lean * (1.0 - spring / g.joint_stiffness)
         # Within its first period it grows, from then on it fades.

@@ -114,10 +114,10 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.known = grasp.load_lever > 0.0
     if not s.known:
         return
-    normal = _mean(grasp.normal)
-    friction, scale = s.law.joint_friction, _SCALE_ERROR * normal * _mean(grasp.arm)
+    normal = mean(grasp.normal)
+    friction, scale = s.law.joint_friction, _SCALE_ERROR * normal * mean(grasp.arm)
     before = s.share * normal
-    found = _mean(s.smooth) + before
+    found = mean(s.smooth) + before
     s.still = min(max(found, -friction), friction)
     taken = min(max(found - s.still, -scale), scale)
     s.share = taken / normal if normal > 0.0 else 0.0
@@ -156,7 +156,7 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
     if s.turned:
         needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, s.needed))
     s.reflex = s.turned
-    if sudden and load > _SUDDEN * max(spare, 0.0) * _mean(grasp.normal):
+    if sudden and load > _SUDDEN * max(spare, 0.0) * mean(grasp.normal):
         needed = s.most  # how much more is to come is not known
         s.reflex = True
     if needed >= s.needed:
@@ -177,13 +177,13 @@ def _average(s: SlipState, grasp: GraspState, closing: float, judged: bool) -> b
     read wrongly, and no joint that is dead.
     """
     friction = s.law.joint_friction
-    known = closing * friction + s.share * _mean(grasp.normal)
+    known = closing * friction + s.share * mean(grasp.normal)
     found1 = grasp.unexplained[0] - known
     found2 = grasp.unexplained[1] - known
     off1 = found1 - s.smooth[0]
     off2 = found2 - s.smooth[1]
     off = 0.5 * (off1 + off2)
-    before = _mean(s.smooth) - s.still
+    before = mean(s.smooth) - s.still
     sudden = False
     if judged and min(off1 * off, off2 * off) > _BOTH * off * off:
         more = min(abs(off), abs(before + off) - abs(before))
@@ -205,7 +205,7 @@ def _average(s: SlipState, grasp: GraspState, closing: float, judged: bool) -> b
 def _weigh(s: SlipState, grasp: GraspState) -> None:
     """Tell the load from the joints' friction."""
     law = s.law
-    off = _mean(s.smooth) - s.still
+    off = mean(s.smooth) - s.still
     load, slope = load_of(off, grasp.load_lever, grasp.load_bow)
     load = abs(load)
     friction = law.joint_friction / grasp.load_lever
@@ -234,6 +234,7 @@ def _watch_turning(s: SlipState, grasp: GraspState) -> None:
 
 
 @inner_kernel
-def _mean(pair: Pair) -> float:
-    mean: float = 0.5 * (pair[0] + pair[1])
-    return mean
+def mean(pair: Pair) -> float:
+    """Of (left, right)."""
+    value: float = 0.5 * (pair[0] + pair[1])
+    return value

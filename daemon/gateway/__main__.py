@@ -82,8 +82,8 @@ def open_server(
     poller, requests, late = server.poller, server.requests, server.repeated.late
     if config.stream:
         listener = Listener(config.stream, config.stream_key, config.ipc_mode)
-        stream = StreamEndpoint(listener, poller, places // 4, config.queue, config.topics, late)
-        server.add(stream, stream)
+        quarter = places // 4
+        server.add(StreamEndpoint(listener, poller, quarter, config.queue, config.topics, late))
     if config.commands:
         listener = Listener(config.commands, "commands.address", config.ipc_mode)
         limit = bounds.FRAMES * config.max_bytes

@@ -79,6 +79,15 @@ class Endpoint:
     now = 0.0
     epoch = 0
     begun = 0
+    wanted = 0  # topics that somebody subscribes to, as bits
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that wait for subscribers."""
+        return 0
+
+    def publish(self, topic: int, message: bytes) -> None:
+        """One message to all who want its topic."""
 
     def tend(self) -> None:
         """Do what is due by the time."""
@@ -250,7 +259,6 @@ class StreamEndpoint(PlainEndpoint[StreamConnection]):
         self.matching = topics.matching
         self._queue = queue
         self._late = late
-        self.wanted = 0  # topics as bits
         super().__init__(listener, poller, bounds.SUBSCRIPTION, places)
 
     def _make(self, accepted: socket.socket, epoch: int) -> StreamConnection:
@@ -274,11 +282,9 @@ class StreamEndpoint(PlainEndpoint[StreamConnection]):
 
     @property
     def backlog(self) -> int:
-        """Bytes that wait for all subscribers."""
         return sum(connection.waiting for connection in self._connections.values())
 
     def publish(self, topic: int, message: bytes) -> None:
-        """One message to all who want its topic."""
         bit = 1 << topic
         wire = self._on_wire(topic, message)
         backlog = 0

@@ -224,8 +224,6 @@ class KeyedStream(_KeyedEndpoint):
         self._matching = config.topics.matching
         self._late = server.repeated.late
         self._prefixes: set[bytes] = set()
-        self.wanted = 0
-        self.backlog = 0
         super().__init__(server, keys, config, zmq.XPUB, config.queue, bounds.KEYED_SUBSCRIPTION)
         self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
 
@@ -263,7 +261,6 @@ def open_endpoints(server: Server, config: Config) -> None:
     """
     keys = Keys(zmq.Context(), Path(config.keys))
     if config.stream:
-        stream = KeyedStream(server, keys, config)
-        server.add(stream, stream)
+        server.add(KeyedStream(server, keys, config))
     if config.commands:
         server.add(KeyedCommands(server, keys, config))

@@ -7,7 +7,6 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
 
 import msgpack
 
@@ -17,19 +16,6 @@ from softfinger.daemon.gateway.endpoints import Endpoint, Poller
 from softfinger.daemon.gateway.request_queue import RequestQueue
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Topics
-
-
-class Stream(Protocol):
-    """Where subscribers come in: `endpoints.StreamEndpoint` or `curve.KeyedStream`."""
-
-    wanted: int  # topics as bits
-
-    @property
-    def backlog(self) -> int:
-        """Bytes that wait for subscribers."""
-
-    def publish(self, topic: int, message: bytes) -> None:
-        """One message to all who want its topic."""
 
 
 class Repeated:
@@ -75,7 +61,6 @@ class Server:
         self.repeated = Repeated(config.topics)
         self._end = end
         self._endpoints: list[Endpoint] = []
-        self._stream: Stream | None = None
         self._reported = b""  # wanted topics and refused requests, as the loop knows them
         self._begun = 0  # the epoch, as the loop knows it
         self._unsent: deque[bytes] = deque(maxlen=bounds.UNSENT)
@@ -85,10 +70,9 @@ class Server:
         self.over = False
         self.poller.watch(end.fileno(), select.EPOLLIN, lambda _: self._take_packets())
 
-    def add(self, endpoint: Endpoint, stream: Stream | None = None) -> None:
-        """Serve those who come in there; ``stream`` is the endpoint that publishes."""
+    def add(self, endpoint: Endpoint) -> None:
+        """Serve those who come in there."""
         self._endpoints.append(endpoint)
-        self._stream = stream or self._stream
 
     def step(self, seconds: float = bounds.TEND) -> None:
         """Wait for the loop or a client for so long at most, and serve them."""
@@ -105,7 +89,7 @@ class Server:
         begun = min((endpoint.begun for endpoint in self._endpoints), default=0)
         if begun != self._begun and self._send(loop_link.BEGUN + loop_link.EPOCHS.pack(begun)):
             self._begun = begun
-        wanted = self._stream.wanted if self._stream is not None else 0
+        wanted = max((endpoint.wanted for endpoint in self._endpoints), default=0)
         report = loop_link.WANTED + loop_link.WANTS.pack(wanted, self.requests.refused)
         if report != self._reported and self._send(report):
             self._reported = report
@@ -177,9 +161,9 @@ class Server:
             message = bytes(self._pieces)
             self._pieces.clear()
         again = self.repeated.add(topic, message)
-        if self._stream is not None:
+        for endpoint in self._endpoints:
             # Subscribers may have come back before the loop has: they get its last events, too.
-            self._stream.publish(topic, again if flags & loop_link.KEEP else message)
+            endpoint.publish(topic, again if flags & loop_link.KEEP else message)
 
     def close(self) -> None:
         """Let subscribers take what waits, for a moment, and disconnect all."""
@@ -188,7 +172,7 @@ class Server:
         self._end.close()
         while self._unsent and time.monotonic() < deadline:
             self._publish_some()
-        while self._stream is not None and self._stream.backlog and time.monotonic() < deadline:
+        while any(each.backlog for each in self._endpoints) and time.monotonic() < deadline:
             self.poller.step(0.01, bounds.TURN)
         for endpoint in self._endpoints:
             endpoint.close()

@@ -71,11 +71,7 @@ class ContactFilter:
         state.t = -math.inf
         shares = np.linspace(1e-3, 1.0, kernels.LAW_POINTS)
         for finger, table in enumerate(tables):
-            law = (
-                np.zeros(shares.shape)
-                if materials is None
-                else materials[finger].force_error(shares)
-            )
+            law = 0.0 if materials is None else materials[finger].force_error(shares)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
         self._history: Any = np.zeros(
             round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
@@ -172,15 +168,11 @@ def _fill_from_frame(
     contact: Contact, estimate: ContactEstimate, table: FloatArray, law: FloatArray, radius: float
 ) -> None:
     """Fill ``contact`` from one frame's estimate alone; ``table`` and ``law``: its tip's."""
-    touches = estimate.contact
-    contact.d = estimate.d if touches else 0.0
-    contact.theta = estimate.tilt_x if touches else 0.0
-    contact.tilt_y = estimate.tilt_y if touches else 0.0
-    contact.d_std = estimate.d_std if touches else 0.0
-    contact.theta_std = estimate.tilt_x_std if touches else 0.0
+    contact.d, contact.theta = estimate.d, estimate.tilt_x  # and without a contact 0, as all else
+    contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
-    if touches:
+    if estimate.contact:
         tilt = total_tilt(contact.theta, contact.tilt_y)
         force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
         # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.

@@ -55,15 +55,19 @@ def make_models(
     A finger that takes no part, or has no sensor, goes by the settings alone. Raises as
     `profile.factory.make_table` and `calibration_file.calibration_for`.
     """
-    made: list[FingerModel] = []
-    if settings.tip.physics == "measured":
-        return _measured_models(settings, on_event)
+    measured = settings.tip.physics == "measured"
+    made: dict[int, FingerModel] = {}
     common: tuple[Material, ContactTable] | None = None
     for finger, name in enumerate(FINGERS):
         calibration = None
         if name in settings.scene.fingers and settings.tactile.backend != "none":
             calibration = calibration_for(settings, finger)
-        if calibration is not None and calibration.modulus is not None:
+        if measured:
+            if name not in settings.scene.fingers:
+                continue  # it has the other's
+            material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
+            table = make_table(settings, material, None, tip=tip)
+        elif calibration is not None and calibration.modulus is not None:
             material = calibration.modulus.material()
             problem = law_problem(material, settings.material.force_error_max)
             if problem:
@@ -75,7 +79,7 @@ def make_models(
                 common = law, make_table(settings, law, cache, on_event)
             material, table = common
         grid = calibrated_grid(settings, finger, calibration)
-        made.append(FingerModel(finger, material, table, grid, calibration))
+        made[finger] = FingerModel(finger, material, table, grid, calibration)
         if calibration is not None and on_event is not None:
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:
@@ -84,23 +88,6 @@ def make_models(
                 f"{worst_force_error(material):.1%} of F at most"
             )
             on_event("info", "material", text)
-    return made[0], made[1]
-
-
-def _measured_models(
-    settings: Settings, on_event: Callable[[str, str, str], None] | None
-) -> tuple[FingerModel, FingerModel]:
-    """Those of tips with curves of their own; a finger that takes no part has the other's."""
-    material, made = Material.constant(1.0), {}
-    for name in settings.scene.fingers:
-        finger = FINGERS.index(name)
-        calibration = calibration_for(settings, finger)
-        tip = _measured_tip(settings, finger, calibration)
-        table = make_table(settings, material, None, tip=tip)
-        grid = calibrated_grid(settings, finger, calibration)
-        made[finger] = FingerModel(finger, material, table, grid, calibration)
-        if calibration is not None and on_event is not None:
-            on_event("info", "calibration", f"{name}: {calibration.summary()}")
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))
     return left, right
 

@@ -17,7 +17,6 @@ from softfinger.daemon.types import FINGERS, GRIP_SHARE
 
 _LONGEST = 60  # characters of a value that are shown
 _DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own
-_CELLS_MIN = 9  # under a solid tip
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
@@ -95,58 +94,54 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
             f'tip.physics: found "measured" with tactile.backend = "{backend}", expected "springs" '
             'or "solid": measured curves are of frames that a board sends'
         )
-        return
+    else:
+        file = 'the file of `softfinger calibrate law` with tip.physics = "measured"'
+        yield from _lacking(settings, "calibration", file)
+
+
+def _lacking(settings: Settings, key: str, expected: str) -> Iterator[str]:
+    """A text of the tactile settings that a finger of the scene must have."""
     for name in settings.scene.fingers:
-        if not settings.tactile.calibration[FINGERS.index(name)]:
-            yield (
-                f'tactile.calibration: found "" for {name}, expected the file of `softfinger '
-                'calibrate law` with tip.physics = "measured"'
-            )
+        if not getattr(settings.tactile, key)[FINGERS.index(name)]:
+            yield f'tactile.{key}: found "" for {name}, expected {expected}'
+
+
+def _above(key: str, found: float, unit: str, most: float, why: str) -> Iterator[str]:
+    if found > most:
+        yield f"{key}: found {found:g} {unit}, expected at most {most:.3g} {unit}, {why}"
 
 
 def _solid_tip(settings: Settings) -> Iterator[str]:
-    if settings.tip.physics != "solid":
+    tip, tactile = settings.tip, settings.tactile
+    if tip.physics != "solid":
         return
     if settings.material.law != "constant":
         yield f'material.law: found "{settings.material.law}", expected "constant" for a solid tip'
     if settings.estimator.method != "ml":
         yield 'estimator.method: found "moments", expected "ml" for a solid tip'
-    deepest = 0.4 * settings.tip.radius
-    if settings.safety.d_max > deepest:
-        yield (
-            f"safety.d_max: found {settings.safety.d_max:g} m, expected at most {deepest:g} m, "
-            "0.4 of a solid tip's radius"
-        )
-    yield from _cells_under(settings)
+    why = "0.4 of a solid tip's radius"
+    yield from _above("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
+    if tactile.backend == "none":
+        return
+    why = "a quarter of a solid tip's radius: more of it hides θ"
+    blurred = list(_above("tactile.blur", tactile.blur, "m", 0.25 * tip.radius, why))
+    yield from blurred
+    if not [*blurred, *_blur(settings)]:
+        yield from _cells_under(settings)
 
 
 def _cells_under(settings: Settings) -> Iterator[str]:
-    """A solid tip's contact is told from all of its base. Kinematics has the rest of this check."""
-    tactile, a = settings.tactile, settings.tip.radius
-    if tactile.backend == "none":
-        return
-    if tactile.blur > 0.25 * a:
-        yield (
-            f"tactile.blur: found {tactile.blur:g} m, expected at most {0.25 * a:g} m, a quarter "
-            "of a solid tip's radius: more of it hides θ"
-        )
-        return
-    pitch_y = tactile.pitch_y or tactile.pitch
-    within = 0.95 * a - tactile.blur - 2.0 * (tactile.centre_error + tactile.pitch_error * a)
-    cells = sum(
-        math.hypot(
-            (abs(col - 0.5 * (tactile.cols - 1) - tactile.centre[0] / tactile.pitch) + 0.5)
-            * tactile.pitch,
-            (abs(row - 0.5 * (tactile.rows - 1) - tactile.centre[1] / pitch_y) + 0.5) * pitch_y,
-        )
-        < within
-        for row in range(tactile.rows)
-        for col in range(tactile.cols)
-    )
-    if cells < _CELLS_MIN:
+    """A solid tip's contact is told from all of its base."""
+    from softfinger.daemon.profile.factory import make_grid, make_tip
+    from softfinger.kinematics.estimation.error_budget import Uncertainty
+    from softfinger.kinematics.estimation.solid_fit import CELLS_MIN, within_rim
+
+    known = Uncertainty(centre=settings.tactile.centre_error, pitch=settings.tactile.pitch_error)
+    cells = within_rim(make_grid(settings), make_tip(settings), known).sum()
+    if cells < CELLS_MIN:
         yield (
             f"tactile.pitch, tactile.centre: found {cells} cells well within a solid tip's rim, "
-            f"expected at least {_CELLS_MIN}"
+            f"expected at least {CELLS_MIN}"
         )
 
 
@@ -187,20 +182,14 @@ def _wedge(settings: Settings) -> Iterator[str]:
 
 
 def _dither(settings: Settings) -> Iterator[str]:
-    control, rate = settings.control, settings.loop.rate
+    control = settings.control
     if control.law != "upright":
         return
     most = settings.safety.current_max * control.torque_constant
-    if control.dither_torque > most:
-        yield (
-            f"control.dither_torque: found {control.dither_torque:g} N·m, expected at most "
-            f"{most:.3g} N·m, what safety.current_max gives"
-        )
-    if control.dither_frequency > rate / _DITHER_TICKS:
-        yield (
-            f"control.dither_frequency: found {control.dither_frequency:g} Hz, expected at most "
-            f"{rate / _DITHER_TICKS:g} Hz, {_DITHER_TICKS} ticks a period"
-        )
+    why = "what safety.current_max gives"
+    yield from _above("control.dither_torque", control.dither_torque, "N·m", most, why)
+    most, why = settings.loop.rate / _DITHER_TICKS, f"{_DITHER_TICKS} ticks a period"
+    yield from _above("control.dither_frequency", control.dither_frequency, "Hz", most, why)
 
 
 def _cells(settings: Settings) -> Iterator[str]:
@@ -215,19 +204,15 @@ def _cells(settings: Settings) -> Iterator[str]:
 
 
 def _blur(settings: Settings) -> Iterator[str]:
-    tactile, blur = settings.tactile, settings.tactile.blur
+    tactile = settings.tactile
     height = tactile.rows * (tactile.pitch_y or tactile.pitch)
     most = 0.5 * min(height, tactile.cols * tactile.pitch)
-    if blur > most:
-        yield f"tactile.blur: found {blur:g} m, expected at most {most:g} m, half the sensor"
+    yield from _above("tactile.blur", tactile.blur, "m", most, "half the sensor")
 
 
 def _recordings(settings: Settings) -> Iterator[str]:
-    if settings.tactile.backend != "replay":
-        return
-    for name in settings.scene.fingers:
-        if not settings.tactile.recording[FINGERS.index(name)]:
-            yield f'tactile.recording: found "" for {name}, expected a recording'
+    if settings.tactile.backend == "replay":
+        yield from _lacking(settings, "recording", "a recording")
 
 
 def _clock(settings: Settings) -> Iterator[str]:

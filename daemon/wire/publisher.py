@@ -7,8 +7,7 @@ that nobody subscribes to are not packed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,9 @@ from softfinger.daemon.wire.schema import (
     Rates,
 )
 
+if TYPE_CHECKING:
+    from softfinger.daemon.loop.timing import Statistics
+
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
 GATEWAY_TOPICS = Topics(
     tuple(topic.decode() for topic in TOPICS), settings=_INDEX[SETTINGS], events=_INDEX[EVENT]
@@ -41,17 +43,6 @@ def bit(topic: bytes) -> int:
 
 
 _COMMANDS = bit(COMMAND)
-
-
-class TickStatistics(Protocol):
-    """Histograms of the loop's times: `loop.timing.Statistics`."""
-
-    @property
-    def ticks(self) -> int:
-        """How many were counted."""
-
-    def spreads(self) -> Mapping[str, Any]:
-        """Median, tail and largest value [s] by the time's name."""
 
 
 class Publisher:
@@ -101,7 +92,7 @@ class Publisher:
         self._send(TACTILE, frame, data, finger, facts, wall, step, number)
 
     def stats(
-        self, state: State, period: float, rates: Rates, statistics: TickStatistics, step: int = 1
+        self, state: State, period: float, rates: Rates, statistics: Statistics, step: int = 1
     ) -> None:
         """Publish ``hand/stats``, every ``step`` ticks."""
         self._send(STATS, state, period, rates, statistics, step)

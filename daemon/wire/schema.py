@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.types import FINGERS, Frame
-from softfinger.daemon.wire.fields import TOPICS, field, fields_of, part, record, topic
-
-__all__ = ["TOPICS", "fields_of"]
+from softfinger.daemon.wire.fields import TOPICS as TOPICS
+from softfinger.daemon.wire.fields import field, part, record, topic
+from softfinger.daemon.wire.fields import fields_of as fields_of
 
 SCHEMA = 1
 STATE = b"hand/state"

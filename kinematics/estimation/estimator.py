@@ -24,7 +24,7 @@ from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
 from softfinger.kinematics.estimation.solid_budget import set_solid_budget
-from softfinger.kinematics.estimation.solid_fit import lay_out_solid
+from softfinger.kinematics.estimation.solid_fit import lay_out_solid, within_rim
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import LIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
@@ -123,8 +123,6 @@ _TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iterati
 _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
 PATCH_LEVEL = 4.9
-_RIM = {"bonded": 0.03, "lying": 0.05}  # of the radius: nearer to a solid tip's rim none counts
-_CELLS_MIN = 9  # that a solid tip's contact and shear can be told from
 _EXPLAINED_MIN = 0.8  # share of the frame's squared pressure below which an estimate is not valid
 
 
@@ -170,14 +168,10 @@ class ContactEstimator:
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()
-        alive = _within(grid, tip, known)
-        if live is not None:
-            alive &= np.asarray(live, dtype=bool)
-        if tip.physics == "solid" and alive.sum() < _CELLS_MIN:
-            raise ValueError(
-                f"a solid tip needs {_CELLS_MIN} live cells within its rim, got {alive.sum()}"
-            )
-        state = self._state = EstimatorState()
+        alive = np.ones(grid.shape, np.bool_) if live is None else np.asarray(live, dtype=bool)
+        # For compiled callers: the memory of `frame_pipeline.estimate_frame`, …
+        state = self.state = EstimatorState()
+        self.arena: tuple[FloatArray, IntArray | None, Any]  # … and what it takes last
         options = self._options = state.options
         options.noise = noise
         options.saturation = math.inf
@@ -193,17 +187,16 @@ class ContactEstimator:
         options.modulus = material.reference_modulus
         options.blur = grid.blur
         options.rotation = grid.rotation
-        self._solid: Any = None
-        self._places: IntArray | None
         if tip.physics == "solid":
-            self._arena, self._places, solid = lay_out_solid(state, grid, tip, alive, material)
-            set_solid_budget(state, solid, known, grid, tip, self._places, material.fit_error)
-            self._solid = solid.array
+            alive = alive & within_rim(grid, tip, known)
+            arena, places, solid = lay_out_solid(state, grid, tip, alive, material)
+            set_solid_budget(state, solid, known, grid, tip, places, material.fit_error)
+            self.arena = arena, places, solid.array
         else:
             set_law(state.law, material.law)
             state.moments.ratios = moment_ratios(tip, material)
             set_budget(state, known, grid, tip, material.fit_error)
-            self._arena, self._places = _lay_out(state, grid, tip, alive)
+            self.arena = *_lay_out(state, grid, tip, alive), None
         self._estimate: Any = state.estimate.array
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
@@ -233,9 +226,9 @@ class ContactEstimator:
 
         Frames as for :meth:`update`. Raises ValueError for a wrong shape or type.
         """
-        estimate = self._state.estimate
+        estimate = self.state.estimate
         kept, seq, last = self._estimate.copy(), self._seq, self._last
-        self._last = ContactEstimate(sharing=self._state.budget.sharing)
+        self._last = ContactEstimate(sharing=self.state.budget.sharing)
         try:
             estimate.warm = False
             found = self.update(frame, pascal_per_count)
@@ -272,13 +265,11 @@ class ContactEstimator:
         self._frame[...] = frame
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
-            self._state.array,
+            self.state.array,
             self._frame,
             float(pascal_per_count),
             float(step),
-            self._arena,
-            self._places,
-            self._solid,
+            *self.arena,
         )
         result = self._last
         # The record's fields in their order: read at once, a tenth of the time of one by one.
@@ -309,40 +300,8 @@ class ContactEstimator:
 
     def reset(self) -> None:
         """Forget the last estimate: the next frame starts cold."""
-        self._state.estimate.warm = False
+        self.state.estimate.warm = False
         self._seq = None
-
-    @property
-    def state(self) -> EstimatorState:
-        """The memory of :func:`estimation.frame_pipeline.estimate_frame`, for compiled callers."""
-        return self._state
-
-    @property
-    def arena(self) -> tuple[FloatArray, IntArray | None, Any]:
-        """What the same function takes last; see `estimation.state`."""
-        return self._arena, self._places, self._solid
-
-
-def _within(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
-    """The cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
-
-    A bonded base's stress is singular there, which no two meshes have alike: from independent
-    elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. Under a
-    tilt a lying base pulls there, where real rubber lifts. And where the tip's place is uncertain,
-    the rim may be elsewhere.
-    """
-    if tip.physics == "springs":
-        return np.ones(grid.shape, np.bool_)
-    margin = max(_RIM[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
-    cells = grid.on(tip)
-    x, y = (
-        np.abs(start + pitch * (np.arange(count) + 0.5)) + 0.5 * pitch
-        for start, pitch, count in (
-            (cells.x, cells.pitch_x, cells.cols),
-            (cells.y, cells.pitch_y, cells.rows),
-        )
-    )
-    return np.asarray(np.hypot(x, y[:, None]) < tip.radius - margin - grid.blur)
 
 
 @lru_cache(maxsize=4)
