@@ -37,8 +37,8 @@ class Connection:
     tired = False  # it floods: it is not to be read for a while
     topics = 0  # that it subscribes to, as bits
 
-    def __init__(self, endpoint: Any, accepted: socket.socket, limit: int, epoch: int) -> None:
-        """``limit`` bounds a frame [bytes]; ``endpoint`` is one of `gateway.endpoints`."""
+    def __init__(self, endpoint: Any, accepted: socket.socket, epoch: int) -> None:
+        """``endpoint`` is one of `gateway.endpoints`."""
         self._endpoint = endpoint
         self.socket = accepted
         self.fd = accepted.fileno()
@@ -47,7 +47,7 @@ class Connection:
         self.ready = False  # the handshake is over
         self.resting = False
         self.waiting = 0  # bytes that it has not taken yet
-        self._parser = FrameParser(limit)
+        self._parser = FrameParser(endpoint.limit)
         self._controls = Allowance(bounds.CONTROLS)
         self._out: deque[memoryview] = deque()
         self.send(GREETING)
@@ -168,12 +168,10 @@ class CommandConnection(Connection):
 
     name = ""  # clients without keys have none
 
-    def __init__(
-        self, endpoint: Any, accepted: socket.socket, limit: int, epoch: int, pace: Pace
-    ) -> None:
-        self.pace = pace
+    def __init__(self, endpoint: Any, accepted: socket.socket, epoch: int) -> None:
+        self.pace: Pace = endpoint.requests.new_pace(endpoint.now)
         self._parts: list[bytes] = []
-        super().__init__(endpoint, accepted, limit, epoch)
+        super().__init__(endpoint, accepted, epoch)
 
     def read(self, now: float) -> None:
         self.pace.begin_read()
@@ -207,13 +205,9 @@ class StreamConnection(Connection):
     TYPE = b"PUB"
     PARTNERS = frozenset({b"SUB", b"XSUB"})
 
-    def __init__(
-        self, endpoint: Any, accepted: socket.socket, limit: int, epoch: int, queue: int
-    ) -> None:
-        """``queue`` messages wait for it."""
-        self._queue = queue
+    def __init__(self, endpoint: Any, accepted: socket.socket, epoch: int) -> None:
         self._prefixes: set[bytes] = set()
-        super().__init__(endpoint, accepted, limit, epoch)
+        super().__init__(endpoint, accepted, epoch)
 
     def _control(self, body: bytes) -> None:
         if self.ready and body[:10] == b"\x09SUBSCRIBE":
@@ -243,5 +237,5 @@ class StreamConnection(Connection):
 
     def publish(self, message: bytes) -> None:
         """One message, which is dropped when too many wait."""
-        if len(self._out) < self._queue:
+        if len(self._out) < self._endpoint.queue:
             self.send(message)

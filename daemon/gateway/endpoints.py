@@ -103,20 +103,19 @@ class Endpoint:
 class PlainEndpoint(Endpoint, Generic[_Connection]):
     """A listening socket and its connections."""
 
+    CONNECTION: type[_Connection]
+
     def __init__(self, listener: Listener, poller: Poller, limit: int, places: int) -> None:
         """``limit`` bounds a frame [bytes], ``places`` the connections."""
         self._listener = listener
         self._poller = poller
-        self._limit = limit
+        self.limit = limit
         self._places = places
         self._connections: dict[int, _Connection] = {}  # those first that were silent longest
         self._handshakes: dict[Connection, float] = {}  # until when, in the order they came
         self._resting: deque[tuple[float, Connection]] = deque()
         self._older = 0  # that wait to be accepted, and came before the present epoch
         poller.watch(listener.fileno(), select.EPOLLIN, lambda _: self.accept())
-
-    def _make(self, accepted: socket.socket, epoch: int) -> _Connection:
-        raise NotImplementedError
 
     def _leaves(self) -> Connection | None:
         """Who leaves so that another may come; None: nobody."""
@@ -150,7 +149,7 @@ class PlainEndpoint(Endpoint, Generic[_Connection]):
             accepted.setblocking(False)
             if accepted.family != socket.AF_UNIX:
                 accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection = self._make(accepted, epoch)
+            connection = self.CONNECTION(self, accepted, epoch)
             if connection.alive:
                 self._connections[connection.fd] = connection
                 self._handshakes[connection] = self.now + bounds.HANDSHAKE
@@ -220,15 +219,13 @@ class PlainEndpoint(Endpoint, Generic[_Connection]):
 class CommandEndpoint(PlainEndpoint[CommandConnection]):
     """Where requests come in."""
 
+    CONNECTION = CommandConnection
+
     def __init__(
         self, listener: Listener, poller: Poller, limit: int, places: int, requests: RequestQueue
     ) -> None:
-        self._requests = requests
+        self.requests = requests
         super().__init__(listener, poller, limit, places)
-
-    def _make(self, accepted: socket.socket, epoch: int) -> CommandConnection:
-        pace = self._requests.new_pace(self.now)
-        return CommandConnection(self, accepted, self._limit, epoch, pace)
 
     def _leaves(self) -> Connection | None:
         return super()._leaves() or next(iter(self._connections.values()), None)
@@ -236,11 +233,13 @@ class CommandEndpoint(PlainEndpoint[CommandConnection]):
     def take(self, connection: CommandConnection, envelope: bytes, payload: bytes) -> None:
         fd = connection.fd
         self._connections[fd] = self._connections.pop(fd)  # it was silent for the shortest time
-        self._requests.take(connection, envelope, payload, self.now)
+        self.requests.take(connection, envelope, payload, self.now)
 
 
 class StreamEndpoint(PlainEndpoint[StreamConnection]):
     """Where subscribers come in."""
+
+    CONNECTION = StreamConnection
 
     def __init__(
         self,
@@ -257,12 +256,9 @@ class StreamEndpoint(PlainEndpoint[StreamConnection]):
         """
         self._names = tuple(name.encode() for name in topics.names)
         self.matching = topics.matching
-        self._queue = queue
+        self.queue = queue
         self._late = late
         super().__init__(listener, poller, bounds.SUBSCRIPTION, places)
-
-    def _make(self, accepted: socket.socket, epoch: int) -> StreamConnection:
-        return StreamConnection(self, accepted, self._limit, epoch, self._queue)
 
     def _leaves(self) -> Connection | None:
         idle = (each for each in self._connections.values() if not each.topics)

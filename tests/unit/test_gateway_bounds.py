@@ -173,7 +173,7 @@ def test_a_reader_that_reads_nothing_does_not_fill_the_memory(
         for client in stuck:
             client.send(frame(b"\x01hand/"))
         until(lambda: served.settle() or served.publisher.wanted & bit(STATE))
-        stream: Any = served.service._stream
+        stream: Any = served.service._endpoints[0]
         state = State()
         for _ in range(60_000):
             served.publisher.state(state, BOTH)
