@@ -17,7 +17,6 @@ import struct
 import time
 import tty
 from collections.abc import Callable
-from pathlib import Path
 
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 
@@ -37,7 +36,7 @@ _LAG = 0.0005
 # before each request is expected until _LATE after it [s].
 _SELDOM, _SOON, _LATE = 0.0009, 0.0003, 0.0002
 _NEVER = -math.inf, -math.inf
-_SCHEDSTAT = Path("/proc/thread-self/schedstat")  # ns run, ns waited for a processor, times run
+_SCHEDSTAT = "/proc/thread-self/schedstat"  # ns run, ns waited for a processor, times run
 
 
 def open_pty() -> tuple[int, int, str]:
@@ -82,6 +81,7 @@ class PtyServoBus:
         self._spin = spin
         self._clock = clock
         self._waited: float | None = None  # s this thread waited for a processor, at the last look
+        self._statistics = -1  # the open file of this thread's scheduling statistics
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
@@ -112,6 +112,9 @@ class PtyServoBus:
             os.close(self._master)
             os.close(self._slave)
         self._master = self._slave = -1
+        if self._statistics >= 0:
+            os.close(self._statistics)
+        self._statistics = -1
 
     def client_baud(self) -> int:
         """The rate that the terminal is set to."""
@@ -149,7 +152,9 @@ class PtyServoBus:
     def _arrival(self, t: float, since: float) -> float:
         """When bytes seen at time t came, if others had the processor from then on."""
         try:
-            waited = int(_SCHEDSTAT.read_bytes().split()[1]) * 1e-9
+            if self._statistics < 0:
+                self._statistics = os.open(_SCHEDSTAT, os.O_RDONLY | os.O_CLOEXEC)
+            waited = int(os.pread(self._statistics, 100, 0).split()[1]) * 1e-9
         except OSError:  # a kernel without scheduling statistics
             return t
         last, self._waited = self._waited, waited
