@@ -104,4 +104,7 @@ def test_only_what_was_found_changes_in_a_profile():
         '# mine\n[hand]\nq_min = [-0.5, 0.1] # stop\n[servos] # a\nzero = [1, 2]\nport = "x"\n'
         "[tactile]\nrows = 8\n"
     )
+    assert put("servos.ids = [1, 2] # a\n[hand]\n", "servos", {"zero": [1], "ids": [2, 1]}) == (
+        "servos.zero = [1]\nservos.ids = [2, 1] # a\n[hand]\n"
+    )
     assert put("", "servos", {"zero": [1, 2]}).strip() == "[servos]\nzero = [1, 2]"

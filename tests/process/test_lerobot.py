@@ -112,7 +112,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(
     )
     assert held["left_touch"].max() > first["left_touch"].max()
     assert robot.send_action(grip)["grip.force"] == 5.0
-    assert 0.0 <= held["left.touch_age"] < 60.0
+    assert abs(held["left.touch_age"]) < 60.0  # a frame newer than the state may have come
     act_until(
         robot,
         {"grip.force": 5.0, "grip.angle": 0.1},

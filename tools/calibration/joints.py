@@ -142,16 +142,21 @@ def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) 
 
 
 def put(text: str, section: str, values: dict[str, list[Any]]) -> str:
-    """A profile's text with these arrays in its ``[section]``, where they stand or as new lines."""
+    """A profile's text with these arrays in its ``[section]``, where they stand or as new lines.
+
+    Without that header they are ``section.key`` where the text has such keys.
+    """
     head = re.search(rf"(?m)^\[{section}\].*\n?", text)
-    if head is None:
+    if head is None and not re.search(rf"(?m)^{section}\.", text):
         return put(f"{text.rstrip()}\n\n[{section}]\n", section, values)
-    start = head.end()
+    prefix = "" if head else f"{section}."
+    start = head.end() if head else 0
     after = re.compile(r"(?m)^\[").search(text, start)
     end = after.start() if after else len(text)
     body = text[start:end]
     for key, value in reversed(values.items()):
-        body, found = re.subn(rf"(?m)^({key}\s*=\s*)\[[^\]]*\]", rf"\g<1>{value}", body)
+        name = re.escape(prefix + key)
+        body, found = re.subn(rf"(?m)^({name}\s*=\s*)\[[^\]]*\]", rf"\g<1>{value}", body)
         if not found:
-            body = f"{key} = {value}\n{body}"
+            body = f"{prefix}{key} = {value}\n{body}"
     return text[:start] + body + text[end:]
