@@ -97,12 +97,13 @@ def _profiles() -> list[str]:
 
 
 def _comments(lines: list[str], node: ast.ClassDef) -> dict[str, str]:
-    """What stands behind each field of a class."""
+    """What stands behind each field of a class, or above it where its line is full."""
     found = {}
     for each in node.body:
         if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name):
-            rest = lines[(each.end_lineno or 1) - 1].encode()[each.end_col_offset :].decode()
-            found[each.target.id] = rest.strip().removeprefix("#").strip()
+            own = "\n".join(lines[each.lineno - 1 : each.end_lineno])
+            word = re.search(r"# (.*)$", own, re.M) or re.match(r" +# (.*)", lines[each.lineno - 2])
+            found[each.target.id] = word[1] if word else ""
     return found
 
 
@@ -250,6 +251,55 @@ def api() -> str:
     return "".join(parts)
 
 
+# --- tables within pages --------------------------------------------------------------------------
+
+
+def checkpoints() -> str:
+    """Closed forms at a few places."""
+    import math
+
+    from softfinger.kinematics.contact.closed_form import closed_forms
+
+    rows = [_head("d [mm]", "θ [°]", "F [N]", "U [mJ]", "∂U/∂d [N]", "∂U/∂θ [mN·m]")]
+    for d, theta in ((2, 0), (2, 30), (4, 0), (4, 15), (6, 30), (8, 0), (8, 30)):
+        c = closed_forms(0.304e6, 1e-3 * d, math.radians(theta))
+        values = c.force, 1e3 * c.energy, c.energy_d, 1e3 * c.energy_theta
+        rows.append(_row(str(d), str(theta), *(f"{float(each):.12g}" for each in values)))
+    return "".join(rows)
+
+
+def errata() -> str:
+    """Each erratum that `softfinger figures` marks, once."""
+    from softfinger.tools.paper.figures import pages
+
+    found = dict.fromkeys(each for page in pages().values() for each in page.errata)
+    rows = [_row(each.place, each.printed, each.holds) for each in found]
+    return _head("place", "printed", "holds") + "".join(rows)
+
+
+def measured() -> str:
+    """The figures that docs/benchmarks.json keeps, of a `softfinger bench` without names."""
+    content = json.loads((ROOT / "docs" / "benchmarks.json").read_text(encoding="utf-8"))
+    load = " to ".join(f"{each:.1f}" for each in content["load"])
+    machine = f"{content['machine']}, {content['cores']} cores, load {load}"
+    rows = [f"{machine}, Python {content['python']}.\n\n"]
+    table = ""
+    for row in content["rows"]:
+        if not row["table"] or row.get("median") is None:
+            continue  # a yardstick, or a bound
+        if row["table"] != table:
+            table = row["table"]
+            title = f"{row['measurement']}: {table}"
+            rows += ["\n", _head(title, "median", "99 %", "unit", "error")]
+        median, late = (f"{row[key]:.3g}" if row.get(key) is not None else "" for key in _TIMES)
+        error = f"{row['error']:.1e}" if row.get("error") else ""
+        rows.append(_row(row["name"], median, late, row["unit"], error))
+    return "".join(rows)
+
+
+_TIMES = ("median", "p99")
+TABLES = {"checkpoints": checkpoints, "errata": errata}
+
 PAGES: dict[str, Callable[[], str]] = {
     "index.md": _from("README.md"),
     "contributing.md": _from("CONTRIBUTING.md"),
@@ -286,7 +336,10 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Links as a reader of the repository follows them, made the site's."""
+    """Tables made from the code; links as a reader of the repository follows them."""
+    markdown = re.sub(
+        r" <!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
+    )
 
     def link(found: re.Match[str]) -> str:
         target = found[1].removeprefix("../").removeprefix("docs/")

@@ -80,6 +80,7 @@ class Section(BaseModel):
 class SceneSettings(Section):
     """What takes part. A backend set to ``none`` takes the servos or the sensors out."""
 
+    # one or two
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, max_length=2)] = ("left", "right")
     object_model: bool = True  # estimate the object's angle and width from the two contacts
 
@@ -87,11 +88,11 @@ class SceneSettings(Section):
 class GeometrySettings(Section):
     """Two rotational fingers in a plane: pivots at (∓pivot_separation/2, 0), q > 0 closes."""
 
-    pivot_separation: Length = 0.100
-    finger_length: Length = 0.080
-    finger_offset: Place = 0.0
-    q_min: tuple[Angle, Angle] = (-0.5, -0.5)
-    q_max: tuple[Angle, Angle] = (1.0, 1.0)
+    pivot_separation: Length = 0.100  # m between the fingers' axes
+    finger_length: Length = 0.080  # m, axis to the centre of the tip's base, along the finger
+    finger_offset: Place = 0.0  # m, the same across the finger; positive towards the other one
+    q_min: tuple[Angle, Angle] = (-0.5, -0.5)  # rad, as far as it opens
+    q_max: tuple[Angle, Angle] = (1.0, 1.0)  # rad, as far as it closes
     open_angle: tuple[Angle, Angle] = (0.0, 0.0)  # where release goes
 
 
@@ -101,8 +102,8 @@ class TipSettings(Section):
     Those are measured by `calibrate law` and stand in the files of ``tactile.calibration``.
     """
 
-    radius: Length = 0.020
-    physics: Literal["springs", "solid", "measured"] = "springs"
+    radius: Length = 0.020  # m
+    physics: Literal["springs", "solid", "measured"] = "springs"  # the contact model
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
     face: Literal["frictionless", "sticking"] = "frictionless"  # a solid tip on the object
@@ -111,9 +112,9 @@ class TipSettings(Section):
 class MaterialSettings(Section):
     """Stress-strain law of the tip: the paper's Table I, a constant modulus, or measured points."""
 
-    law: Literal["table_i", "constant", "points"] = "table_i"
+    law: Literal["table_i", "constant", "points"] = "table_i"  # stress over strain
     modulus: Modulus = 0.304e6  # Pa, for law = "constant"
-    strain: tuple[Finite, ...] = ()  # for law = "points"
+    strain: tuple[Finite, ...] = ()  # 1, for law = "points"
     stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
     modulus_error: Annotated[float, Field(ge=0, le=1)] = 0.0  # relative, standard deviation
     force_error_max: Positive = 0.05  # of F, by the law's misfit of its points, d > radius/20
@@ -122,16 +123,17 @@ class MaterialSettings(Section):
 class TableSettings(Section):
     """The contact table: largest relative error of force, energy and their partials."""
 
-    tolerance: Annotated[float, Field(ge=1e-13, le=1e-2)] = 1e-9
+    tolerance: Annotated[float, Field(ge=1e-13, le=1e-2)] = 1e-9  # relative
 
 
 class ServoSettings(Section):
     """The joints."""
 
-    backend: Annotated[str, _one_of(SERVOS)] = "simulated"
+    backend: Annotated[str, _one_of(SERVOS)] = "simulated"  # what drives the joints
     port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
-    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000
-    model: Model = "XM430-W350"
+    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000  # bit/s
+    model: Model = "XM430-W350"  # of both servos
+    # on the bus, each another
     ids: tuple[Annotated[int, Field(ge=0, le=252)], Annotated[int, Field(ge=0, le=252)]] = (1, 2)
     direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
     zero: tuple[Counts, Counts] = (2048, 2048)  # counts at q = 0
@@ -148,19 +150,19 @@ class ServoSettings(Section):
 class TactileSettings(Section):
     """The pressure grids under the tips."""
 
-    backend: Annotated[str, _one_of(TACTILE)] = "simulated"
-    port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")
-    baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000
-    rows: Annotated[int, Field(ge=4, le=256)] = 44
-    cols: Annotated[int, Field(ge=4, le=256)] = 44
-    pitch: Annotated[Length, Field(le=0.05)] = 0.058 / 44
+    backend: Annotated[str, _one_of(TACTILE)] = "simulated"  # where frames come from
+    port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")  # "{dir}" as for the servos
+    baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000  # bit/s
+    rows: Annotated[int, Field(ge=4, le=256)] = 44  # cells along y
+    cols: Annotated[int, Field(ge=4, le=256)] = 44  # cells along x
+    pitch: Annotated[Length, Field(le=0.05)] = 0.058 / 44  # m from cell to cell
     pitch_y: Annotated[float, Field(ge=0, le=0.05, json_schema_extra=_METRES)] = 0.0  # 0: as pitch
     centre: tuple[Place, Place] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
     rotation: tuple[Angle, Angle] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
     blur: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, the elastomer's standard deviation
     dead: tuple[Cells, Cells] = ((), ())  # cells [row, col] that are left out
     threshold: Annotated[int, Field(ge=0, le=255)] = 0  # smallest count sent; 0 stands for less
-    pascal_per_count: Positive = 4.0
+    pascal_per_count: Positive = 4.0  # Pa of one count
     full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
     rate: Rate = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
@@ -182,7 +184,7 @@ class EstimatorSettings(Section):
     force alone.
     """
 
-    method: Literal["moments", "ml"] = "ml"
+    method: Literal["moments", "ml"] = "ml"  # moments alone, or maximum likelihood
     free_gain: Literal["auto", True, False] = "auto"  # estimate measured/modelled pressure too
 
 
@@ -194,7 +196,8 @@ class LoopSettings(Section):
     ``auto`` is ``hand`` with these and ``real`` with others.
     """
 
-    rate: Annotated[float, Field(ge=10, le=5000)] = 500.0
+    rate: Annotated[float, Field(ge=10, le=5000)] = 500.0  # Hz, ticks
+    # auto: real; of a simulated hand one that stands still while the machine is late
     clock: Literal["auto", "hand", "real", "virtual"] = "auto"
 
 
@@ -217,9 +220,9 @@ class RealtimeSettings(Section):
 class StreamSettings(Section):
     """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
 
-    address: str = STREAM_ADDRESS
-    state_rate: Rate = 100.0
-    tactile_rate: Rate = 100.0
+    address: str = STREAM_ADDRESS  # tcp or ipc
+    state_rate: Rate = 100.0  # Hz
+    tactile_rate: Rate = 100.0  # Hz, of each finger's frames
     tactile_unit: Literal["count", "Pa"] = "count"  # raw, or what the estimator makes of it
     queue: Annotated[int, Field(ge=1, le=100_000)] = 2000  # messages kept for a slow subscriber
 
@@ -227,9 +230,9 @@ class StreamSettings(Section):
 class CommandSettings(Section):
     """The command server."""
 
-    address: str = COMMAND_ADDRESS
+    address: str = COMMAND_ADDRESS  # tcp or ipc
     lease: Seconds = 2.0  # s a commander keeps the hand after its last command
-    max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096
+    max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096  # bytes of a command
     per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is always heard
 
 
@@ -305,7 +308,7 @@ class SafetySettings(Section):
 class ObjectSettings(Section):
     """What the daemon assumes of the object."""
 
-    width: Length = 0.040
+    width: Length = 0.040  # m between its faces
     taper: Annotated[float, Field(ge=-1.5, le=1.5)] = (
         0.0  # rad between its faces; above 0 it is wider at the palm
     )
@@ -315,15 +318,15 @@ class ObjectSettings(Section):
 class SimulationSettings(Section):
     """The plant behind simulated backends and the emulator; these defaults are our own choice."""
 
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Annotated[int, Field(ge=0)] = 1  # of noise and faults
     object_mass: Factor = 0.10  # kg
-    object_shape: Annotated[str, _one_of(SHAPES)] = "rectangle"
-    object_width: Length = 0.040  # of a wedge: at half its height
-    object_height: Length = 0.060
-    object_radius: Length = 0.020  # of a disc
+    object_shape: Annotated[str, _one_of(SHAPES)] = "rectangle"  # seen from the side
+    object_width: Length = 0.040  # m; of a wedge: at half its height
+    object_height: Length = 0.060  # m, away from the palm
+    object_radius: Length = 0.020  # m, of a disc
     object_taper: Annotated[float, Field(ge=-1.5, le=1.5)] = 0.17  # rad between a wedge's faces
     object_position: tuple[Place, Place] = (0.0, 0.080)  # m, in the hand's plane
-    object_angle: Angle = 0.0
+    object_angle: Angle = 0.0  # rad, at the start
     gravity: tuple[Acceleration, Acceleration] = (
         0.0,
         0.0,
@@ -359,9 +362,9 @@ class SimulationSettings(Section):
 class TaskSettings(Section):
     """What the daemon does by itself after start."""
 
-    name: Literal["none", "demo"] = "none"
-    force: Positive = 8.0
-    angle: Angle = 0.14
+    name: Literal["none", "demo"] = "none"  # what the hand does by itself
+    force: Positive = 8.0  # N, the tips' mean
+    angle: Angle = 0.14  # rad, to either side
 
 
 class PluginSettings(Section):

@@ -66,3 +66,18 @@ def test_links_on_the_site(site: tuple[ModuleType, dict[str, str]]) -> None:
             )
             if anchor:
                 assert anchor in anchors(pages[target or name]), f"{name}: {target}#{anchor}"
+
+
+def test_every_setting_says_what_it_is(site: tuple[ModuleType, dict[str, str]]) -> None:
+    rows = re.findall(r"(?m)^\| `(\w+)` \|.*\| (.*?) ?\|$", site[1]["configuration.md"])
+    assert len(rows) > 150
+    assert [key for key, meaning in rows if not meaning] == []
+
+
+def test_every_erratum_is_told(site: tuple[ModuleType, dict[str, str]]) -> None:
+    from softfinger.tools.paper.figures import pages
+
+    text = site[1]["model.md"].replace("\\|", "|")
+    for page in pages().values():
+        assert all(each.holds in text for each in page.errata)
+    assert "15.8197516322" in text  # F at 4 mm, 15°
