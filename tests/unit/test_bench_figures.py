@@ -116,7 +116,8 @@ def test_frames_of_a_board_are_what_it_would_send() -> None:
     np.testing.assert_allclose(found[:, :4], seen, rtol=1e-9)
 
 
-def test_growth_has_slopes_and_bounds() -> None:
+def test_growth_has_slopes_and_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "MATERIALS", {"Table I": LAW})
     cells, errors = growth.cells((16, 24, 32), 1)
     assert all("∝ (cells a side)^" in note for note in cells.notes)
     assert len(cells.rows) == 21

@@ -1,4 +1,4 @@
-"""How cost and error grow: with cells, tolerance, subscribers, sensors and rate.
+"""How cost and error grow: with cells, tolerance and material, subscribers, sensors, rate, kernels.
 
 Each table is of one run in turns, and ends with the fitted slopes: the exponent of a power law over
 all points, and between the last two, which shows where it bends.
@@ -8,14 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import math
+import subprocess
+import tempfile
+import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.lookup import TableError
+from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks import contact, estimator
@@ -29,7 +34,9 @@ from softfinger.tools.benchmarks.measuring import (
     slopes,
     timed,
 )
+from softfinger.tools.benchmarks.rigs import SOFTFINGER, busy_seconds, can, hold, virtual_daemon
 from softfinger.tools.benchmarks.scenes import TimedScene, standing
+from softfinger.tools.benchmarks.startup import start
 from softfinger.tools.benchmarks.tick import in_place
 
 _SIDES = (8, 16, 32, 44, 64, 96, 128)  # cells
@@ -37,17 +44,33 @@ _PITCH = WIDTH / 44
 _TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 _SUBSCRIBERS = (0, 1, 3, 10, 30, 100)
 _RATES = (100.0, 200.0, 500.0, 1000.0, 2000.0)  # Hz
+# Words of scenes, each with more kernels.
+_STARTS = (
+    ("--set", "tactile.backend=none"),
+    ("--set", "servos.backend=none"),
+    (),
+    ("--set", "tactile.blur=0.5e-3"),
+)
+MATERIALS = {
+    "Table I": contact.LAW,
+    "constant": LINEAR,
+    "points": Material.from_points(
+        np.linspace(0.1, 1.0, 10), 1e5 * np.sinh(np.linspace(0.1, 1.0, 10))
+    ),
+}
 _FRAMES = 32
 _IN_TURN = 20  # ticks: whole periods of frames and state
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Cells, tolerance, and what a tick costs; ``brief`` takes every other point."""
+    """All of them; ``brief`` takes every other point."""
     step, rounds = (2, 5) if brief else (1, 25)
     return [
         *cells(_SIDES[::step], rounds),
         *tolerances(_TOLERANCES[::step], rounds),
         *ticks(step, 2 * rounds),
+        recording(_RATES[::step], rounds),
+        starts(_STARTS[::step], 1 if brief else 3),
     ]
 
 
@@ -85,35 +108,30 @@ def cells(sides: tuple[int, ...], rounds: int) -> list[Report]:
 
 
 def tolerances(wanted: tuple[float, ...], rounds: int) -> list[Report]:
-    """A table's lookup time, size and build time."""
+    """A table's lookup time, size and build time, for each material."""
     x = "tolerance"
     d, theta = contact.points(512)
-    built: dict[float, ContactTable] = {}
-    builds: list[Row] = []
-
-    for tolerance in wanted:
-        build = partial(ContactTable.build, TIP, contact.LAW, tolerance)
-        try:
-            built[tolerance] = build()
-        except TableError:  # not within 256 KiB
-            continue
-        spent = 1e-6 * np.array(timed(build, 3))
-        builds.append(figure(f"build: {tolerance:g}", "s", spent, **{x: tolerance}))
+    built: dict[str, tuple[ContactTable, list[float], Row]] = {}
+    for name, material in MATERIALS.items():
+        for tolerance in wanted:
+            with contextlib.suppress(TableError):  # not within 256 KiB
+                table = ContactTable.build(TIP, material, tolerance)
+                spent = timed(partial(ContactTable.build, TIP, material, tolerance), 2)
+                facts = {x: tolerance, "bound": table.max_error}
+                built[f"{name}: {tolerance:g}"] = table, spent, facts
     subjects = {
-        f"lookup: {t:g}": Subject(partial(contact.loop, table, d, theta), d.size)
-        for t, table in built.items()
+        name: Subject(partial(contact.loop, table, d, theta), d.size)
+        for name, (table, _, _) in built.items()
     }
     times = interleave(subjects, rounds)
-    lookups = [
-        figure(f"lookup: {t:g}", "ns", times[f"lookup: {t:g}"], **{x: t, "bound": table.max_error})
-        for t, table in built.items()
-    ]
-    sizes = [
-        figure(f"size: {t:g}", "KiB", [table.data.nbytes / 1024], **{x: t})
-        for t, table in built.items()
-    ]
-    named = (("lookup", lookups), ("table's size", sizes), ("table's build", builds))
-    return [_grown(title, rows, x) for title, rows in named]
+    found: dict[str, list[Row]] = {"lookup": [], "table's size": [], "table's build": []}
+    for name, (table, spent, facts) in built.items():
+        samples = ("ns", times[name]), ("KiB", [table.data.nbytes / 1024]), ("ms", spent)
+        for rows, (unit, values) in zip(found.values(), samples, strict=True):
+            rows.append(figure(name, unit, np.array(values), **facts))
+    for row in found["table's build"]:
+        row |= {key: 1e-3 * row[key] for key in ("median", "IQR", "p99")}
+    return [_grown(title, rows, x) for title, rows in found.items()]
 
 
 def ticks(step: int, rounds: int) -> list[Report]:
@@ -146,3 +164,44 @@ def _over(x: str, scenes: dict[float, TimedScene], rounds: int) -> Report:
     for row, rate in zip(rows, rates.values(), strict=True):
         row["of a processor %"] = 1e-4 * row["median"] * rate
     return _grown(f"tick over {x}", rows, x)
+
+
+def recording(rates: tuple[float, ...], rounds: int) -> Report:
+    """Processor time of a recorder that gets all topics, the state at every tick."""
+    x = "rate [Hz]"
+    rows = []
+    for rate in rates:
+        sections = {"loop": {"rate": rate}, "stream": {"state_rate": rate}}
+        with tempfile.TemporaryDirectory() as folder, virtual_daemon(sections) as daemon:
+            hold(daemon)
+            can(daemon)
+            words = ["record", "--address", daemon.settings.stream.address, f"{folder}/a.mcap"]
+            with subprocess.Popen([*SOFTFINGER, *words], stdout=subprocess.DEVNULL) as recorder:
+                publishing = daemon.loop._publishing
+                assert publishing is not None
+                while not publishing._publisher.wanted and recorder.poll() is None:
+                    in_place(daemon, rate, _IN_TURN)
+                shares = []
+                for _ in range(min(rounds, 10)):
+                    began, before = time.monotonic(), busy_seconds(recorder.pid)
+                    in_place(daemon, rate, round(0.3 * rate))
+                    taken = busy_seconds(recorder.pid) - before
+                    shares.append(100.0 * taken / (time.monotonic() - began))
+                recorder.terminate()
+        rows.append(figure(f"record: {rate:g}", "% of a processor", shares, **{x: rate}))
+    return _grown("recorder", rows, x)
+
+
+def starts(scenes: tuple[tuple[str, ...], ...], count: int) -> Report:
+    """First and later starts, to the first state, of scenes that need more and more kernels."""
+    x = "kernels"
+    rows: list[Row] = []
+    for words in scenes:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            cold = [start(folder, *words).seconds]
+            kernels = len(list(folder.rglob("*.nbc")))
+            warm = [start(folder, *words).seconds for _ in range(count)]
+        for kind, seconds in (("cold", cold), ("warm", warm)):
+            rows.append(figure(f"{kind}: {kernels}", "s", seconds, **{x: kernels}))
+    return _grown("start to the first state", rows, x)
