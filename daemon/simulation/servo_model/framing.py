@@ -75,6 +75,24 @@ class Packet(NamedTuple):
     size: int  # bytes it took on the wire
 
 
+def _is_plain(data: bytes) -> bool:
+    """Whether it is one whole packet without stuffing, as nearly all are."""
+    return (
+        10 <= len(data) <= MAX_LENGTH
+        and data[:4] == _PREFIX
+        and 7 + (data[5] | data[6] << 8) == len(data)
+        and data[4] not in (0xFD, 0xFF)
+        and data.find(HEADER, 7, -2) < 0
+    )
+
+
+def _packet(raw: bytes) -> Packet:
+    """The whole packet that ``raw`` is."""
+    valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
+    body = raw[7:-2].replace(_STUFFED, HEADER)
+    return Packet(raw[4], body[0], body[1:], valid, len(raw))
+
+
 class PacketParser:
     """Packets out of a byte stream, as a servo finds them.
 
@@ -101,19 +119,17 @@ class PacketParser:
             known = self._known.get(data)
             if known is not None:
                 return known
-        whole = not buffer
+            if _is_plain(data):
+                packets = [_packet(data)]
+                # A client asks the same thing tick after tick.
+                if packets[0].instruction in _ASKED_AGAIN and len(self._known) < _KNOWN:
+                    self._known[data] = packets
+                return packets
         buffer += data
-        packets: list[Packet] = []
+        packets = []
         while (packet := self._next()) is not None:
             packets.append(packet)
-        if whole and len(packets) == 1 and packets[0].size == len(data):
-            self._remember(data, packets)
         return packets
-
-    def _remember(self, data: bytes, packets: list[Packet]) -> None:
-        """A client asks the same thing tick after tick."""
-        if packets[0].instruction in _ASKED_AGAIN and len(self._known) < _KNOWN:
-            self._known[data] = packets
 
     def reset(self) -> None:
         """Forget a packet begun."""
@@ -151,9 +167,7 @@ class PacketParser:
                 return None
             raw = bytes(buffer[:end])
             del buffer[:end]
-            valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
-            body = raw[7:-2].replace(_STUFFED, HEADER)
-            return Packet(packet_id, body[0], body[1:], valid, end)
+            return _packet(raw)
         return None
 
     def _header_within(self, end: int) -> int:

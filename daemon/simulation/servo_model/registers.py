@@ -262,7 +262,8 @@ class ControlTable:
         nothing is to be written, the items before the bad one neither; the values that were
         understood are there all the same where only another register forbids one.
         """
-        error, layout = self._layout(address, len(data))
+        span = address, len(data)
+        error, layout = self._layouts.get(span) or self._layout(*span)
         if error:
             return error, []
         plan: list[tuple[Item, int]] = []
@@ -289,12 +290,10 @@ class ControlTable:
 
     def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
         """Which items a span writes, with their places in its data, or the error it makes."""
-        known = self._layouts.get((address, length))
-        if known is None:
-            known = self._lay_out(address, length)
-            if len(self._layouts) < _LAYOUTS:
-                self._layouts[address, length] = known
-        return known
+        layout = self._lay_out(address, length)
+        if len(self._layouts) < _LAYOUTS:
+            self._layouts[address, length] = layout
+        return layout
 
     def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
         if length == 0:

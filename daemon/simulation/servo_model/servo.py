@@ -120,8 +120,9 @@ class EmulatedServo:
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
         """Whether it answers group reads from ``servo_id``."""
         memory = self._memory
-        asked = memory[reg.ID] == servo_id and memory[reg.STATUS_RETURN_LEVEL] >= 1
-        return asked and (self.fast_reads or not fast)
+        if memory[reg.ID] != servo_id or not memory[reg.STATUS_RETURN_LEVEL]:
+            return False
+        return self.fast_reads or not fast
 
     @property
     def alert(self) -> int:
@@ -146,7 +147,7 @@ class EmulatedServo:
     def heard(self, t: float) -> None:
         """An instruction packet went by: the bus watchdog starts anew."""
         self._watched = t
-        self.recorder.heard(t, self.torque_on)
+        self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
 
     def next_event(self) -> float:
         """When :meth:`act` next has something to do [s]."""

@@ -51,6 +51,7 @@ class ServoJoint:
     ) -> None:
         self.profile = Profile()
         self._model = model
+        self._senses_current = model.senses_current
         self._table = table
         self._memory = table.memory
         self._plant = plant
@@ -103,7 +104,10 @@ class ServoJoint:
         return within + int(offset)
 
     def _angle(self, position: float) -> float:
-        within = self.sign * (position - _I32(self._memory, reg.HOMING_OFFSET)[0])
+        memory = self._memory
+        within = position - _I32(memory, reg.HOMING_OFFSET)[0]
+        if memory[reg.DRIVE_MODE] & 1:
+            within = -within
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_angle(self, counts: int) -> float:
@@ -183,13 +187,14 @@ class ServoJoint:
         if self.stuck is not None:
             return 0, 0, self.position()
         plant, joint, scale = self._plant, self._joint, self._scale
-        sign = self.sign
         ampere = plant.current.item(joint)
-        if self._model.senses_current:
-            current = sign * scale.current_counts(ampere)
+        if self._senses_current:
+            current = scale.current_counts(ampere)
         else:  # the register is present load, 0.1 %
-            current = round(sign * 1000.0 * self._load * ampere)
-        velocity = sign * scale.velocity_counts(plant.dq.item(joint))
+            current = round(1000.0 * self._load * ampere)
+        velocity = scale.velocity_counts(plant.dq.item(joint))
+        if self._memory[reg.DRIVE_MODE] & 1:
+            current, velocity = -current, -velocity
         if not -32768 <= current <= 32767:
             current = -32768 if current < 0 else 32767
         return current, velocity, self.position()
