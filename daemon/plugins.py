@@ -111,7 +111,7 @@ class GuardedSensor(_Guard):
         """The newest sound frame."""
         try:
             frame = self._made.latest()
-            if frame is not self._seen:
+            if frame is not None and frame is not self._seen:
                 self._seen = frame
                 self._check(frame)
                 self._sound = frame

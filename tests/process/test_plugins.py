@@ -17,6 +17,7 @@ from softfinger.daemon.errors import PluginError, SettingsError, TactileError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.types import Frame
 from softfinger.testing import check_servos, check_shape, check_tactile
+from softfinger.tools.setup import doctor
 from tests.conftest import until
 from tests.harness.daemon_process import Running
 
@@ -45,9 +46,10 @@ def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("here")
-def test_the_example_does_what_a_backend_has_to() -> None:
+def test_the_example_does_what_a_backend_has_to(caplog: pytest.LogCaptureFixture) -> None:
     settings = load(changes=METAL)
     check_tactile(settings)
+    assert not caplog.records  # a closed board has no frame, which is no failure
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
 
@@ -75,6 +77,14 @@ def test_one_report_has_the_plugins_errors_with_all_others() -> None:
         "loop.rate",
     ):
         assert part in report
+
+
+@pytest.mark.usefixtures("here")
+def test_doctor_hears_the_boards_and_asks_nothing_of_ports_that_they_may_not_have() -> None:
+    found = {each.subject: each for each in doctor.results(load(changes=METAL), False)}
+    assert found["servos"].text.startswith("following: a plugin's")
+    assert "44 × 44 cells" in found["tactile left"].text
+    assert "/dev/ttyUSB0" not in found
 
 
 @pytest.mark.usefixtures("here")

@@ -82,7 +82,7 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
     else:
         for name in settings.scene.fingers:
             finger = FINGERS.index(name)
-            if free[tactile.port[finger]]:
+            if free.get(tactile.port[finger], True):
                 yield check_board(settings, finger)
     yield from check_machine()
     if fix:
@@ -92,11 +92,12 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """(key, path) of every port that the scene needs."""
+    """(key, path) of every port that the scene needs; what a plugin opens is not known."""
     ports = []
-    if SERVOS[settings.servos.backend].metal:
+    servos, tactile = SERVOS[settings.servos.backend], TACTILE[settings.tactile.backend]
+    if servos.metal and not servos.source:
         ports.append(("servos.port", settings.servos.port))
-    if TACTILE[settings.tactile.backend].metal:
+    if tactile.metal and not tactile.source:
         for name in settings.scene.fingers:
             ports.append(("tactile.port", settings.tactile.port[FINGERS.index(name)]))
     return ports
@@ -118,6 +119,10 @@ def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Re
     servos = settings.servos
     if not SERVOS[servos.backend].metal:
         yield Result("note", "servos", f"{servos.backend}: no servo to ask")
+        return
+    if SERVOS[servos.backend].source:
+        text = f"{servos.backend}: a plugin's, which softfinger.testing.check_servos tries"
+        yield Result("note", "servos", text)
         return
     if not free[servos.port]:
         return
