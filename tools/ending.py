@@ -9,16 +9,22 @@ import select
 import signal
 import time
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 
 class Ending:
-    """A context in which SIGINT and SIGTERM ask for the end, as does the end of ``duration`` s."""
+    """A context in which signals ask for the end, as does the end of ``duration`` s.
 
-    def __init__(self, duration: float | None = None) -> None:
+    So does the end of ``lifeline``, a pipe whose other end is the process that started this one.
+    """
+
+    signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, duration: float | None = None, lifeline: int | None = None) -> None:
         self._asked = False
         self._duration = math.inf if duration is None else duration
         self._deadline = math.inf
+        self._lifeline = [] if lifeline is None else [lifeline]
 
     def begin(self) -> None:
         """The duration counts from now on."""
@@ -36,21 +42,37 @@ class Ending:
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end, ``seconds`` at most; True when it has come."""
-        left = self._deadline - time.monotonic()
-        select.select([self._wakes], [], [], max(0.0, min(seconds, left)))
+        self.ready(seconds)
         return self.over
 
-    def _ask(self, *_: object) -> None:
+    def ready(self, seconds: float, *others: int) -> list[int]:
+        """Wait for the end, a signal or ``others``, ``seconds`` at most; which of these are ready.
+
+        A signal that asks for no end ends the wait once.
+        """
+        left = min(seconds, self._deadline - time.monotonic())
+        watched = [self._wakes, *self._lifeline, *others]
+        ready = select.select(watched, [], [], max(0.0, left))[0]
+        if self._wakes in ready and not self._asked:
+            os.read(self._wakes, 4096)
+        self._asked |= bool(set(self._lifeline).intersection(ready))
+        return [each for each in ready if each in others]
+
+    def end(self, *_: object) -> None:
+        """Ask for the end; from a signal handler, too."""
+        self._asked = True
+        self.wake()
+
+    def wake(self, *_: object) -> None:
+        """End a wait."""
         # No lock, as an Event has: the signal may come while this very thread holds it.
-        if not self._asked:
-            self._asked = True
+        with contextlib.suppress(BlockingIOError):  # it is full: that wakes, too
             os.write(self._wake, b"!")
 
-    def __enter__(self) -> Ending:
+    def __enter__(self) -> Self:
         self._wakes, self._wake = os.pipe()
-        self._before = {
-            number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)
-        }
+        os.set_blocking(self._wake, False)
+        self._before = {number: signal.signal(number, self.end) for number in self.signals}
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -7,8 +7,8 @@ Plain data from the servo maker's manuals; what a joint's counts are in rad, rad
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 # --- addresses -----------------------------------------------------------------------------------
 
@@ -198,102 +198,29 @@ class ServoModel:
         return max(data + entries for _, data, entries in self.indirect_blocks(firmware)) - 1
 
 
-_XM430_W350 = ServoModel(
-    name="XM430-W350",
-    number=1020,
-    firmware=48,
-    highest_baud=7,
-    current_unit=2.69e-3,
-    current_limit=1193,
-    velocity_limit=200,
-    velocity_max=1023,
-    temperature_limit=80,
-    voltage_min=95,
-    voltage_max=160,
-    velocity_gains=(1920, 100),
-    position_gains=(0, 0, 800),
-    shutdown=52,
-    drive_mode_max=5,
-    fast_read_firmware=45,
-)
-_XL330_M288 = ServoModel(
-    name="XL330-M288",
-    number=1200,
-    firmware=53,
-    highest_baud=6,
-    current_unit=1e-3,
-    current_limit=1750,
-    velocity_limit=445,
-    velocity_max=2047,
-    temperature_limit=70,
-    voltage_min=35,
-    voltage_max=70,
-    velocity_gains=(1600, 180),
-    position_gains=(0, 0, 400),
-    shutdown=53,
-    drive_mode_max=5,
-    fast_read_firmware=46,
-    pwm_slope=140,
-    small=True,
-)
-_XC330_M288 = replace(
-    _XL330_M288,
-    name="XC330-M288",
-    number=1240,
-    current_limit=2352,
-    velocity_limit=350,
-    velocity_gains=(1600, 50),
-    position_gains=(500, 0, 1100),
-    shutdown=52,
-    drive_mode_max=13,
-)
-MODELS: Final = {
-    model.name: model
-    for model in (
-        _XM430_W350,
-        replace(_XM430_W350, name="XM430-W210", number=1030, velocity_limit=330),
-        replace(
-            _XM430_W350, name="XM540-W270", number=1120, current_limit=2047, velocity_limit=128
-        ),
-        _XL330_M288,
-        replace(
-            _XL330_M288,
-            name="XL330-M077",
-            number=1190,
-            velocity_limit=1620,
-            velocity_gains=(400, 40),
-            position_gains=(0, 400, 400),
-        ),
-        replace(
-            _XC330_M288,
-            name="XC330-T288",
-            number=1220,
-            current_limit=910,
-            velocity_limit=320,
-            voltage_min=55,
-            voltage_max=140,
-            velocity_gains=(1200, 40),
-            position_gains=(0, 0, 900),
-            pwm_slope=255,
-        ),
-        _XC330_M288,
-        replace(
-            _XM430_W350,
-            name="XL430-W250",
-            number=1060,
-            current_unit=0.0,
-            current_limit=0,
-            velocity_limit=265,
-            temperature_limit=72,
-            voltage_min=60,
-            voltage_max=140,
-            velocity_gains=(1000, 100),
-            position_gains=(4000, 0, 640),
-            drive_mode_max=13,
-            modes=(VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE),
-        ),
-    )
-}
+_ALL = tuple(MODE_NAMES)
+_WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE)
+# A row a model, as ServoModel's fields follow each other: name, number, firmware, highest baud, A a
+# count, current limit, velocity limit and its bound, °C, 0.1 V; then gains, shutdown and the rest.
+_MODELS: tuple[tuple[Any, ...], ...] = (
+    ("XM430-W350", 1020, 48, 7, 2.69e-3, 1193, 200, 1023, 80, 95, 160,
+     (1920, 100), (0, 0, 800), 52, 5, 45),
+    ("XM430-W210", 1030, 48, 7, 2.69e-3, 1193, 330, 1023, 80, 95, 160,
+     (1920, 100), (0, 0, 800), 52, 5, 45),
+    ("XM540-W270", 1120, 48, 7, 2.69e-3, 2047, 128, 1023, 80, 95, 160,
+     (1920, 100), (0, 0, 800), 52, 5, 45),
+    ("XL330-M288", 1200, 53, 6, 1e-3, 1750, 445, 2047, 70, 35, 70,
+     (1600, 180), (0, 0, 400), 53, 5, 46, _ALL, 140, True),
+    ("XL330-M077", 1190, 53, 6, 1e-3, 1750, 1620, 2047, 70, 35, 70,
+     (400, 40), (0, 400, 400), 53, 5, 46, _ALL, 140, True),
+    ("XC330-T288", 1220, 53, 6, 1e-3, 910, 320, 2047, 70, 55, 140,
+     (1200, 40), (0, 0, 900), 52, 13, 46, _ALL, 255, True),
+    ("XC330-M288", 1240, 53, 6, 1e-3, 2352, 350, 2047, 70, 35, 70,
+     (1600, 50), (500, 0, 1100), 52, 13, 46, _ALL, 140, True),
+    ("XL430-W250", 1060, 48, 7, 0.0, 0, 265, 1023, 72, 60, 140,
+     (1000, 100), (4000, 0, 640), 52, 13, 45, _WITHOUT_CURRENT),
+)  # fmt: skip
+MODELS: Final = {row[0]: ServoModel(*row) for row in _MODELS}
 
 
 def by_name(name: str) -> ServoModel:

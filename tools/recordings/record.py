@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import select
 import sys
 import time
 from pathlib import Path
@@ -79,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         state = f"was damaged ({damage}), its sound part is kept" if damage else "sound"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
-    with Ending(arguments.duration) as ending:
+    with Ending(arguments.duration, arguments.lifeline) as ending:
         return _Recorder(arguments, ending).record()
 
 
@@ -139,8 +138,6 @@ class _Recorder:
                 if not self._waiting:
                     self._waiting = True
                     to_stderr("record")(waiting(arguments.address, arguments.keys))
-            if arguments.lifeline is not None and select.select([arguments.lifeline], [], [], 0)[0]:
-                break  # the daemon that started this has ended
             if now - shown >= _SHOW:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)

@@ -10,13 +10,11 @@ import argparse
 import contextlib
 import math
 import os
-import select
 import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import Any, Self
 
 import zmq
 
@@ -31,6 +29,7 @@ from softfinger.tools.arguments import (
     stream_address,
     to_stderr,
 )
+from softfinger.tools.ending import Ending
 from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
@@ -124,8 +123,6 @@ REDRAW = 0.1  # s between redraws at most
 PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
 PLAIN_LINE = 1.0  # s between plain lines
 
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
@@ -193,65 +190,36 @@ def _is_page(args: argparse.Namespace) -> bool:
     return (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
 
 
-class _Ending:
-    """A context: whether it is time to end. Signals wake `wait`."""
+class _Ending(Ending):
+    """Also suspends, and ends without a stream if that is asked for."""
+
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
     def __init__(self, args: argparse.Namespace) -> None:
+        super().__init__(args.duration, args.lifeline)
+        self.begin()
         self.why = ""  # to be printed once the terminal is back
-        self.over = False
         self.suspend = False
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
-        self._lifeline: int | None = args.lifeline
         self.beside = args.lifeline is not None  # the daemon is in this process group
-        self._deadline = math.inf if args.duration is None else time.monotonic() + args.duration
         self._patience = time.monotonic() + PATIENCE
-        self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> _Ending:
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_read, False)
-        os.set_blocking(self._wake_write, False)
-        self._wakeup_before = signal.set_wakeup_fd(self._wake_write, warn_on_full_buffer=False)
-        for number_ in _ENDING:
-            self._before[number_] = signal.signal(number_, self._end)
-        self._before[signal.SIGWINCH] = signal.signal(signal.SIGWINCH, lambda *_: None)
+    def __enter__(self) -> Self:
+        super().__enter__()
+        self._before[signal.SIGWINCH] = signal.signal(signal.SIGWINCH, self.wake)
         self._before[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._pause)
         return self
 
-    def __exit__(self, *_: object) -> None:
-        for number_, handler in self._before.items():
-            signal.signal(number_, handler)
-        signal.set_wakeup_fd(self._wakeup_before)
-        os.close(self._wake_read)
-        os.close(self._wake_write)
-
-    def _end(self, number_: int, frame: FrameType | None) -> None:
-        self.over = True
+    def end(self, *_: object) -> None:
+        super().end()
         if self.terminal is not None and self.terminal.writing:
             raise TerminalGone("a signal came while the terminal took no output")
 
-    def _pause(self, number_: int, frame: FrameType | None) -> None:
+    def _pause(self, *_: object) -> None:
         self.suspend = True
-
-    def wait(self, timeout: float, keyboard: int | None = None) -> bool:
-        """Wait for the keyboard, a signal, the lifeline's end or the time. True for a key."""
-        poll = select.poll()
-        poll.register(self._wake_read, select.POLLIN)
-        for descriptor in (keyboard, self._lifeline):
-            if descriptor is not None:
-                poll.register(descriptor, select.POLLIN)
-        left = min(timeout, self._deadline - time.monotonic())
-        ready = [fd for fd, _ in poll.poll(max(0.0, left) * 1e3)]
-        if self._wake_read in ready:
-            with contextlib.suppress(BlockingIOError):
-                os.read(self._wake_read, 4096)
-        if self._lifeline in ready and os.read(self._lifeline or 0, 1) == b"":
-            self.over = True
-        if time.monotonic() >= self._deadline:
-            self.over = True
-        return keyboard is not None and keyboard in ready
+        self.wake()
 
     def watch(self, feed: Feed, address: str, now: float) -> None:
         """With ``--no-wait``: end without a stream."""
@@ -262,7 +230,8 @@ class _Ending:
             self.why = "the stream has ended"
         elif status == "waiting" and now > self._patience:
             self.why = no_stream(address, self._keys)
-        self.over = bool(self.why)
+        if self.why:
+            self.end()
 
 
 def _run_page(
@@ -296,14 +265,14 @@ def _page_loop(
     hand = HandKeys(page.feed, commander)
     due = time.monotonic()
     while not (ending.over or ending.suspend):
-        if ending.wait(due - time.monotonic(), keyboard) and keyboard is not None:
-            typed = _read(keyboard)
+        keyboards = [] if keyboard is None else [keyboard]
+        for each in ending.ready(due - time.monotonic(), *keyboards):
+            typed = _read(each)
             if not typed:
                 keyboard = None  # the keyboard is gone, the page stays
             for key in keys.decode(typed):
                 if key == "q":
-                    ending.over = True
-                    return
+                    return ending.end()
                 hand.press(key, time.monotonic())
         now = time.monotonic()
         if now < due:
