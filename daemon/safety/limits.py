@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -139,8 +140,13 @@ def checking(terms: Mapping[str, int], text: Text | None) -> Check:
     source += [
         f" if not ({term}): return text(view, state, {i}, share)" for term, i in terms.items()
     ]
+    return _compiled("\n".join([*source, ' return ""']), text)
+
+
+@cache
+def _compiled(source: str, text: Text | None) -> Check:
     names: dict[str, Any] = {"sin": math.sin, "GRIPPING": GRIPPING, "text": text}
-    exec("\n".join([*source, ' return ""']), names)
+    exec(source, names)
     return cast(Check, names["check"])
 
 

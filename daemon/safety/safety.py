@@ -34,6 +34,10 @@ class Breach(NamedTuple):
     text: str
 
 
+def _one_of_them(*_: object) -> str:
+    return "one of them"
+
+
 class _Watch:
     """One limit of a scene, and since when it is broken."""
 
@@ -104,7 +108,7 @@ class Safety:
             if watch.limit.share == share[watch.limit.holds]
             for term in watch.limit.terms(view, str(watch.limit.share))
         }
-        self._any = checking(terms, lambda *_: "one of them")
+        self._any = checking(terms, _one_of_them)
         self._turn = 0
         self._busy = False  # a limit of each tick is broken, or was a moment ago
         self._found: dict[_Watch, str] = {}  # faults that stand

@@ -298,6 +298,13 @@ class ContactEstimator:
         self._seq = seq
         return result
 
+    def share_scratch(self, other: ContactEstimator) -> None:
+        """Work in the arena of ``other``, an equal one, when the same thread calls both.
+
+        It holds constants and scratch: what a frame leaves for the next is in :attr:`state`.
+        """
+        self._arena, self._frame = other._arena, other._frame
+
     def reset(self) -> None:
         """Forget the last estimate: the next frame starts cold."""
         self.state.estimate.warm = False

@@ -6,6 +6,7 @@ as in a running daemon. Both take turns, on canned readings and the same hand.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -54,22 +55,34 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) -> list[Row]:
-    """The pipeline alone: back to back with and without subscribers, in place at ``rates``."""
+    """The pipeline alone: back to back with and without subscribers, in place at ``rates``.
+
+    In place also with the rehearsal before each tick. SCHED_FIFO and one processor where allowed.
+    """
     samples: dict[str, list[float]] = {}
+    used: dict[str, float] = {}  # s of the processor, of all seconds
     topics = (schema.STATE, schema.TACTILE)
     with virtual_daemon({}) as quiet, virtual_daemon({}, *topics) as heard:
         for daemon in (quiet, heard):
             hold(daemon)
             can(daemon)
+        quiet.rehearse(Settings().realtime.rehearsal)
+        rehearse = quiet.loop.rehearsal
         turns: dict[str, Callable[[], list[float]]] = {
             "back to back": partial(ticks, quiet, 200),
             "back to back, state and frames subscribed": partial(ticks, heard, 200),
         }
-        turns |= {f"in place at {rate:g} Hz": partial(in_place, quiet, rate) for rate in rates}
-        with RealTime(Settings()):
+        for rate in rates:
+            name = f"in place at {rate:g} Hz"
+            turns[name] = partial(in_place, quiet, rate)
+            turns[f"{name}, rehearsed"] = partial(in_place, quiet, rate, before=rehearse)
+        with RealTime(_own_processor()):
             for _ in range(rounds):
                 for name, turn in turns.items():
+                    began, before = time.perf_counter(), time.thread_time()
                     samples.setdefault(name, []).extend(turn())
+                    share = (time.thread_time() - before) / (time.perf_counter() - began)
+                    used[name] = used.get(name, 0.0) + share / rounds
         must_hold(quiet)
         must_hold(heard)
     rows = [
@@ -79,7 +92,17 @@ def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) ->
     base = rows[0]["median"]
     for row in rows:
         row["× back to back"] = row["median"] / base
+        if "place" in row["name"]:
+            row["of a processor"] = used[row["name"]]
     return rows
+
+
+def _own_processor() -> Settings:
+    """SCHED_FIFO on one processor where that is allowed; without either where it is not."""
+    if not may_be_real_time():
+        return Settings()
+    cpus = (max(os.sched_getaffinity(0)),)
+    return Settings.model_validate({"realtime": {"priority": _PRIORITY, "cpus": cpus}})
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
@@ -92,12 +115,19 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
     return samples
 
 
-def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
-    """Times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
+def in_place(
+    daemon: Daemon, rate: float, count: int = 0, before: Callable[[float], None] | None = None
+) -> list[float]:
+    """Times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s.
+
+    ``before`` is called before each sleep with its end.
+    """
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(count or round(0.15 * rate)):
         deadline += 1.0 / rate
+        if before is not None:
+            before(deadline)
         machine.sleep_until(deadline)
         samples += ticks(daemon, 1)
     return samples
