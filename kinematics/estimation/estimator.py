@@ -303,7 +303,8 @@ class ContactEstimator:
 
         It holds constants and scratch: what a frame leaves for the next is in :attr:`state`.
         """
-        self._arena, self._frame = other._arena, other._frame
+        self.arena = other.arena[0], *self.arena[1:]
+        self._frame = other._frame
 
     def reset(self) -> None:
         """Forget the last estimate: the next frame starts cold."""

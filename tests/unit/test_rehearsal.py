@@ -146,7 +146,7 @@ def test_nothing_that_can_be_written_is_both_the_loops_and_the_twins(make: Make)
     mine, its = _reached(daemon.loop.stages), _reached(twin.stages)
     both = [mine[k] for k in mine.keys() & its.keys()]
     estimators = [each._estimator for each in daemon.loop.perception.fingers]
-    scratch = [array for each in estimators for array in (each._arena, each._frame)]
+    scratch = [array for each in estimators for array in (each.arena[0], each._frame)]
     tables = _reached(daemon.tables)
     for each in both:
         if isinstance(each, np.ndarray):
