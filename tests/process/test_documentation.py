@@ -17,7 +17,6 @@ import re
 import select
 import shlex
 import subprocess
-import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,10 +26,9 @@ import pytest
 
 from softfinger.daemon.client.command_client import send
 from softfinger.daemon.profile.load import find, load
-from softfinger.kinematics.compiled.kernel_folder import kernel_folder
 from tests.conftest import own_addresses
-from tests.harness import documented
 from tests.harness.daemon_process import Running
+from tests.harness.documented import Softfinger, parse
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
@@ -73,17 +71,15 @@ def blocks(page: Path) -> list[Block]:
 class Shell:
     """One shell for a page's blocks, whose variables stay; it tells which commands failed."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, softfinger: Softfinger) -> None:
+        self._folder, self._softfinger = folder, softfinger
         self.log = folder / "shell.log"
-        self._told, told = os.pipe()
+        self._told, self._tell = os.pipe()
         with self.log.open("w") as log:
             self._process = subprocess.Popen(
                 ["bash", "--norc"], stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=folder,
-                env=os.environ | {"HOME": str(folder)}, pass_fds=[told], text=True,
+                env=os.environ | {"HOME": str(folder)}, pass_fds=[self._tell], text=True,
             )  # fmt: skip
-        os.close(told)
-        self._tell = told
 
     def run(self, text: str) -> str:
         """The exit statuses that were not 0, and their commands."""
@@ -95,37 +91,44 @@ class Shell:
             file=self._process.stdin,
             flush=True,
         )
-        assert select.select([self._told], [], [], PATIENCE)[0], f"too long: {text}"
-        return os.read(self._told, 4096).decode().strip()
+        while True:
+            ready = select.select([self._told, self._softfinger.socket], [], [], PATIENCE)[0]
+            assert ready, f"too long: {text}"
+            if self._told in ready:
+                return os.read(self._told, 4096).decode().strip()
+            self._softfinger.serve()
 
     def close(self) -> None:
         self._process.kill()
         self._process.communicate()
         os.close(self._told)
+        os.close(self._tell)
+        self._softfinger.end()
+
+
+class Shared(NamedTuple):
+    """What the pages share."""
+
+    addresses: tuple[str, str]
+    softfinger: Softfinger
 
 
 @pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """The one simulated hand, its addresses in the environment."""
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+    """The one simulated hand, and the command that finds it."""
     place = tmp_path_factory.mktemp("hand")
     place.chmod(0o700)
     stream, commands = addresses = own_addresses()
-    command = place / "bin" / "softfinger"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m {documented.__name__} "$@"\n')
-    command.chmod(0o755)
-    kernels = kernel_folder()
-    with pytest.MonkeyPatch.context() as patch:
+    (place / "bin").mkdir()
+    softfinger = Softfinger(place / "bin")
+    with pytest.MonkeyPatch.context() as patch, softfinger.socket:
         patch.setenv("XDG_RUNTIME_DIR", str(place))
         patch.setenv("SOFTFINGER_ADDRESS", ",".join(addresses))
-        patch.setenv("PATH", f"{command.parent}:{os.environ['PATH']}")
+        patch.setenv("PATH", f"{place / 'bin'}:{os.environ['PATH']}")
         patch.setenv("PYTHONPATH", str(ROOT))
-        patch.setenv(documented.REAL_HOME, os.environ.get("HOME", "/"))
-        if kernels is not None:
-            patch.setenv("NUMBA_CACHE_DIR", str(kernels.parent))
-        words = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
-        daemon = Running(*words)
-        yield addresses
+        words = (f"stream.address={stream}", f"commands.address={commands}", "loop.rate=100")
+        daemon = Running(*[word for each in words for word in ("--set", each)])
+        yield Shared(addresses, softfinger)
         assert daemon.end() == 0
 
 
@@ -149,11 +152,11 @@ def run_python(text: str, addresses: tuple[str, str]) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks(
-    page: Path, hand: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("my.toml").write_text(find(Path("hil")).read_text(encoding="utf-8"))
-    shell = Shell(tmp_path)
+    shell = Shell(tmp_path, shared.softfinger)
     try:
         for block in blocks(page):
             at = f"{page.name}:{block.line}"
@@ -171,14 +174,14 @@ def test_blocks(
                     f"{at}: {failed}\n{shell.log.read_text()}"
                 )
             elif block.language == "python":
-                run_python(block.text, hand)
+                run_python(block.text, shared.addresses)
             else:
                 assert block.language == "toml", f"{at}: {block.language}: nothing runs this"
                 Path("block.toml").write_text(block.text)
                 load(Path("block.toml"))
     finally:
         shell.close()
-        send(hand[1], {"command": "stop"}, timeout=120.0)
+        send(shared.addresses[1], {"command": "stop"}, timeout=120.0)
 
 
 def parse_only(block: Block, at: str) -> None:
@@ -188,4 +191,4 @@ def parse_only(block: Block, at: str) -> None:
     for line in block.text.replace("\\\n", "").splitlines():
         if line.startswith("softfinger "):
             words = shlex.split(line, comments=True)[1:]
-            documented.parse([word for word in words if not re.fullmatch(r"\$\w+", word)])
+            parse([word for word in words if not re.fullmatch(r"\$\w+", word)])
