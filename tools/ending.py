@@ -1,4 +1,4 @@
-"""When a subcommand ends: by a signal, or after a duration."""
+"""When a subcommand ends: by a signal, after a duration, or with the process that started it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Ending:
 
     @property
     def asked(self) -> bool:
-        """A signal has come."""
+        """A signal has come, or the lifeline has ended."""
         return self._asked
 
     @property
