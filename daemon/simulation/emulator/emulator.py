@@ -229,8 +229,8 @@ class Emulator:
     def _turn(self) -> None:
         """Wait for bytes or for what is due, and do it: servos first, one slow thing at most.
 
-        Shortly before a request is expected the hand is brought up to date, and nothing slow is
-        begun until it has come: its reply waits for no physics.
+        Shortly before a request is expected the hand is brought up to date and the reply rehearsed,
+        and nothing slow is begun until it has come: its reply waits for no physics.
         """
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
@@ -257,6 +257,7 @@ class Emulator:
         if servos is not None and servos.rush[0] <= t < servos.rush[1]:
             if start < servos.rush[0]:
                 self._advance(t)
+                servos.rehearse(t)
             return
         late = [board for board in boards if board.next_event() <= t]
         if late:
