@@ -105,17 +105,18 @@ class Publishing:
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
-            publisher.input(state, (frames[0], frames[1]))
+            publisher.send(schema.INPUT, state, frames)
         if seq % self._state_every == 0:
             if wanted & _STATE:
                 self._states += 1
-                publisher.state(state, self._scene, self._state_every)
+                publisher.send(schema.STATE, state, self._scene, self._state_every)
             if wanted & _TRUTH and self.truth is not None:
-                publisher.truth(state, self.truth, self._state_every)
+                publisher.send(schema.TRUTH, state, self.truth, self._state_every)
         if seq % self._stats_every == self._stats_phase:
             rates = self._rates(state)
             if wanted & _STATS:
-                publisher.stats(state, self._period, rates, self._statistics, self._stats_every)
+                told = state, self._period, rates, self._statistics, self._stats_every
+                publisher.send(schema.STATS, *told)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:
         frame = self._seen[perception.finger] = perception.frame
@@ -128,7 +129,8 @@ class Publishing:
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.published()
         number = self._numbers[perception.finger]
-        self._publisher.tactile(frame, data, perception.finger, perception.facts, wall, n, number)
+        sensor = perception.finger, perception.facts
+        self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
         """Rates [Hz] since they were last asked for, by the machine's time."""

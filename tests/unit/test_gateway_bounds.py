@@ -176,7 +176,7 @@ def test_a_reader_that_reads_nothing_does_not_fill_the_memory(
         stream: Any = served.service._endpoints[0]
         state = State()
         for _ in range(60_000):
-            served.publisher.state(state, BOTH)
+            served.publisher.send(STATE, state, BOTH)
             served.service.step(0.0)
             assert stream.backlog <= 33 << 20
         assert any(client.hung_up() for client in stuck), "the slowest leave"

@@ -123,7 +123,7 @@ def test_the_statistics_message_has_every_field_as_documented(
     statistics = Statistics()
     record(statistics.counts, statistics.largest, (1e-6, 2e-5, 1e-5, 2e-6))
     rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
-    publisher.stats(State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
+    publisher.send(STATS, State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
     until(lambda: [served.settle(), socket.poll(0)][1])
     topic, payload = socket.recv_multipart()
     assert topic == b"hand/stats"

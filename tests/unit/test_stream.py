@@ -104,7 +104,7 @@ def test_tactile_data_is_little_endian_uint16_row_major(
     assert not publisher.wanted & bit(STATE)
     data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
     facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
-    publisher.tactile(Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
+    publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
     topic, message = receive(socket, served)
     assert topic == b"hand/tactile"
     assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
@@ -184,7 +184,7 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
     state = State()
     for seq in range(20_000):
         state.seq = seq
-        publisher.state(state, BOTH)
+        publisher.send(STATE, state, BOTH)
         served.service.step(0.0)  # would never return if it waited for the stuck one
         while reading.poll(0):
             reading.recv_multipart()
@@ -202,10 +202,10 @@ def test_a_late_subscriber_gets_what_is_published_from_then_on(
     served = Served(addresses[0], queue=10)
     publisher = served.publisher
     for seq in range(100):
-        publisher.state(State(seq=seq), BOTH)
+        publisher.send(STATE, State(seq=seq), BOTH)
     late = subscribe(context, addresses[0], b"hand/state")
     until(lambda: wanted(served))
-    publisher.state(State(seq=100), BOTH)
+    publisher.send(STATE, State(seq=100), BOTH)
     assert receive(late, served)[1]["seq"] == 100
     served.close()
 
@@ -293,7 +293,7 @@ def test_a_long_message_comes_in_pieces_and_whole(
         served.publisher.settings(98.0, 0.5, facts)
         socket = subscribe(context, addresses[0])
         assert receive(socket, served)[1]["settings"] == facts.settings
-        served.publisher.tactile(Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
+        served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
         assert receive(socket, served)[1]["data"] == grid.tobytes()
 
 
