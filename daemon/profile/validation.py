@@ -108,7 +108,7 @@ def _lacking(settings: Settings, key: str, expected: str) -> Iterator[str]:
 
 def _above(key: str, found: float, unit: str, most: float, why: str) -> Iterator[str]:
     if found > most:
-        yield f"{key}: found {found:g} {unit}, expected at most {most:.3g} {unit}, {why}"
+        yield f"{key}: found {found:g} {unit}, expected at most {most:g} {unit}, {why}"
 
 
 def _solid_tip(settings: Settings) -> Iterator[str]:

@@ -219,7 +219,7 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> N
         ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
         (
             '[control]\nlaw = "upright"\ndither_torque = 3.0',
-            "control.dither_torque: found 3 N·m, expected at most 2.14 N·m",
+            "control.dither_torque: found 3 N·m, expected at most 2.136 N·m",
         ),
         (
             '[control]\nlaw = "upright"\ndither_frequency = 50.0\n[loop]\nrate = 200.0',
