@@ -33,15 +33,14 @@ class Listener:
         self.rates: list[Rates] = []
         self.seq = 0
 
-    def state(self, state: State, *_: Any) -> None:
-        self.ticks["state"].append(state.seq)
-
-    def tactile(self, frame: Any, _data: Any, finger: int, *_: Any) -> None:
-        self.frames[finger].append(frame.seq)
-
-    def stats(self, state: State, _period: float, rates: Rates, *_: Any) -> None:
-        self.ticks["stats"].append(state.seq)
-        self.rates.append(rates)
+    def send(self, topic: bytes, first: Any, *others: Any) -> None:
+        if topic == TACTILE:
+            _, finger, *_ = others
+            self.frames[finger].append(first.seq)
+        else:
+            self.ticks[topic.decode().removeprefix("hand/")].append(first.seq)
+        if topic == STATS:
+            self.rates.append(others[1])
 
     def event(self, *_: Any) -> None: ...
 
