@@ -251,6 +251,8 @@ def open_port(path: str, baud: int) -> serial.Serial:
         number = error.errno
         if number == errno.ENOENT:
             why = "no such port; is the board plugged in?"
+            if not path.startswith("/dev/"):
+                why = "no such port; is `softfinger emulate` running?"
         elif number in (errno.EACCES, errno.EPERM):
             why = "no permission to open it; is this user in the group that owns the port?"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):

@@ -142,7 +142,7 @@ def _send(board: Board, data: bytes) -> bool:
 
 
 def test_a_missing_port_is_told(tmp_path):
-    with pytest.raises(TactileError, match=r"tactile-left: no such port"):
+    with pytest.raises(TactileError, match=r"tactile-left: no such port; is `softfinger emulate`"):
         sensor(str(tmp_path / "tactile-left")).open()
 
 
