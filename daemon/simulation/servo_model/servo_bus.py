@@ -73,9 +73,7 @@ class ServoBus:
         self.plant = plant
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
-        self.lag = (
-            0.0  # s by which what a reading shows may be older than it, to be answered sooner
-        )
+        self.lag = 0.0  # s by which what a reading shows may be older than its reply
         self.packets = 0  # that came through
         self._now = -math.inf
         self._due = -math.inf  # no servo does anything by itself before then
