@@ -22,6 +22,7 @@ from softfinger.daemon.wire.schema import TACTILE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.calibration.calibration_frames import rising
 from softfinger.tools.cli import main
 
 tactile_message = message_maker(TACTILE)
@@ -329,3 +330,11 @@ def test_no_frames_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["calibrate", "tare", str(tmp_path / "sensor.json"), "--frames", "0"])
     assert "expected at least one frame" in capsys.readouterr().err
+
+
+def test_frames_of_a_press_that_rests_at_its_depth_are_not_those_of_its_way_down():
+    way = np.minimum(np.arange(1.0, 140.0), 40.0) ** 2
+    noisy = way * np.random.default_rng(1).normal(1.0, 0.005, way.size)
+    assert int(np.argmax(noisy)) > 45
+    assert 36 <= rising(noisy.tolist()) <= 40
+    assert rising([]) == 0

@@ -31,7 +31,7 @@ _WAIT = 60.0  # s for a press to begin
 _TOUCHED = 3  # cells above their noise: something touches the tip
 _CLEAR = 6.0  # standard deviations, and two counts, from which a cell is above its noise
 _FEWEST = 5  # frames of a press
-_BACK = 0.95  # of the run's largest reading, below which the tip is released
+_BACK = 0.95  # of the run's largest reading: below it the tip goes down yet, or is released
 
 
 @dataclass(frozen=True)
@@ -169,12 +169,17 @@ def _live_run(
                 frames.append(frame.data)
                 d.append(speed * (frame.t_sample - last_free))
     totals = [float(converter.readings(each.astype(np.float64)).sum()) for each in frames]
-    count = int(np.argmax(totals))  # the deepest itself may already be on the way back
+    count = rising(totals)
     if count < _FEWEST:
         raise CalibrationError(f"{count} frames while it was pressed: press slower")
     _say(f"{count} frames of a press to {1e3 * d[count]:.2f} mm")
     truths = {**_spread(given, count), "d": np.array(d[:count])}
     return Loads([each[None] for each in frames[:count]], truths)
+
+
+def rising(totals: list[float]) -> int:
+    """How many frames came while the press went down: what rests at its depth is none of them."""
+    return int(np.argmax(np.array(totals) > _BACK * max(totals))) if totals else 0
 
 
 @contextlib.contextmanager
