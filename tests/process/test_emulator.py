@@ -116,28 +116,43 @@ def test_boards_send_the_default_grid(hand, finger):
     assert counters["resyncs"] == counters["skipped_bytes"] == 0
 
 
-def test_the_physics_stands_behind_servos_and_boards(hand, servos):
+@pytest.fixture
+def boards(hand):
+    """Both tips' boards, which are closed with the test."""
     sensors = [board(hand, finger) for finger in (0, 1)]
-    for sensor in sensors:
-        sensor.open()
-    limp = [int(sensor.latest().data.sum()) for sensor in sensors]
-    for servo, goal in ((1, 2048 + 400), (2, 2048 - 400)):
+    try:
+        for sensor in sensors:
+            sensor.open()
+        yield sensors
+    finally:
+        for sensor in sensors:
+            sensor.close()
+
+
+def test_the_physics_stands_behind_servos_and_boards(servos, boards):
+    closed = {1: 2048 + 400, 2: 2048 - 400}
+    limp = [int(sensor.latest().data.sum()) for sensor in boards]
+    for servo, goal in closed.items():
         servos.write(servo, TORQUE_ENABLE, 1, 1)
         servos.write(servo, GOAL_CURRENT, 2, 150)  # 0.4 A
         servos.write(servo, GOAL_POSITION, 4, goal)
-    until(lambda: all(sensor.latest().data.max() > 40 for sensor in sensors))
-    pressed = [int(sensor.latest().data.sum()) for sensor in sensors]
+    until(lambda: all(sensor.latest().data.max() > 40 for sensor in boards))
+    pressed = [int(sensor.latest().data.sum()) for sensor in boards]
     assert all(after > before + 500 for before, after in zip(limp, pressed, strict=True))
-    until(lambda: servos.read(1, PRESENT_POSITION, 4) > 2060)
-    until(lambda: servos.read(2, PRESENT_POSITION, 4) < 2036)
+    # They are as strong as each other: where one lets go, the other takes the object along.
+    for other, moved in (
+        (2, lambda: servos.read(1, PRESENT_POSITION, 4) > 2060),
+        (1, lambda: servos.read(2, PRESENT_POSITION, 4) < 2036),
+    ):
+        servos.write(other, GOAL_POSITION, 4, 2048)
+        until(moved)
+        servos.write(other, GOAL_POSITION, 4, closed[other])
     for servo in (1, 2):
         servos.write(servo, GOAL_POSITION, 4, 2048)
-    until(lambda: all(sensor.latest().data.max() < 30 for sensor in sensors))
+    until(lambda: all(sensor.latest().data.max() < 30 for sensor in boards))
     until(lambda: all(abs(servos.read(servo, PRESENT_POSITION, 4) - 2048) < 8 for servo in (1, 2)))
     for servo in (1, 2):
         servos.write(servo, TORQUE_ENABLE, 1, 0)
-    for sensor in sensors:
-        sensor.close()
 
 
 def test_clients_may_come_and_go(hand):
