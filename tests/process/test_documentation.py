@@ -61,6 +61,8 @@ def blocks(page: Path) -> list[Block]:
         if mark:
             assert REASON.fullmatch(mark), f"{page.name}:{line}: {mark!r}"
             assert fence["language"], f"{page.name}:{line}: a mark on a block that isn't run"
+            for other in re.findall(r"tests/\S+", mark):
+                assert (ROOT / other).exists(), f"{page.name}:{line}: {other}"
         if fence["language"]:
             code = textwrap.dedent(fence["text"])
             found.append(Block(line, fence["language"], code, mark))
