@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import select
 import signal
 import subprocess
@@ -20,7 +19,6 @@ from tests.conftest import Inline, own_addresses, until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger
 
 Profile = Callable[[str], Path]
-README = Path(__file__).parents[2] / "README.md"
 
 
 class Shared(NamedTuple):
@@ -160,31 +158,6 @@ def test_garbage_on_the_command_socket_changes_nothing(
         assert socket.poll(60_000)
         assert msgpack.unpackb(socket.recv_multipart()[-1])["ok"] is False
     assert ask(hand.commands, "arm")["ok"]
-
-
-def test_the_readme_subscriber_prints_what_the_daemon_publishes(hand: Shared) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    (subscriber,) = [block for block in blocks if "zmq.SUB" in block]
-    assert len(subscriber.strip().splitlines()) == 6
-    process = subprocess.Popen(
-        [sys.executable, "-u", "-c", subscriber.replace("tcp://127.0.0.1:9872", hand.stream)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    lines = [process.stdout.readline() for _ in range(3)]
-    process.kill()
-    process.communicate()
-    assert all(re.fullmatch(r"disarmed: 0\.00 N at 0\.00 mm\n", line) for line in lines)
-
-
-def test_the_readme_mathematics_runs() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    (mathematics,) = [block for block in blocks if "ContactTable" in block]
-    names: dict[str, Any] = {}
-    exec(mathematics, names)
-    assert names["estimate"].d == pytest.approx(0.004, rel=1e-3)
-    assert names["contact"].force > 0.0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
