@@ -36,7 +36,8 @@ from softfinger.daemon.wire.publisher import Publisher
 from softfinger.kinematics.compiled.layout import Record
 
 _ROUND = 4  # passes: the first with new frames, and after a look at the loop's own data
-_MORE = 1.25  # of its mean time that a pass may take
+_MORE = 1.25  # of the time taken lately that a pass may take
+_SPARE = 2e-5  # s before the deadline that no pass may take, since some take longer
 _FADE = 0.98  # of that time a tick later
 _LARGEST = 16_384  # bytes: longer arrays are a kernel's constants and scratch
 _VALUES = frozenset({bool, int, float, str, type(None), Mode})  # what nobody can write
@@ -79,8 +80,8 @@ class Rehearsal:
         """Sleep, and rehearse until shortly before the machine's time ``due`` [s]."""
         # A pass that was interrupted once is tried again, though not soon.
         took = self._took = [min(_FADE * each, 2.0 * self._lead) for each in self._took]
-        now = time.monotonic
-        if now() + _MORE * took[_COLD] > due:
+        now, ends = time.monotonic, due - _SPARE
+        if now() + _MORE * took[_COLD] > ends:
             return
         self.likeness.take()
         self._link.wanted = self._loop.wanted
@@ -88,7 +89,7 @@ class Rehearsal:
         if asleep > 0.0:
             time.sleep(asleep)
         kind, number, began = _COLD, 0, now()
-        while began + _MORE * took[kind] < due:
+        while began + _MORE * took[kind] < ends:
             try:
                 self._pass(kind != _SAME)
             except Exception as error:  # a twin's; the loop goes on without
@@ -96,15 +97,15 @@ class Rehearsal:
                 self._loop.emit("warning", "rehearsal", f"ended by an error: {error!r}")
                 return
             ended = now()
-            took[kind] = 0.5 * (took[kind] + ended - began)
+            took[kind] = max(ended - began, 0.9 * took[kind])  # most of the last few
             began = ended
             number += 1
-            fresh = number % _ROUND == 0 and began + _MORE * took[_FRESH] < due
+            fresh = number % _ROUND == 0 and began + _MORE * took[_FRESH] < ends
             kind = _FRESH if fresh else _SAME
 
     def _pass(self, fresh: bool) -> None:
         twin = self.twin
-        if twin.state.mode != self._loop.state.mode:
+        if twin.state.fault != self._loop.state.fault:
             self.likeness.take()  # it went its own way, on the same reading again and again
         t = twin.state.t + twin.period
         if fresh:
