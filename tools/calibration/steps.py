@@ -266,7 +266,7 @@ def _modulus(step: Step) -> Done:
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
-        f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} frames, zero of d at "
+        f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} loads, zero of d at "
         f"{found.offset * 1e3:.3f} mm, force within {found.residual:.2%} rms"
     )
     if not whole.all():
