@@ -33,7 +33,7 @@ _MEMORY_STEP = 1.0  # s between two looks at this process's memory
 _MEMORY_SLACK = 50.0  # MB that it may grow by itself
 _AHEAD = 200  # pictures of a recording that are sent before waiting for the viewer
 _FLUSH_TIME = 60.0  # s for that
-_LATE = 10.0  # MB of the stream, some 30 s, that a page opened late reads before it is up to date
+_LATE = 1.0  # MB of the stream, some 3 s, that a page opened late reads before it is up to date
 
 
 class Session:

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=megabytes,
         default=500.0,
         metavar="MB",
-        help="memory for the newest data (default 500); a page opened late on a stream gets 10",
+        help="memory for the newest data (default 500); a page opened late on a stream gets 1",
     )
     parser.add_argument(
         "--rate",
