@@ -107,10 +107,12 @@ def held_on(pair: Pair, stream: Stream, count: int) -> list[dict[str, Any]]:
         else:
             held.clear()
             if command := next_step.get(state["mode"]):
-                ask(pair.commands, command, **({"force": 10.0} if command == "grasp" else {}))
+                force = {"force": 10.0} if command == "grasp" else {}
+                reply = ask(pair.commands, command, **force)
+                print(state["mode"], state["fault"], command, reply)  # shown if it fails
         return len(held) == count
 
-    until(look, 300.0)
+    until(look, 500.0)
     return held
 
 
@@ -120,7 +122,7 @@ def test_arm_grasp_10_n_hold_release_and_stop_over_bytes(
     stream = Stream(context, pair.stream)
     before = stream.next()
     assert (before["mode"], before["torque"]) == ("disarmed", False)
-    held = held_on(pair, stream, 200)
+    held = held_on(pair, stream, 60)
     # A busy machine may keep a reading or a frame from being fresh for a moment.
     sound = [state for state in held if state["left"]["valid"] and state["right"]["valid"]]
     assert sum(near(state, 10.0) for state in sound) > 0.9 * len(sound) > 0
@@ -143,7 +145,8 @@ def test_a_second_daemon_on_the_same_ports_says_so_before_torque_is_on(
     assert second.returncode == 1
     assert f"{pair.folder}/servos" in second.stderr.splitlines()[-1]
     assert "Traceback" not in second.stderr
-    assert ask(pair.commands, "arm")["ok"], "the first one must live on"
+    reply = ask(pair.commands, "arm")
+    assert reply["ok"], f"the first one must live on: {reply}"
     assert ask(pair.commands, "disarm")["ok"]
 
 
