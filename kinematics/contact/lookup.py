@@ -168,7 +168,7 @@ def _piece(h: float, bits: int) -> tuple[int, float]:
 
 
 @inlined_kernel
-def _from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
+def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
     """The five ratios by one of the forms that span y. Shapes and strides are literals."""
     i, x = _piece(h, 3)
     y = 2.0 * y - 1.0
@@ -210,7 +210,7 @@ def _share(y: float, count: int) -> tuple[int, float]:
 
 
 @inner_kernel
-def _from_corner(p: Pointer, h: float, y: float) -> Ratios:
+def from_corner(p: Pointer, h: float, y: float) -> Ratios:
     """The five ratios A + B log h below the lowest octave."""
     j, y = _share(y, CORNER_PIECES)
     x = (2.0 / LOWEST) * h - 1.0
@@ -238,12 +238,12 @@ def _ratios(
         inverse = both * h
         y = math.sqrt(gap) * both
         if form > 3:
-            return inverse, _from_slab(p, form, h, y)
+            return inverse, from_slab(p, form, h, y)
         return inverse, _from_square(p, form, h, y)
     inverse = 1.0 / c
     s = abs(s)
     y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
-    return inverse, _from_corner(p, h, y)
+    return inverse, from_corner(p, h, y)
 
 
 @inlined_kernel
@@ -399,7 +399,7 @@ def lookups(
                 continue
             r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0
             if form > 3:
-                r_f, r_u, r_fd, r_ft, r_ut = _from_slab(p, form, work[k - start + _BLOCK], y)
+                r_f, r_u, r_fd, r_ft, r_ut = from_slab(p, form, work[k - start + _BLOCK], y)
             elif form != CLOSED:
                 r_f, r_u, r_fd, r_ft, r_ut = _from_square(p, form, work[k - start + _BLOCK], y)
             inverse = work[k - start + 2 * _BLOCK]

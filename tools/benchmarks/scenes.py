@@ -3,8 +3,8 @@
 In µs a tick: all daemons stand side by side, on canned readings (or the simulated hand) and virtual
 time, and tick in turns. A step is switched off in a daemon of its own, from outside; what it saves
 is the median of the differences to the daemon that has it, round by round, with that median's own
-error. In seconds of the first start, where the scenes differ in kernels: `softfinger compile` with
-an empty cache, on all processors; and the processor time of that, which other load hardly changes.
+error. In seconds of the first start: `softfinger compile` with an empty cache, on all processors,
+and the processor time of that, which other load hardly changes; 0 where both need the same kernels.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,15 @@ from numpy.typing import NDArray
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.simd import address, further
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.estimation.detection import presses_outside
 from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.likelihood import accumulate, press
+from softfinger.kinematics.estimation.state import EstimatorState
+from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.tools.benchmarks.measuring import Report, Row, Subject, figure, interleave
 from softfinger.tools.benchmarks.rigs import (
     SOFTFINGER,
@@ -55,6 +63,19 @@ class TimedScene:
     topics: tuple[str, ...] = ()
     subscribers: int = 1  # to each of these
     alter: Callable[[Daemon], None] = can
+    start: tuple[str, ...] | None = None  # words that say its kernels, if not the sections
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """For `softfinger compile`."""
+        if self.start is not None:
+            return self.start
+        words = []
+        for part, values in self.sections.items():
+            for key, value in values.items():
+                text = repr(list(value) if isinstance(value, tuple) else value)
+                words += ["--set", f"{part}.{key}={text}"]
+        return tuple(words)
 
 
 def _always_fitted(daemon: Daemon) -> None:
@@ -79,6 +100,39 @@ def _always_cold(daemon: Daemon) -> None:
         estimator.update = cold  # type: ignore[assignment,method-assign]
 
 
+def _after_each_fit(more: Callable[[Any, Any], None], daemon: Daemon) -> None:
+    """Have this kernel run over the state of each new estimate."""
+    can(daemon)
+    for finger in daemon.loop.perception.fingers:
+        estimator = finger._estimator
+
+        def both(*arguments: Any, e: Any = estimator, then: Any = estimator.update) -> Any:
+            found = then(*arguments)
+            more(e.state.array, e.arena[0])
+            return found
+
+        estimator.update = both  # type: ignore[assignment,method-assign]
+
+
+@kernel
+def _all_cells(states: Records[EstimatorState], arena: FloatArray) -> None:
+    """One step's sums over the whole grid's cells."""
+    state = states[0]
+    state.fit.count = state.model.rows * state.model.cols
+    packed = further(address(arena), state.at.packed)
+    press(state, packed)
+    accumulate(state, packed)
+
+
+@kernel
+def _second_contact(states: Records[EstimatorState], arena: FloatArray) -> None:
+    """The search for pressure off the footprint, over readings that have none."""
+    state = states[0]
+    centres = further(address(arena), state.at.centres)
+    readings = further(address(arena), state.at.packed)
+    state.estimate.second = presses_outside(None, state, readings, centres, 1e9)
+
+
 def _always_packed(daemon: Daemon) -> None:
     can(daemon)
     publishing = daemon.loop._publishing
@@ -97,13 +151,12 @@ def _tabulated(daemon: Daemon) -> None:
 ONE = {"scene": {"fingers": ("left",)}}
 CONSTANT = {"material": {"law": "constant"}}
 HOLDING, IDLE, ONE_IDLE = "two fingers holding", "idle and open", "one finger, idle"
+NO_SENSORS, NO_SERVOS = "servos without sensors, idle", "sensors without servos, one tip touched"
 SCENES = {
     IDLE: TimedScene(holds=False),
     ONE_IDLE: TimedScene(ONE, holds=False),
-    "servos without sensors, idle": TimedScene({"tactile": {"backend": "none"}}, holds=False),
-    "sensors without servos, one tip touched": TimedScene(
-        {"servos": {"backend": "none"}}, holds=False
-    ),
+    NO_SENSORS: TimedScene({"tactile": {"backend": "none"}}, holds=False),
+    NO_SERVOS: TimedScene({"servos": {"backend": "none"}}, holds=False),
     HOLDING: TimedScene(),
     "two fingers holding, all subscribed": TimedScene(topics=("hand",)),
 }
@@ -114,34 +167,39 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
         TimedScene(alter=lambda daemon: can(daemon, every_tick=True)),
     ),
     "no contact, no fit": (SCENES[IDLE], TimedScene(holds=False, alter=_always_fitted)),
+    "cells off the footprint": (
+        SCENES[HOLDING],
+        TimedScene(alter=partial(_after_each_fit, _all_cells)),
+    ),
+    "the search for a second contact": (
+        SCENES[HOLDING],
+        TimedScene(alter=partial(_after_each_fit, _second_contact)),
+    ),
     "the fit starts from the last contact": (SCENES[HOLDING], TimedScene(alter=_always_cold)),
     "no blur": (SCENES[HOLDING], TimedScene({"tactile": {"blur": 0.5e-3}})),
     "a modulus that is constant": (TimedScene(CONSTANT), TimedScene(CONSTANT, alter=_tabulated)),
     "topics without subscribers": (SCENES[HOLDING], TimedScene(alter=_always_packed)),
     "state at 100 Hz, not each tick": (
         TimedScene(topics=("hand/state",)),
-        TimedScene({"stream": {"state_rate": 500.0}}, topics=("hand/state",)),
+        TimedScene({"stream": {"state_rate": 500.0}}, topics=("hand/state",), start=()),
     ),
     "a finger": (SCENES[ONE_IDLE], SCENES[IDLE]),
-    "the simulated hand": (SCENES[HOLDING], TimedScene(alter=_as_it_is)),
+    "the simulated hand": (
+        TimedScene(start=("--config", "hil")),
+        TimedScene(alter=_as_it_is),
+    ),
     "the object's taper": (
         TimedScene(alter=_as_it_is),
         TimedScene({"simulation": {"object_shape": "wedge"}}, alter=_as_it_is),
     ),
+    "sensors": (SCENES[NO_SENSORS], SCENES[IDLE]),
+    "servos": (SCENES[NO_SERVOS], SCENES[HOLDING]),
 }
-# The same of the first start: words for `softfinger compile`, with and without.
-STARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "no blur": ((), ("--set", "tactile.blur=0.5e-3")),
-    "a modulus that is constant": (("--set", "material.law=constant"), ()),
-    "a finger": (("--set", "scene.fingers=['left']"), ()),
-    "the simulated hand": (("--config", "hil"), ()),
-    "no sensors": (("--set", "tactile.backend=none"), ()),
-    "no servos": (("--set", "servos.backend=none"), ()),
-    "kernels of other scenes": ((), ("--all",)),
-}
+# Of the first start alone.
+OTHERS = "kernels of other scenes", ((), ("--all",))
 
 
-def measure(brief: bool = False, rounds: int = 1000) -> list[Report]:
+def measure(brief: bool = False, rounds: int = 400) -> list[Report]:
     """All scenes and steps in turns; unless ``brief`` the first starts, several minutes."""
     scenes = dict(SCENES)
     for name, (base, without) in STEPS.items():
@@ -155,22 +213,17 @@ def measure(brief: bool = False, rounds: int = 1000) -> list[Report]:
     taken = {name: 1e-3 * times[same[id(scene)]] for name, scene in scenes.items()}
     costs = [figure(name, "µs", taken[name]) for name in SCENES]
     savings = [saving(name, taken[f"with {name}"], taken[f"without {name}"]) for name in STEPS]
-    tables = [Report("mean tick", costs), Report("skipped, µs a tick", savings)]
     if not brief:
-        words = dict.fromkeys(word for pair in STARTS.values() for word in pair)
-        starts = {each: first_start(*each) for each in words}
-        rows = []
-        for name, (some, more) in STARTS.items():
-            (wall, busy), (wall_more, busy_more) = starts[some], starts[more]
-            row = {
-                "name": name,
-                "with s": wall,
-                "without s": wall_more,
-                "saves s": wall_more - wall,
-            }
-            rows.append(row | {"of processor time, s": busy_more - busy})
-        tables.append(Report("skipped, s of the first start", rows))
-    return tables
+        pairs = {name: (base.words, without.words) for name, (base, without) in STEPS.items()}
+        savings.append({"name": OTHERS[0]})
+        starts: dict[tuple[str, ...], NDArray[np.float64]] = {}
+        for row, (some, more) in zip(savings, [*pairs.values(), OTHERS[1]], strict=True):
+            for words in (some, more) if some != more else ():
+                if words not in starts:
+                    starts[words] = np.array(first_start(*words))
+            wall, busy = starts[more] - starts[some] if some != more else (0.0, 0.0)
+            row |= {"first start s": wall, "of processor time s": busy}
+    return [Report("mean tick", costs), Report("skipped, µs a tick", savings)]
 
 
 def standing(scene: TimedScene, stack: contextlib.ExitStack) -> Daemon:
