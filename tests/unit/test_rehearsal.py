@@ -197,10 +197,12 @@ def test_a_pass_is_begun_only_where_there_is_time_for_it(
 
     monkeypatch.setattr(rehearse, "_pass", costly)
     for k in range(20):
-        due = machine.monotonic() + (2e-3 if k % 4 else 3e-4)  # now and then it comes late
+        before, left = passes, (2e-3, 1e-3, 5e-4)[k % 3] if k % 4 else 3e-4  # some come late
+        due = machine.monotonic() + left
         rehearse(due)
         if k >= 8:  # it has learnt by then what a pass takes
             assert machine.t <= due
+            assert (passes - before) * cost <= 0.5 * left  # others have the processor half the time
     assert (passes > 20) == (cost < 1e-3)
 
 
