@@ -55,7 +55,7 @@ class Rehearsal:
         clock: LoopClock,
         lead: float,
     ) -> None:
-        """``lead`` [s]: how long before a deadline it begins, after a sleep of that time at least."""
+        """``lead`` [s]: how long before a deadline it begins, after as long a sleep at least."""
         self._loop = loop
         self._lead = lead
         self._link = Link()  # with nobody at its other end
