@@ -88,7 +88,7 @@ class Rehearsal:
         # Half of what is left at least: Linux takes the processor from a real-time thread that
         # leaves others less than 5 % of it, for 50 ms.
         left = due - now()
-        time.sleep(max(left - self._lead, 0.5 * left))
+        time.sleep(max(left - self._lead, 0.5 * left, 0.0))
         kind, number, began = _COLD, 0, now()
         while began + _MORE * took[kind] < ends:
             try:

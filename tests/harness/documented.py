@@ -66,16 +66,22 @@ class Softfinger:
         client = self.socket.accept()[0]
         with client, client.makefile("rw") as stream:
             words = json.loads(stream.readline())
-            told, error = io.StringIO(), io.StringIO()
-            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(error):
-                try:
-                    status = self._carry_out(words)
-                except SystemExit as ended:  # argparse's
-                    status = int(ended.code or 0)
-                except SettingsError as wrong:
-                    status = 2
-                    print(wrong, file=sys.stderr)
-            print(json.dumps((status, told.getvalue(), error.getvalue())), file=stream, flush=True)
+            status, told, error = self._answer(words)
+            while "send it again" in told:  # a busy machine held the daemon up
+                status, told, error = self._answer(words)
+            print(json.dumps((status, told, error)), file=stream, flush=True)
+
+    def _answer(self, words: list[str]) -> tuple[int, str, str]:
+        told, error = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(error):
+            try:
+                status = self._carry_out(words)
+            except SystemExit as ended:  # argparse's
+                status = int(ended.code or 0)
+            except SettingsError as wrong:
+                status = 2
+                print(wrong, file=sys.stderr)
+        return status, told.getvalue(), error.getvalue()
 
     def _carry_out(self, words: list[str]) -> int:
         name = words[0]

@@ -353,7 +353,7 @@ def test_a_port_that_goes_away(bus: RunningBus, connect: Connect) -> None:
 
 
 def test_torque_off_counts_once_every_servo_says_so(bus: RunningBus, connect: Connect) -> None:
-    backend = connect(bus, reply_timeout=0.01)
+    backend = connect(bus, reply_timeout=0.25)
     backend.torque_on()
     bus.fault("silent=2")
     assert not backend.torque_off(Reading())

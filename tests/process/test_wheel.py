@@ -75,4 +75,4 @@ def test_folders_of_the_same_names_are_in_nobodys_way(wheel: Path, tmp_path: Pat
     run("-c", _PUBLIC)
     assert run("-m", "softfinger", "--version").startswith("softfinger ")
     assert "tip.force" in run("-m", "softfinger", "limits")
-    assert run("-m", "softfinger", "config", "reference", "tip.radius") == "tip.radius = 0.02\n"
+    assert run("-m", "softfinger", "config", "reference", "tip.radius") == "tip.radius = 0.02 # m\n"

@@ -49,6 +49,7 @@ class Machine:
         return self.t
 
     def sleep(self, seconds: float) -> None:
+        assert seconds >= 0.0
         self.t += seconds
 
 
@@ -204,6 +205,20 @@ def test_a_pass_is_begun_only_where_there_is_time_for_it(
             assert machine.t <= due
             assert (passes - before) * cost <= 0.5 * left  # others have the processor half the time
     assert (passes > 10) == (cost < 1e-3)
+
+
+def test_a_deadline_that_passes_while_the_twin_is_prepared_is_no_error(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = make()
+    machine = Machine(daemon, 0.0)
+    monkeypatch.setattr(module, "time", machine)
+    daemon.rehearse(1e-3)
+    rehearse, late = rehearsal_of(daemon), machine.monotonic() + 1e-3
+    monkeypatch.setattr(rehearse.likeness, "take", lambda: machine.sleep(1e-3))
+    monkeypatch.setattr(rehearse, "_pass", lambda _: pytest.fail("no time for it"))
+    rehearse(late - 5e-4)
+    assert machine.monotonic() == late
 
 
 def test_an_error_of_the_twin_ends_the_rehearsal_and_nothing_else(
