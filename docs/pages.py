@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import ast
 import inspect
+import itertools
 import json
 import os
 import re
@@ -281,24 +282,21 @@ def measured() -> str:
     """The figures that docs/benchmarks.json keeps, of a `softfinger bench` without names."""
     content = json.loads((ROOT / "docs" / "benchmarks.json").read_text(encoding="utf-8"))
     load = " to ".join(f"{each:.1f}" for each in content["load"])
-    machine = f"{content['machine']}, {content['cores']} cores, load {load}"
-    rows = [f"{machine}, Python {content['python']}.\n\n"]
-    table = ""
-    for row in content["rows"]:
-        if not row["table"] or row.get("median") is None:
-            continue  # a yardstick, or a bound
-        if row["table"] != table:
-            table = row["table"]
-            title = f"{row['measurement']}: {table}"
-            rows += ["\n", _head(title, "median", "99 %", "unit", "error")]
-        median, late = (f"{row[key]:.3g}" if row.get(key) is not None else "" for key in _TIMES)
-        error = f"{row['error']:.1e}" if row.get("error") else ""
-        rows.append(_row(row["name"], median, late, row["unit"], error))
-    return "".join(rows)
+    parts = [f"{content['machine']}, {content['cores']} cores, load {load}.\n"]
+    shown = [row for row in content["rows"] if row["table"] and row.get("median") is not None]
+    for title, rows in itertools.groupby(shown, key=lambda row: row["table"]):
+        parts.append(
+            "\n" + _head(title, "median", "p99", "unit", "aim ≤", "error", "RMS of d [µm]")
+        )
+        for row in rows:
+            keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
+            cells = (row.get(key) for key in keys)
+            told = ("" if c is None else c if isinstance(c, str) else f"{c:.3g}" for c in cells)
+            parts.append(_row(row["name"], *told))
+    return "".join(parts)
 
 
-_TIMES = ("median", "p99")
-TABLES = {"checkpoints": checkpoints, "errata": errata}
+TABLES = {"checkpoints": checkpoints, "errata": errata, "measured": measured}
 
 PAGES: dict[str, Callable[[], str]] = {
     "index.md": _from("README.md"),
@@ -338,7 +336,7 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Tables made from the code; links as a reader of the repository follows them."""
     markdown = re.sub(
-        r" <!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
+        r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
     )
 
     def link(found: re.Match[str]) -> str:

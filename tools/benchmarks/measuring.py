@@ -168,7 +168,9 @@ def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
             )
         else:
             at, median = np.log(at), np.log(median)
-            whole, last = np.polyfit(at, median, 1)[0], np.polyfit(at[-2:], median[-2:], 1)[0]
+            whole, end = np.polyfit(at, median, 1)[0], at == at[-1]  # several may be there
+            before = np.flatnonzero(~end)[-1]
+            last = (median[end].mean() - median[before]) / (at[-1] - at[before])
             notes.append(f"  {name}: ∝ ({x})^{whole:.2f}, at the end ^{last:.2f}")
     return tuple(notes)
 

@@ -18,13 +18,17 @@ _LONGEST = 46  # characters of a bar's name
 def draw(reports: list[Report], path: Path) -> None:
     """A panel for each of ``reports``. Raises MissingExtra without matplotlib."""
     columns = min(len(reports), 3)
-    rows = math.ceil(len(reports) / columns)
+    heights = [
+        max(3.5 if each.x else 1.1 + 0.24 * len(each.rows) for each in reports[k : k + columns])
+        for k in range(0, len(reports), columns)
+    ]
     looks: dict[str, int] = {}  # of each kind, the same in all panels
     with style.settings():
         from matplotlib.ticker import NullFormatter
 
-        figure = style.new_figure(4.2 * columns + 0.6, 3.5 * rows + 0.4)
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        figure = style.new_figure(4.2 * columns + 0.6, sum(heights) + 0.4)
+        grid = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
+        panels = grid.ravel()
         for axes in panels[len(reports) :]:
             axes.remove()
         for axes, report in zip(panels, reports, strict=False):
@@ -73,14 +77,16 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
         axes.barh(k, row["median"], color=style.KINDS[0], height=0.6)
         if row["n"] >= 100:
             axes.plot(row["p99"], k, "|", color=style.INK, ms=9, mew=1.5)
-        axes.annotate(f" {row['median']:.3g}", (row["median"], k), va="center", fontsize=6)
+        end = max(row["median"], row["p99"]) if row["n"] >= 100 else row["median"]
+        axes.annotate(f"  {row['median']:.3g}", (end, k), va="center", fontsize=6)
     names = [str(row["name"]) for row in rows]
     short = [name if len(name) <= _LONGEST else name[: _LONGEST - 1] + "…" for name in names]
     axes.set_yticks(range(len(rows)), short, fontsize=6)
-    axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
     tails = any(row["n"] >= 100 for row in rows)
     axes.set_xlabel(f"median{' and 99th percentile' if tails else ''} [{rows[0]['unit']}]")
     axes.set_xscale(_scale([row[key] for row in rows for key in ("median", "p99")]))
+    axes.margins(x=0.15)  # for the last figure
 
 
 def _scale(values: list[float]) -> str:
