@@ -32,7 +32,7 @@ SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
     "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     "doctor": ("setup", "check ports, servos, boards and this machine, and say what mends them"),
     "scan": ("setup", "find the servos on a port, at any rate"),
-    "calibrate": ("calibration", "calibrate the pressure sensor under a tip, step by step"),
+    "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
     "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
     "limits": ("setup", "list every limit: condition, consequence, setting"),
     "config": ("setup", "list and show the profiles, and every setting with its default"),

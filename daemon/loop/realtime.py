@@ -78,7 +78,9 @@ class RealTime:
 
     def __init__(self, settings: Settings) -> None:
         self.outcomes: list[Measure] = []
-        self.rehearsal = 0.0  # s before a tick, for `loop.rehearsal`; it needs all of a processor
+        self.rehearsal = (
+            0.0  # s before a tick, for `loop.rehearsal`; it needs a processor of its own
+        )
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -98,7 +100,7 @@ class RealTime:
             self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
         if wanted.rehearsal and own:
             self.rehearsal = wanted.rehearsal
-            self._granted(f"rehearsal for {wanted.rehearsal * 1e6:g} µs before each tick")
+            self._granted(f"rehearsal for up to {wanted.rehearsal * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
         """For the loop's events: one with all that was granted, one for each refusal."""
