@@ -33,6 +33,7 @@ from tests.harness.golden_wire import flat, sample
 
 Profile = Callable[[str], Path]
 TOPICS = tuple(schema.TOPICS)
+EVENT = schema.EVENT
 
 
 @pytest.fixture
@@ -116,6 +117,29 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path: Path, topic: byt
     described = json.loads(schema.data)["properties"]
     assert set(json.loads(raw.data)) == set(described)
     assert raw.log_time == int(golden["timestamp"] * 1e9)
+    if topic == EVENT:  # as Foxglove wants it
+        line = json.loads(raw.data)
+        assert schema.name == "foxglove.Log"
+        assert (golden["level"], line["level"]) == ("warning", 3)
+        assert (line["message"], line["name"]) == (golden["text"], golden["kind"])
+        seconds = line["timestamp"]["sec"] + 1e-9 * line["timestamp"]["nsec"]
+        assert seconds == pytest.approx(golden["timestamp"])
+
+
+def test_the_layouts_name_only_fields_that_are_streamed() -> None:
+    folder = Path(__file__).parents[2] / "tools" / "viewing"
+    fields = {
+        f"{topic.decode()}/{each.name.replace('.', '/')}"
+        for topic in TOPICS
+        for each in schema.TOPICS[topic].fields
+    }
+    curves = re.findall(r'curve name="([^"]+)"', (folder / "plotjuggler_layout.xml").read_text())
+    paths = re.findall(
+        r'"value": *"(hand/\w+\.[^"]+)"', (folder / "foxglove_layout.json").read_text()
+    )
+    assert curves
+    assert paths
+    assert {each.replace(".", "/") for each in (*curves, *paths)} <= fields
 
 
 def test_numbers_that_are_none_come_back_as_such(tmp_path: Path) -> None:

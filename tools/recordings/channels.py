@@ -14,8 +14,28 @@ ENCODING = "json"
 SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
-_IMAGE = "foxglove.RawImage"
-_TACTILE = tuple(field.name for field in schema.TOPICS[schema.TACTILE].fields)  # in their order
+
+# Frames and events are Foxglove's messages, too: its schema, and the fields that it wants. Where
+# one of ours has the same name, ours has another name in the recording.
+_STAMP = {
+    "type": "object",
+    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+}
+_WORD, _NUMBER = {"type": "string"}, {"type": "integer"}
+_FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
+    schema.TACTILE: (
+        "foxglove.RawImage",
+        {"timestamp": _STAMP, "frame_id": _WORD, "width": _NUMBER, "height": _NUMBER}
+        | {"encoding": _WORD, "step": _NUMBER},
+    ),
+    schema.EVENT: (
+        "foxglove.Log",
+        {"timestamp": _STAMP, "level": _NUMBER, "message": _WORD, "name": _WORD}
+        | {"file": _WORD, "line": _NUMBER},
+    ),
+}
+_KEPT_AS = {"timestamp": "unix", "level": "severity"}
+_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's; 0 is one that it doesn't know
 
 _MOST_CELLS = 4096  # in a row or column
 
@@ -40,56 +60,69 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
     if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
     described = schema_docs.json_schema(topic)
-    if topic != schema.TACTILE:
+    if topic not in _FOXGLOVE:
         return topic.decode().replace("/", "."), described
-    own = described["properties"]
-    stamp = {
-        "type": "object",
-        "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-    }
-    described["properties"] = {
-        "timestamp": stamp,
-        "frame_id": {"type": "string"},
-        "width": {"type": "integer"},
-        "height": {"type": "integer"},
-        "encoding": {"type": "string"},
-        "step": {"type": "integer"},
-        **{("unix" if name == "timestamp" else name): field for name, field in own.items()},
-    }
-    return _IMAGE, described
+    name, fields = _FOXGLOVE[topic]
+    own = described["properties"].items()
+    described["properties"] = fields | {_kept_as(each, fields): field for each, field in own}
+    return name, described
 
 
 def to_json(topic: bytes) -> Converter:
     """What makes a map fit for JSON. The map may be changed."""
-    return _image if topic == schema.TACTILE else _as_it_is
+    return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, _as_it_is)
 
 
 def from_json(topic: bytes) -> Converter:
     """What makes the map of the wire from a channel's JSON."""
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
     floats = [field.name.split(".") for field in fields if field.kind == "float"]
-    return _Restored(floats, topic == schema.TACTILE)
+    return _Restored(topic, floats)
+
+
+def _kept_as(name: str, fields: dict[str, Any]) -> str:
+    return _KEPT_AS[name] if name in fields else name
 
 
 def _as_it_is(message: dict[str, Any]) -> dict[str, Any]:
     return message
 
 
+def _stamp(unix: object) -> dict[str, int]:
+    if not isinstance(unix, float) or not 0.0 <= unix < 2.0**32:
+        return {"sec": 0, "nsec": 0}
+    seconds = math.floor(unix)
+    return {"sec": seconds, "nsec": int((unix - seconds) * 1e9)}
+
+
 def _image(message: dict[str, Any]) -> dict[str, Any]:
     unix = message.pop("timestamp", None)
-    sound = isinstance(unix, float) and math.isfinite(unix) and 0.0 <= unix < 2.0**32
-    seconds = math.floor(unix) if sound else 0
     width, height = message.get("cols"), message.get("rows")
     data = message.get("data")
     message["data"] = base64.b64encode(data).decode() if isinstance(data, bytes) else ""
     return {
-        "timestamp": {"sec": seconds, "nsec": int((unix - seconds) * 1e9) if sound else 0},
+        "timestamp": _stamp(unix),
         "frame_id": message.get("finger"),
         "width": width,
         "height": height,
         "encoding": "mono16",
         "step": 2 * width if isinstance(width, int) else 0,
         "unix": unix,
+        **message,
+    }
+
+
+def _log(message: dict[str, Any]) -> dict[str, Any]:
+    unix, severity = message.pop("timestamp", None), message.pop("level", None)
+    return {
+        "timestamp": _stamp(unix),
+        "level": _LEVELS.get(severity, 0) if isinstance(severity, str) else 0,
+        "message": message.get("text"),
+        "name": message.get("kind"),
+        "file": "",
+        "line": 0,
+        "unix": unix,
+        "severity": severity,
         **message,
     }
 
@@ -109,24 +142,29 @@ def _is_frame(message: dict[str, Any]) -> bool:
 
 
 class _Restored:
-    """Nulls are NaN again, bytes are bytes, and an image is the topic's own map.
+    """Nulls are NaN again, bytes are bytes, and an image or a log line is the topic's own map.
 
     Raises ValueError, TypeError or AttributeError for what is no message of the topic.
     """
 
-    _IMAGE_ALONE = ("timestamp", "frame_id", "width", "height", "encoding", "step")
-
-    def __init__(self, floats: list[list[str]], image: bool) -> None:
+    def __init__(self, topic: bytes, floats: list[list[str]]) -> None:
         self._floats = floats
-        self._image = image
+        self._foxglove = _FOXGLOVE.get(topic, ("", {}))[1]
+        self._image = topic == schema.TACTILE
+        self._names = (
+            [field.name for field in schema.TOPICS[topic].fields] if self._foxglove else []
+        )
 
     def __call__(self, message: dict[str, Any]) -> dict[str, Any]:
-        if self._image:
-            for name in self._IMAGE_ALONE:
+        if self._foxglove and _KEPT_AS["timestamp"] in message:
+            for name in self._foxglove:
                 message.pop(name, None)
-            message["timestamp"] = message.pop("unix", math.nan)
+            for name, kept in _KEPT_AS.items():
+                if kept in message:
+                    message[name] = message.pop(kept)
+            message = {name: message[name] for name in self._names if name in message} | message
+        if self._image:
             message["data"] = base64.b64decode(message.get("data") or "")
-            message = {name: message[name] for name in _TACTILE if name in message} | message
             if not _is_frame(message):
                 raise ValueError("a tactile frame whose fields do not fit together")
         for path in self._floats:
