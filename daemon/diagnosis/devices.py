@@ -21,26 +21,31 @@ from softfinger.daemon.servos.checks import Examined, examine
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import open_line
-from softfinger.daemon.servos.provisioning import ALONE, FACTORY_ID, plan, provision, search
+from softfinger.daemon.servos.provisioning import (
+    ALONE,
+    FACTORY_ID,
+    SEARCH_TIME,
+    plan,
+    provision,
+    search,
+)
 from softfinger.daemon.types import FINGERS
 
-_PATIENCE = 0.05  # s for a reply: a factory-new servo behind a slow adapter answers within it
+_PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts anew
 _LISTEN = 0.5  # s of a board's frames
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
 
 
-def check_servos(
-    settings: Settings, patience: float = _PATIENCE, wait: float = 0.8
-) -> list[Result]:
+def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Result]:
     """Each servo of the scene; where one does not answer, what answers at every rate instead.
 
-    ``patience`` [s] is given to each reply, ``wait`` [s] to each rate that is searched.
+    ``wait`` [s] is given to each rate that is searched.
     """
     servos = settings.servos
     model = by_name(servos.model)
     try:
         # The adapter's low-latency mode would be a change, so it is not asked for.
-        with open_line(servos.port, servos.baud, patience, low_latency=False) as line:
+        with open_line(servos.port, servos.baud, low_latency=False) as line:
             found = examine(line, settings, model)
         results = [line for each in found for line in _judge(each, settings, model)]
         if not all(each.answers for each in found):
@@ -112,6 +117,8 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
     """Whether a board sends frames of the settings' grid at their rate; ``listen`` s are heard."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
+    patient = tactile.model_copy(update={"open_timeout": max(tactile.open_timeout, _PATIENCE)})
+    settings = settings.model_copy(update={"tactile": patient})
     sensor = make_sensor(settings, RealClock(), None, finger)
     assert sensor is not None
     try:

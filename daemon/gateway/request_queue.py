@@ -8,6 +8,7 @@ pauses. Nothing here reads or sends.
 Each request carries the epoch that its connection was in when it was read. The loop counts epochs
 up, with every stop and whenever it could not act for a while, and carries out requests of the
 present one alone; a connection comes into it only once nothing is left in it that arrived before.
+A ``status`` changes nothing and is answered in any epoch.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import msgpack
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.wire.command_server import PASSED, decode
+from softfinger.daemon.wire.loop_link import ALWAYS
 
 _NUMBERS = 1 << 30  # that requests are distinguished by
 _FULL = "too many commands wait already"
@@ -141,7 +143,8 @@ class RequestQueue:
         elif pace.behind:
             self._refuse_flood(client, envelope)
         else:
-            self._queue(client, envelope, msgpack.packb(request), now)
+            epoch = ALWAYS if request["command"] == "status" else client.epoch
+            self._queue(client, _Request(envelope, epoch, now, msgpack.packb(request)))
 
     def _shared(self, client: Client, now: float) -> float:
         """What each client may send in a second: less when many send."""
@@ -157,15 +160,15 @@ class RequestQueue:
         if client.pace.refusals <= bounds.REFUSALS:
             _refuse(client, envelope, f"too many commands: at most {self._per_second:g} a second")
 
-    def _queue(self, client: Client, envelope: Any, packed: bytes, now: float) -> None:
+    def _queue(self, client: Client, request: _Request) -> None:
         queued = self._waiting.get(client)
         if queued is None:
             self._waiting[client] = queued = deque()
         elif len(queued) >= bounds.WAITING_EACH or self._count >= bounds.WAITING:
             self.refused += 1
-            _refuse(client, envelope, _FULL)
+            _refuse(client, request.envelope, _FULL)
             return
-        queued.append(_Request(envelope, client.epoch, now, packed))
+        queued.append(request)
         self._count += 1
 
     def pump(self, now: float) -> None:
@@ -183,7 +186,7 @@ class RequestQueue:
         while self._waiting and len(self._asked) < bounds.UNDER_WAY + bool(self._stop):
             client, queued = next(iter(self._waiting.items()))
             request = queued[0]
-            if request.epoch != self.epoch:
+            if request.epoch not in (self.epoch, ALWAYS):
                 _refuse(client, request.envelope, PASSED)
             elif now - request.came > bounds.OLDEST:
                 _refuse(client, request.envelope, _OLD)
@@ -229,12 +232,8 @@ class RequestQueue:
             client.answer(envelope, reply)
 
     def begin_epoch(self, epoch: int) -> None:
-        """Refuse all that waits; what is read from now on carries its client's epoch."""
+        """What waits is refused at its turn; what is read from now on has its client's epoch."""
         self.epoch = epoch
-        waiting, self._waiting, self._count = self._waiting, {}, 0
-        for client, queued in waiting.items():
-            for request in queued:
-                _refuse(client, request.envelope, PASSED)
 
 
 def _refuse(client: Client, envelope: Any, error: str) -> None:

@@ -43,7 +43,7 @@ from dynamixel_sdk.robotis_def import (
 )
 
 from softfinger.daemon.servos.crc import crc16
-from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.port import UNHURRIED, SerialPort
 
 TRIES = 3  # of an exchange outside the tick
 _HEADER = b"\xff\xff\xfd"
@@ -324,7 +324,7 @@ class ServoLine:
 
 @contextlib.contextmanager
 def open_line(
-    path: str, baud: int, reply_timeout: float, low_latency: bool = True
+    path: str, baud: int, reply_timeout: float = UNHURRIED, low_latency: bool = True
 ) -> Iterator[ServoLine]:
     """A line on a port of its own, closed at the end. Raises ServoError when it can't be opened."""
     port = SerialPort(path, baud, reply_timeout, low_latency)

@@ -13,6 +13,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from dynamixel_sdk.robotis_def import COMM_RX_TIMEOUT
+
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
@@ -23,7 +25,6 @@ from softfinger.daemon.servos.joint import servo_name
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
 
-PING_TIMEOUT = 0.02  # s, for factory-new servos with their return delay, behind slow adapters
 SEARCH_TIME = 0.8  # s to listen at each rate: 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ALONE = (
@@ -95,7 +96,7 @@ def search(
     for baud in bauds:
         with contextlib.ExitStack() as stack:
             try:
-                line = stack.enter_context(open_line(path, baud, PING_TIMEOUT))
+                line = stack.enter_context(open_line(path, baud))
             except ServoError as error:
                 refusal = refusal or error
                 continue
@@ -117,8 +118,10 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
     handler, damaged = line.handler, 0
     for _ in range(_PROBES):
         before = handler.damaged
-        handler.readTxRx(line.port, servo_id, 0, CHECKED)
+        result = handler.readTxRx(line.port, servo_id, 0, CHECKED)[1]
         damaged += handler.damaged > before
+        if result == COMM_RX_TIMEOUT:
+            break  # nobody has it
     return damaged > 1  # one alone may be a disturbance
 
 
@@ -225,7 +228,7 @@ def provision(settings: Settings, search_time: float = SEARCH_TIME) -> Provision
         servos.ids[finger]: servo_name(servos.ids[finger], finger)
         for finger in map(FINGERS.index, settings.scene.fingers)
     }
-    with open_line(servos.port, servos.baud, PING_TIMEOUT) as line:
+    with open_line(servos.port, servos.baud) as line:
         complete = all(line.ping(servo_id) is not None for servo_id in names)
     if not complete:
         found = search(servos.port, model.baud_rates, search_time, {FACTORY_ID, *servos.ids})
@@ -233,7 +236,7 @@ def provision(settings: Settings, search_time: float = SEARCH_TIME) -> Provision
         for change in what.changes:
             _identify(servos.port, change, model, result)
         result.problems += _unknown(settings, found, what)
-    with open_line(servos.port, servos.baud, PING_TIMEOUT) as line:
+    with open_line(servos.port, servos.baud) as line:
         for servo_id, name in names.items():
             number = line.ping(servo_id)
             if number is None:
@@ -271,7 +274,7 @@ def _identify(path: str, change: Change, model: ServoModel, result: Provisioned)
 
     if change.baud not in model.baud_rates:
         return failed(f"an {model.name} has no {change.baud} baud", "set servos.baud")
-    with open_line(path, change.servo.baud, PING_TIMEOUT) as line:
+    with open_line(path, change.servo.baud) as line:
         if line.store(reg.STATUS_RETURN_LEVEL, {old: b"\x02"}):
             return failed("answers a ping but no read")
         if new != old and line.ping(new) is not None:
@@ -288,7 +291,7 @@ def _identify(path: str, change: Change, model: ServoModel, result: Provisioned)
             index = model.baud_rates.index(change.baud)
             line.write(reg.BAUD_RATE, {new: bytes((index,))})
             time.sleep(_WRITTEN)
-    with open_line(path, change.baud, PING_TIMEOUT) as line:
+    with open_line(path, change.baud) as line:
         if line.ping(new) != model.number:
             return failed(f"no answer after its rate was set to {change.baud} baud")
     result.done.append((name, str(change)))

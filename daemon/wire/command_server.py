@@ -1,7 +1,7 @@
 """The loop's side of commands: takes requests from the gateway, and has them carried out.
 
 It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first; what came before
-one is refused, wherever it waits (see `gateway.request_queue`).
+one is refused, wherever it waits (see `gateway.request_queue`), but for a ``status``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.wire.loop_link import Link
+from softfinger.daemon.wire.loop_link import ALWAYS, Link
 
 if TYPE_CHECKING:  # the gateway has no use for it
     from softfinger.daemon.wire.local_stop import LocalStop
@@ -64,7 +64,7 @@ class CommandServer:
             link.begin_epoch()  # before the answer, after which its client may go on
             link.reply(stop.number, reply)
         for _ in range(_A_TICK):
-            while link.asked and link.asked[0].epoch != link.epoch:
+            while link.asked and link.asked[0].epoch not in (link.epoch, ALWAYS):
                 link.reply(link.asked.popleft().number, _refusal(PASSED))
             if not link.asked:
                 return

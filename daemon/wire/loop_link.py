@@ -36,6 +36,8 @@ EPOCHS = struct.Struct("<Q")
 WANTS = struct.Struct("<IQ")
 ASKED = struct.Struct("<QI")
 
+ALWAYS = 2**64 - 1  # the epoch of a request that changes nothing, answered in any
+
 ANEW = 3  # exit status of a gateway that is to be started again, and has given the reason
 
 LARGEST = 65_536  # bytes of a packet

@@ -117,16 +117,14 @@ class Softfinger:
 def _patient_doctor() -> contextlib.ExitStack:
     """On a busy machine, on which others have the sockets."""
     from softfinger.daemon.diagnosis import devices, machine
-    from softfinger.daemon.servos import provisioning
     from softfinger.tools.setup import doctor
 
     stack = contextlib.ExitStack()
     whole = devices.check_servos
     for module, name, value in (
         (doctor, "check_addresses", lambda _: []),
-        (doctor, "check_servos", lambda settings: whole(settings, 0.5, 0.5)),
+        (doctor, "check_servos", lambda settings: whole(settings, 0.5)),
         (machine, "_WAKE_UPS", 5),
-        (provisioning, "PING_TIMEOUT", 0.2),
     ):
         stack.enter_context(mock.patch.object(module, name, value))
     return stack

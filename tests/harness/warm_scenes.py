@@ -8,6 +8,7 @@ another scene.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -82,7 +83,7 @@ class Watch(event.Listener):
 def run(settings: Settings) -> dict[str, Any]:
     """Run the script; what was compiled or loaded before the first tick and after it."""
     watch = Watch()
-    modes = []
+    modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch), Daemon(settings, wire=False) as hand:
         before = len(watch.heard)
         for wait, request in SCRIPT:
@@ -91,13 +92,16 @@ def run(settings: Settings) -> dict[str, Any]:
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)
-            try:
-                hand.loop.command(request)
-            except Refused:
-                pass
+            again = [{"command": "clear"}, {"command": "arm"}]
+            fault = hand.loop.state.fault_name
+            for each in (*(again if fault else ()), request):
+                with contextlib.suppress(Refused):
+                    hand.loop.command(each)
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)
-        return {"before": before, "after": watch.heard[before:], "modes": sorted(set(modes))}
+            faults += [fault] if fault else []
+    heard = {"before": before, "after": watch.heard[before:]}
+    return {**heard, "modes": sorted(set(modes)), "faults": faults}
 
 
 def calibrated(folder: Path) -> dict[str, Any]:

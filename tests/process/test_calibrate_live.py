@@ -125,7 +125,10 @@ def test_a_press_at_known_speed_gives_the_modulus(tmp_path, capsys):
     profile.write_text(text + "[simulation]\ncompression_speed = 0.05\ntactile_noise = 300.0\n")
     words = [str(tmp_path / "a.json"), "--config", str(profile), "--no-plot", "--frames", "40"]
     assert main(["calibrate", "tare", *words, "--set", "simulation.compression_speed=0"]) == 0
-    assert main(["calibrate", "modulus", *words, "--speed", "50", "--law"]) == 0
+    told = ""
+    while main(["calibrate", "modulus", *words, "--speed", "50", "--law"]):
+        told = capsys.readouterr().err  # a busy machine misses frames, and the tool tells
+        assert "press again" in told or "press slower" in told
     found = load_calibration(tmp_path / "a.json").modulus
     assert found.modulus == pytest.approx(E, rel=0.03)
     assert found.material().stress(0.2) == pytest.approx(0.2 * E, rel=0.05)

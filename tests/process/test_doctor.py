@@ -21,7 +21,6 @@ from softfinger.daemon.loop import warm_up
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos import provisioning
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
@@ -75,9 +74,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UPS", 5)
     whole = devices.check_servos
-    monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.5, 0.5))
-    # The emulator shares this process's interpreter lock.
-    monkeypatch.setattr(provisioning, "PING_TIMEOUT", 0.2)
+    monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.5))
 
 
 def with_status(lines: list[str], status: str) -> list[str]:

@@ -43,7 +43,7 @@ def test_grasp_and_turn(
     assert states > 50
     assert lost == 0
     force = float(re.findall(r"while holding: ([\d.]+) N", done.stdout)[0])
-    assert force == pytest.approx(8.0, rel=0.05)
+    assert force == pytest.approx(8.0, rel=0.1)
     pixels = imread(picture)[..., :3]
     assert pixels.shape[:2] == (504, 1080)
     for colour in ((0, 114, 178), (213, 94, 0), (0, 158, 115)):  # left, right, object

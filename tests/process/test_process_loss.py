@@ -51,16 +51,7 @@ class Rig:
         return ask(self.commands, name, **numbers)
 
     def status(self) -> dict[str, Any]:
-        """Just after the machine held the daemon up it refuses even this: then once more."""
-        found: dict[str, Any] = {}
-
-        def answered() -> bool:
-            found.clear()
-            found.update(self.send("status"))
-            return bool(found["ok"])
-
-        until(answered)
-        return found
+        return self.send("status")
 
     def report(self) -> dict[str, Any]:
         report: dict[str, Any] = json.loads(send_words(self.folder, "report"))

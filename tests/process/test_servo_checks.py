@@ -13,7 +13,7 @@ import serial
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.servos import checks, dynamixel
+from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort, latency_file
@@ -197,7 +197,6 @@ def test_an_adapters_latency_timer_is_asked_to_be_low(
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
-    monkeypatch.setattr(dynamixel, "_PATIENCE", 1.0)
     # The mode is not there, as on this pseudo-terminal.
     text = "the adapter's latency timer is 16 ms, so a read takes that long"
     fix = "`softfinger doctor --fix` sets it to 1 ms"

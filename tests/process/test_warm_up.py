@@ -37,4 +37,5 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path: Path) -> No
         # A machine that is too busy for the real-time scene is no fault of its kernels.
         timely = name != "stand-in hand"
         wanted |= {"holding", "releasing"} if servos and not blind and timely else set()
-        assert wanted <= set(scene["modes"]), name
+        assert wanted <= set(scene["modes"]), (name, scene["faults"])
+        assert not (scene["faults"] and timely), (name, scene["faults"])

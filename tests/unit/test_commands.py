@@ -101,9 +101,15 @@ def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
         early.connect(addresses[1])
         early.send(msgpack.packb({"command": "arm"}))
         until(lambda: [served.settle(1), served.link.asked][1])
+        asking = context.socket(zmq.REQ)
+        asking.connect(addresses[1])
+        asking.send(msgpack.packb({"command": "status"}))
+        until(lambda: [served.settle(1), len(served.link.asked) == 2][1])
         served.server.begin_epoch()
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert "before a stop; send it again" in msgpack.unpackb(early.recv())["error"]
+        until(lambda: [served.serve(echo), asking.poll(0)][1])
+        assert msgpack.unpackb(asking.recv()) == {"ok": True, "heard": "status"}, "it harms nobody"
         early.send(msgpack.packb({"command": "arm"}))
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert msgpack.unpackb(early.recv()) == {"ok": True, "heard": "arm"}

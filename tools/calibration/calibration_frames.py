@@ -26,13 +26,15 @@ from softfinger.daemon.types import FINGERS, Frame
 from softfinger.kinematics.calibration.calibration import CalibrationError
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
-_PATIENCE = 3.0  # s without a new frame
+_PATIENCE = 10.0  # s without a new frame
 _WAIT = 60.0  # s for a press to begin
 _TOUCHED = 3  # cells above their noise: something touches the tip
 _CLEAR = 6.0  # standard deviations, and two counts, from which a cell is above its noise
 _FEWEST = 5  # frames of a press
 _LOADS = 6  # at least, where there are frames enough, …
+_FEWEST_LOADS = 3
 _TOGETHER = 12  # … which are a load together at most
+_MISSED = 1.5  # periods between two frames: one is missing
 _BACK = 0.95  # of the run's largest reading: below it the tip goes down yet, or is released
 
 
@@ -151,7 +153,7 @@ def _live_run(
     if calibration.tare is None:
         raise CalibrationError("--speed: tare first: a touch is detected by the noise it measures")
     noise = calibration.tare.noise
-    speed = arguments.speed * 1e-3
+    speed, longest = arguments.speed * 1e-3, _MISSED / settings.tactile.rate
     with _opened(settings, clock, calibration.sensor.finger) as backend:
         _say(f"press at {arguments.speed:g} mm/s, beginning clear of the tip, then release")
         begin, last_free, most = clock.now(), -math.inf, 0.0
@@ -169,6 +171,12 @@ def _live_run(
             elif last_free > -math.inf:
                 if total < _BACK * most:
                     break
+                if not frames and frame.t_sample - last_free > longest:
+                    gap = 1e3 * (frame.t_sample - last_free)
+                    raise CalibrationError(
+                        f"--speed: no frame came in the {gap:.0f} ms before the first touch, whose "
+                        "moment is not known then: press again"
+                    )
                 most = max(most, total)
                 frames.append(frame.data)
                 d.append(speed * (frame.t_sample - last_free))
@@ -178,10 +186,21 @@ def _live_run(
         raise CalibrationError(f"{count} frames while it was pressed: press slower")
     _say(f"{count} frames of a press to {1e3 * d[count]:.2f} mm")
     size = min(max(count // _LOADS, 1), _TOGETHER)
-    loads = [slice(k, k + size) for k in range(0, count - size + 1, size)]
-    depths = np.array([np.mean(d[each]) for each in loads])
+    # No load spans frames that were lost: all have the same range of depths.
+    lost = np.flatnonzero(np.diff(d[:count]) > speed * longest) + 1
+    loads = [
+        run[k : k + size]
+        for run in np.split(np.arange(count), lost)
+        for k in range(0, len(run) - size + 1, size)
+    ]
+    if len(loads) < _FEWEST_LOADS:
+        raise CalibrationError(
+            f"--speed: {count} frames came of a press, at {settings.tactile.rate:g} Hz with too "
+            "many missing: press again"
+        )
+    depths = np.array([np.mean([d[k] for k in each]) for each in loads])
     truths = {**_spread(given, len(loads)), "d": depths}
-    return Loads([np.stack(frames[each]) for each in loads], truths)
+    return Loads([np.stack([frames[k] for k in each]) for each in loads], truths)
 
 
 def rising(totals: list[float]) -> int:

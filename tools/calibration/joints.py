@@ -29,7 +29,6 @@ _POSES = {
     "open": "open it fully",
     "zero": "put it upright, straight away from the palm",
 }
-_PATIENCE = 1.0  # s for a reply: nothing is in a hurry here
 _LEAST = 0.2  # rad between closed and open
 _ALONE = 0.25  # of that, which another finger may move meanwhile
 _MARGIN = 0.03  # rad between the stops and the commanded range
@@ -54,7 +53,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
     ids = [servos.ids[finger] for finger in scene]
     radian = 2.0 * math.pi / reg.COUNTS_PER_TURN / servos.gear_ratio
     told = []
-    with open_line(servos.port, servos.baud, _PATIENCE) as line:
+    with open_line(servos.port, servos.baud) as line:
         _read(line, ids)
         for finger in scene:
             name = FINGERS[finger]
