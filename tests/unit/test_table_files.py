@@ -25,6 +25,7 @@ from softfinger.kinematics.contact.lookup import TableError
 
 TIP = Fingertip(0.020)
 CONSTANT = Material.constant(0.304e6)
+TABLE_I = Material.table_i()
 
 
 @pytest.fixture
@@ -112,6 +113,14 @@ def test_the_daemon_keeps_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     table = make_table(settings, CONSTANT, tmp_path)
     assert asked == [(tmp_path, Fingertip(settings.tip.radius), CONSTANT, settings.table.tolerance)]
     assert (tmp_path / "one.table").read_bytes()[-table.data.nbytes :] == table.data.tobytes()
+
+
+def test_hands_of_one_process_share_their_table() -> None:
+    table = make_table(Settings(), CONSTANT, None)
+    assert make_table(Settings(), CONSTANT, None) is table
+    coarse = make_table(Settings.model_validate({"table": {"tolerance": 1e-3}}), TABLE_I, None)
+    assert 1e-9 < coarse.max_error <= 1e-3
+    assert make_table(Settings(), TABLE_I, None).max_error <= 1e-9
 
 
 def test_what_is_wrong_becomes_an_event_or_a_settings_error(tmp_path: Path) -> None:
