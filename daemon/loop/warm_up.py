@@ -68,8 +68,8 @@ def parts(settings: Settings) -> list[Part]:
     """What ``settings`` has kernels for, in the order in which two processes best share them.
 
     One has the estimator and then the simulated sensor, whose kernels it has compiled in part by
-    then; the other the contact table and the simulated hand, which looks up in it; the shorter ones
-    even out what is left.
+    then; the other the contact table, then the simulated hand and the filter, which look up in it;
+    the shorter ones even out what is left.
     """
     simulated = SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"
@@ -79,7 +79,8 @@ def parts(settings: Settings) -> list[Part]:
         _HAND: simulated,
         _SENSOR: settings.tactile.backend == "simulated",
         _FILTER: servos and sensors,
-        _GRIP: servos,
+        _GRIP: servos and sensors,
+        _JOINTS: True,
     }
     return [part for part, needed in wanted.items() if needed]
 
@@ -171,11 +172,9 @@ def _filter(scene: WantedScene) -> None:
 
 def _grip(scene: WantedScene) -> None:
     from softfinger.daemon.control.grip import Grip
-    from softfinger.daemon.loop.timing import Statistics
     from softfinger.daemon.perception.contact_filter_kernels import GraspState
 
     fingers, pose, reading = scene.sensing, ObjectPose(), Reading()
-    Statistics()
     if not fingers:
         return
     grip = Grip(scene.settings, fingers, GraspState())
@@ -188,18 +187,27 @@ def _grip(scene: WantedScene) -> None:
         grip.angles(pose)
 
 
+def _joints(scene: WantedScene) -> None:
+    from softfinger.daemon.control.setpoint import JointSetpoints
+    from softfinger.daemon.loop.timing import Statistics
+
+    JointSetpoints(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time)
+    Statistics()
+
+
 def _many(scene: WantedScene) -> None:
     scene.models[0].table(np.zeros(2), np.zeros(2))
 
 
 _TABLE = Part("contact table", 27, _table)
-_ESTIMATOR = Part("estimator", 67, _estimator)
-_HAND = Part("simulated hand", 61, _hand, after=_TABLE.name)
+_ESTIMATOR = Part("estimator", 79, _estimator)
+_HAND = Part("simulated hand", 64, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
 _FILTER = Part("contact filter", 25, _filter, after=_TABLE.name)
-_GRIP = Part("grip and timing", 33, _grip)
+_GRIP = Part("grip", 26, _grip)
+_JOINTS = Part("joints and timing", 7, _joints)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
-ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _MANY)
+ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _JOINTS, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
 LANDSCAPE = (_TABLE, _MANY)  # what a picture of the energy needs
 FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # what frames are analysed with

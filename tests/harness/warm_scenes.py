@@ -19,6 +19,7 @@ from numba.core import event
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.warm_up import WantedScene, warm_up
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
     TareStep,
@@ -81,11 +82,15 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; what was compiled or loaded before the first tick and after it."""
+    """Run the script; what was compiled or loaded before the first tick, in no part, and after."""
     watch = Watch()
     modes, faults = [], []
-    with event.install_listener("numba:compiler_lock", watch), Daemon(settings, wire=False) as hand:
+    with event.install_listener("numba:compiler_lock", watch):
+        warm_up(WantedScene(settings, None))
+        parts = len(watch.heard)
+        hand = Daemon(settings, wire=False)
         before = len(watch.heard)
+    with event.install_listener("numba:compiler_lock", watch), hand:
         for wait, request in SCRIPT:
             hand.loop.advance(wait)
             for _ in range(300):  # in real time a busy machine may be long about it
@@ -100,7 +105,7 @@ def run(settings: Settings) -> dict[str, Any]:
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)
             faults += [fault] if fault else []
-    heard = {"before": before, "after": watch.heard[before:]}
+    heard = {"before": before, "in no part": watch.heard[parts:before], "after": watch.heard[before:]}
     return {**heard, "modes": sorted(set(modes)), "faults": faults}
 
 

@@ -67,8 +67,8 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
     rest = compiled(tmp_path)
     assert rest.returncode == 0
     first, part, last = rest.stderr.splitlines()
-    assert first == "compiling kernels, on the first start only: grip and timing"
-    assert part.startswith("grip and timing: ")
+    assert first == "compiling kernels, on the first start only: joints and timing"
+    assert part.startswith("joints and timing: ")
     assert last.startswith("compiled in ")
     again = compiled(tmp_path)
     assert (again.returncode, again.stdout, again.stderr) == (0, "all kernels are compiled\n", "")

@@ -29,6 +29,7 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path: Path) -> No
     assert set(told) == {*SCENES, "calibrated sensor, position grip", "stand-in hand"}
     for name, scene in told.items():
         assert scene["before"] >= 5, f"{name}: the watch heard nothing of the warm-up"
+        assert scene["in no part"] == [], f"{name}: the daemon itself would compile these"
         assert scene["after"] == [], name
         servos = name != "sensors without servos"
         blind = name in ("servos without sensors", "position mode")
