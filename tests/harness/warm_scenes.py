@@ -105,7 +105,8 @@ def run(settings: Settings) -> dict[str, Any]:
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)
             faults += [fault] if fault else []
-    heard = {"before": before, "in no part": watch.heard[parts:before], "after": watch.heard[before:]}
+    unforeseen, after = watch.heard[parts:before], watch.heard[before:]
+    heard = {"before": before, "in no part": unforeseen, "after": after}
     return {**heard, "modes": sorted(set(modes)), "faults": faults}
 
 
