@@ -13,7 +13,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.servos.port import PortGone
+from softfinger.daemon.servos.port import UNHURRIED, PortGone
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.provisioning import (
     Found,
@@ -112,7 +112,7 @@ class Bus:
         self.t = 0.0
 
     @contextlib.contextmanager
-    def line(self, path: str, baud: int, timeout: float) -> Iterator[ServoLine]:
+    def line(self, path: str, baud: int, timeout: float = UNHURRIED) -> Iterator[ServoLine]:
         if baud < 0:
             raise ServoError("no such rate")
         port = DirectPort(self.bus, baud, timeout, self.t)
