@@ -77,11 +77,14 @@ def _flush(work: Rendering, law: FloatArray, out: FloatArray) -> None:
 
 
 @kernel
-def render(works: Records[Rendering], law: FloatArray, out: FloatArray) -> None:
+def render(
+    works: Records[Rendering], law: FloatArray, columns: FloatArray, out: FloatArray
+) -> None:
     """Write the pressure [Pa] of a contact, averaged over each cell, into ``out`` [rows, cols].
 
-    ``law`` is the material's. d ≤ 0 gives zeros. Beyond the domain's limit the footprint ends at
-    the rim and the strain stays ≤ 1.
+    ``law`` is the material's, ``columns`` [cols + 1, 2] is overwritten: an array made here would
+    have every start load Numba's arrays. d ≤ 0 gives zeros. Beyond the domain's limit the footprint
+    ends at the rim and the strain stays ≤ 1.
     """
     work = works[0]
     grid = work.grid
@@ -96,7 +99,6 @@ def render(works: Records[Rendering], law: FloatArray, out: FloatArray) -> None:
     if not face.low < face.high:
         return
     first_row, last_row = rows_touched(face, grid)
-    columns = np.empty((grid.cols + 1, 2))
     for j in range(grid.cols + 1):
         columns[j, 0], columns[j, 1] = line_span(
             face.u, face.w, face.v, a, grid.x + j * grid.pitch_x
@@ -219,14 +221,14 @@ class SensorGrid:
         work["n_x"], work["n_y"] = self.to_sensor(n_x, n_y)
         if self.blur == 0.0:
             work["grid"] = self.on(tip).array
-            render(work, material.law, out)
+            render(work, material.law, np.empty((self.cols + 1, 2)), out)
             return out
         pitch_x, pitch_y = self.pitches
         n = parts(self.blur / pitch_x), parts(self.blur / pitch_y)
         stencils, finer = self.finer(n)
         fine = np.empty(finer.shape)
         work["grid"] = finer.on(tip).array
-        render(work, material.law, fine)
+        render(work, material.law, np.empty((finer.cols + 1, 2)), fine)
         out[:] = average(fine, *stencils, n)
         return out
 

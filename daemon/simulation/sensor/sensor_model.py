@@ -134,6 +134,7 @@ class SensorModel:
             self._parts = n_x, n_y
             self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._parts)
             self._rendered = np.zeros(cells.shape)
+        self._columns = np.empty((cells.cols + 1, 2))
         self._solid: SolidPressure | None = None
         if tip.physics == "solid":
             blurred = replace(grid, blur=flaws.blur)
@@ -209,7 +210,7 @@ class SensorModel:
                 self._curved.bend = bend
                 render_curved(self._curved.array, self._law, self._rendered)
             else:
-                render(self._plane.array, self._law, self._rendered)
+                render(self._plane.array, self._law, self._columns, self._rendered)
             if flaws.blur > 0.0:
                 pressure[:] = average(self._rendered, *self._stencils, self._parts)
         if flaws.hysteresis > 0.0:
