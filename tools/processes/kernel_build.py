@@ -215,7 +215,7 @@ def main() -> None:
     of a part a line. Standard output, a line each: ``kernel NAME`` as one is begun, ``done`` when a
     part is built, ``failed REASON`` when it can't be.
     """
-    gc.disable()  # the compiler makes much that lives: looking through it costs 6 % of the time
+    gc.disable()  # the compiler makes much that lives: looking through it costs 4 % of the time
     out = sys.stdout
     sys.stdout = sys.stderr  # whatever else prints, prints there
 
