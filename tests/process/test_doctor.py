@@ -326,7 +326,7 @@ def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     monkeypatch.setattr(warm_up, "kernel_folder", lambda: tmp_path)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
-    assert "contact table not compiled yet" in found.text
+    assert "contact table, joints and timing not compiled yet" in found.text
     for part in warm_up.parts(scene):
         warm_up.mark_built(part, scene)
     (found,) = kernels.check_kernels(scene)
