@@ -25,7 +25,7 @@ from softfinger.tools.terminal.progress import Progress
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY = 600e6  # bytes that a process needs at most: the only one, which builds everything
+_MEMORY = 400e6  # bytes that a process needs at most
 _LOOK = 0.2  # s between two looks at the time
 
 
@@ -215,7 +215,7 @@ def main() -> None:
     of a part a line. Standard output, a line each: ``kernel NAME`` as one is begun, ``done`` when a
     part is built, ``failed REASON`` when it can't be.
     """
-    gc.disable()  # the compiler makes much that lives: looking through it costs 4 % of the time
+    gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
     out = sys.stdout
     sys.stdout = sys.stderr  # whatever else prints, prints there
 
