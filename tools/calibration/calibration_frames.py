@@ -32,8 +32,8 @@ _TOUCHED = 3  # cells above their noise: something touches the tip
 _CLEAR = 6.0  # standard deviations, and two counts, from which a cell is above its noise
 _FEWEST = 5  # frames of a press
 _LOADS = 6  # at least, where there are frames enough, …
-_FEWEST_LOADS = 3
 _TOGETHER = 12  # … which are a load together at most
+_FEWEST_LOADS = 3  # where frames were lost
 _MISSED = 1.5  # periods between two frames: one is missing
 _BACK = 0.95  # of the run's largest reading: below it the tip goes down yet, or is released
 
@@ -187,7 +187,8 @@ def _live_run(
     _say(f"{count} frames of a press to {1e3 * d[count]:.2f} mm")
     size = min(max(count // _LOADS, 1), _TOGETHER)
     # No load spans frames that were lost: all have the same range of depths.
-    lost = np.flatnonzero(np.diff(d[:count]) > speed * longest) + 1
+    depths, counts = np.array(d[:count]), np.stack(frames[:count])
+    lost = np.flatnonzero(np.diff(depths) > speed * longest) + 1
     loads = [
         run[k : k + size]
         for run in np.split(np.arange(count), lost)
@@ -198,9 +199,8 @@ def _live_run(
             f"--speed: {count} frames came of a press, at {settings.tactile.rate:g} Hz with too "
             "many missing: press again"
         )
-    depths = np.array([np.mean([d[k] for k in each]) for each in loads])
-    truths = {**_spread(given, len(loads)), "d": depths}
-    return Loads([np.stack([frames[k] for k in each]) for each in loads], truths)
+    truths = _spread(given, len(loads)) | {"d": np.array([depths[k].mean() for k in loads])}
+    return Loads([counts[k] for k in loads], truths)
 
 
 def rising(totals: list[float]) -> int:
