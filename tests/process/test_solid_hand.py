@@ -15,7 +15,10 @@ from tests.harness.daemon_process import softfinger
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four virtual seconds of the demo: grasped, held, and turned."""
+    """Four virtual seconds of the demo: grasped, held, and turned.
+
+    Virtual time waits for nobody: where the recorder of a busy machine falls behind, once more.
+    """
     path = tmp_path_factory.mktemp("solid") / "hand.mcap"
     stream, commands = own_addresses()
     changes = {
@@ -26,9 +29,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     words = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
     seconds = ("--duration", "4", "--record", str(path))
-    done = softfinger("run", "--config", "solid", *words, *seconds, timeout=600.0)
-    assert done.returncode == 0, done.stderr
-    return path
+    while True:
+        done = softfinger("run", "--config", "solid", *words, *seconds, timeout=600.0)
+        assert done.returncode == 0, done.stderr
+        if "lost on the way: none" in done.stderr:
+            return path
+        path.unlink()
 
 
 def test_its_recording_recomputes_to_the_last_bit(
