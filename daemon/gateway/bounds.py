@@ -39,7 +39,7 @@ KEYED_CONNECTION = 100_000  # bytes of each, and for each message that waits for
 KEYED_WAITING = 128  # … two of libzmq's records
 KEYED_QUEUE = 64  # requests of one client in its socket
 KEYED_SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
-PURGE = 0.02  # s after a stop in which all requests are refused, …
+PURGE = 0.02  # s after a stop in which all requests but a status are refused, …
 LONGEST_PURGE = 0.25  # … and while there are any
 KEYS_CHECKED = 0.5  # s between looks at the folder of keys
 

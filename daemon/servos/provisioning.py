@@ -115,12 +115,13 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
 
     Supply voltage, position and running time do, a reply of a ping does not.
     """
-    handler, damaged = line.handler, 0
+    handler, damaged, silent = line.handler, 0, 0
     for _ in range(_PROBES):
         before = handler.damaged
         result = handler.readTxRx(line.port, servo_id, 0, CHECKED)[1]
         damaged += handler.damaged > before
-        if result == COMM_RX_TIMEOUT:
+        silent += result == COMM_RX_TIMEOUT
+        if silent > 1 and not damaged:
             break  # nobody has it
     return damaged > 1  # one alone may be a disturbance
 

@@ -119,15 +119,18 @@ def test_load_by_load_from_a_board(live):
     assert (live / "sensor.tare.png").stat().st_size > 5000
 
 
-def test_a_press_at_known_speed_gives_the_modulus(tmp_path, capsys):
+@pytest.mark.parametrize("dropped", [0.0, 0.2])
+def test_a_press_at_known_speed_gives_the_modulus(tmp_path, capsys, dropped):
     profile = tmp_path / "press.toml"
     text = PROFILE.replace('clock = "virtual"', 'clock = "real"') + "rate = 200.0\n"
     profile.write_text(text + "[simulation]\ncompression_speed = 0.05\ntactile_noise = 300.0\n")
     words = [str(tmp_path / "a.json"), "--config", str(profile), "--no-plot", "--frames", "40"]
     assert main(["calibrate", "tare", *words, "--set", "simulation.compression_speed=0"]) == 0
-    told = ""
-    while main(["calibrate", "modulus", *words, "--speed", "50", "--law"]):
-        told = capsys.readouterr().err  # a busy machine misses frames, and the tool tells
+    words += ["--set", f"simulation.tactile_dropped={dropped}", "--speed", "50", "--law"]
+    for seed in range(20):
+        if main(["calibrate", "modulus", *words, "--set", f"simulation.seed={seed}"]) == 0:
+            break
+        told = capsys.readouterr().err  # frames were missed, on a busy machine or on purpose
         assert "press again" in told or "press slower" in told
     found = load_calibration(tmp_path / "a.json").modulus
     assert found.modulus == pytest.approx(E, rel=0.03)

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import AddressError, Refused
+from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
@@ -93,9 +94,14 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
     assert send(addresses[1], {"command": "arm"})["ok"] is True
 
 
+@pytest.mark.parametrize("under_way", [1, 4])  # the second request waits in the queue, or the link
 def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
-    context: zmq.Context[Any], addresses: tuple[str, str]
+    context: zmq.Context[Any],
+    addresses: tuple[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    under_way: int,
 ) -> None:
+    monkeypatch.setattr(bounds, "UNDER_WAY", under_way)
     with Served(commands=addresses[1]) as served:
         early = context.socket(zmq.REQ)
         early.connect(addresses[1])
@@ -104,7 +110,8 @@ def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
         asking = context.socket(zmq.REQ)
         asking.connect(addresses[1])
         asking.send(msgpack.packb({"command": "status"}))
-        until(lambda: [served.settle(1), len(served.link.asked) == 2][1])
+        queue = served.service.requests
+        until(lambda: [served.settle(1), len(served.link.asked) + queue._count == 2][1])
         served.server.begin_epoch()
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert "before a stop; send it again" in msgpack.unpackb(early.recv())["error"]

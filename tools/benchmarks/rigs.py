@@ -312,20 +312,12 @@ class Rig:
         return reply
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
-        """The daemon's status, None when it does not answer.
-
-        Just after a stall it refuses even this: then it is asked again.
-        """
-        end = time.monotonic() + timeout
-        while (left := end - time.monotonic()) > 0.0:
-            try:
-                status = self.ask({"command": "status"}, left)
-            except NoAnswer:
-                return None
-            if status["ok"]:
-                return status
-            time.sleep(_LOOK)
-        return None
+        """The daemon's status, None when it does not answer."""
+        try:
+            status = self.ask({"command": "status"}, timeout)
+        except NoAnswer:
+            return None
+        return status if status["ok"] else None
 
     def states(self, wait: float = _LOOK) -> list[dict[str, Any]]:
         """States that came since the last call, none after ``wait`` s without one."""

@@ -34,7 +34,8 @@ _FEWEST = 5  # frames of a press
 _LOADS = 6  # at least, where there are frames enough, …
 _TOGETHER = 12  # … which are a load together at most
 _FEWEST_LOADS = 3  # where frames were lost
-_MISSED = 1.5  # periods between two frames: one is missing
+_MISSED = 1.5  # periods between two frames: one is missing, …
+_SKIPPED = 3e-3  # … if they are s enough: of a faster board not each frame is taken
 _BACK = 0.95  # of the run's largest reading: below it the tip goes down yet, or is released
 
 
@@ -146,14 +147,16 @@ def _live_run(
 
     Some frames in a row are a load at their mean d: in one alone noise hides a light touch's rim.
 
-    d counts from the last frame without a touch: its zero is off by one frame's travel at most.
+    d counts from the last frame without a touch: its zero is off by the travel of one and a half
+    frames at most.
     """
     clock = RealClock()
     converter = Converter(calibration, settings.tactile.pascal_per_count)
     if calibration.tare is None:
         raise CalibrationError("--speed: tare first: a touch is detected by the noise it measures")
     noise = calibration.tare.noise
-    speed, longest = arguments.speed * 1e-3, _MISSED / settings.tactile.rate
+    speed, rate = arguments.speed * 1e-3, settings.tactile.rate
+    longest = max(_MISSED / rate, _SKIPPED)
     with _opened(settings, clock, calibration.sensor.finger) as backend:
         _say(f"press at {arguments.speed:g} mm/s, beginning clear of the tip, then release")
         begin, last_free, most = clock.now(), -math.inf, 0.0
@@ -174,8 +177,8 @@ def _live_run(
                 if not frames and frame.t_sample - last_free > longest:
                     gap = 1e3 * (frame.t_sample - last_free)
                     raise CalibrationError(
-                        f"--speed: no frame came in the {gap:.0f} ms before the first touch, whose "
-                        "moment is not known then: press again"
+                        f"--speed: no frame came in the {gap:.0f} ms before the first touch, where "
+                        f"tactile.rate is {rate:g} Hz: press again"
                     )
                 most = max(most, total)
                 frames.append(frame.data)
@@ -196,8 +199,8 @@ def _live_run(
     ]
     if len(loads) < _FEWEST_LOADS:
         raise CalibrationError(
-            f"--speed: {count} frames came of a press, at {settings.tactile.rate:g} Hz with too "
-            "many missing: press again"
+            f"--speed: {count} frames came of a press, with too many missing where tactile.rate "
+            f"is {rate:g} Hz: press again"
         )
     truths = _spread(given, len(loads)) | {"d": np.array([depths[k].mean() for k in loads])}
     return Loads([counts[k] for k in loads], truths)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import sys
 import time
 from pathlib import Path
@@ -42,8 +41,8 @@ _SILENCE = 2.0  # s without a message after which a line says so
 # s between two looks at the socket, where messages wait meanwhile: waking for each one would cost
 # more than all that is done with it.
 _STEP = 0.1
-_BACKLOG = 10.0  # s for messages that are on their way when the end is asked for, …
-_QUIET = 0.5  # … and until one more comes
+_BACKLOG = 10.0  # s for messages that wait when the end is asked for
+_QUIET = 0.5  # s in which what was sent before it arrives, on a busy machine, too
 _SHOW = 0.5  # s between two progress lines, and two flushes
 _BATCH = 1000  # messages between two looks at the clock
 
@@ -94,8 +93,6 @@ class _Recorder:
         self._gaps: dict[bytes, Gaps] = {}
         self._writers = [RecordingWriter(arguments.file)]  # the last is being written
         self._first: float | None = None  # the stream's first timestamp
-        self._offset = math.inf  # of this machine's clock to the stream's [s]
-        self._newest = -math.inf  # the stream's newest timestamp
         self._opened = time.monotonic()
         self._messages = 0  # received, to be written
         self._unreadable = 0
@@ -161,11 +158,14 @@ class _Recorder:
         return count
 
     def _take_rest(self, socket: zmq.Socket[bytes], quiet: float) -> None:
-        """Take what was sent until now, until none of it has come for ``quiet`` s."""
-        asked = time.time() - (self._offset if self._first is not None else 0.0)
-        latest = time.monotonic() + _BACKLOG
-        while not self._complete and self._newest < asked and time.monotonic() < latest:
-            if self._take_batch(socket) < _BATCH and not socket.poll(int(quiet * 1e3)):
+        """Take the messages that wait, and those that arrive within ``quiet`` s."""
+        began = time.monotonic()
+        while not self._complete:
+            behind = self._take_batch(socket) == _BATCH
+            age = time.monotonic() - began
+            if behind and age < _BACKLOG:
+                continue
+            if age >= quiet or not socket.poll(int((quiet - age) * 1e3)):
                 return
 
     def _take(self, frames: list[bytes]) -> None:
@@ -175,10 +175,7 @@ class _Recorder:
             self._unreadable += 1
             return
         stamp = message.get("timestamp")
-        now = time.time()
-        when = stamp if isinstance(stamp, float) else now
-        self._offset = min(self._offset, now - when)
-        self._newest = when
+        when = stamp if isinstance(stamp, float) else time.time()
         if message.get("again") is not True:  # a repeated one is older than the recording
             if self._first is None:
                 self._first = when
