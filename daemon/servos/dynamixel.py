@@ -28,7 +28,7 @@ from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import examine, latency_of
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import Joint, JointScale
-from softfinger.daemon.servos.port import BITS_PER_BYTE, UNHURRIED, PortGone, SerialPort
+from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
 from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.servos.torque import Torque
 from softfinger.daemon.types import FINGERS, Goal, Reading
@@ -53,6 +53,7 @@ _FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
 # without a reply the next ones ask for spans of different lengths, which distinguishes the replies.
 _LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
 _DOUBTFUL = 32  # requests
+_PATIENCE = 0.2  # s for a reply while the servos are checked; `clear` holds the loop up for it
 _LAST_TRIES = 10  # of torque off, at the end
 
 
@@ -124,7 +125,7 @@ class DynamixelServos:
     def _check(self, line: ServoLine, model: ServoModel) -> bool:
         """Whether all servos answer fast sync reads; sets the joints' own limits."""
         port = line.port
-        allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, UNHURRIED)
+        allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
         try:
             found = examine(line, self._profile, model)
         finally:

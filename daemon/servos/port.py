@@ -19,9 +19,9 @@ from dynamixel_sdk.port_handler import PortHandler
 from softfinger.daemon.errors import ServoError
 
 BITS_PER_BYTE = 10
-# s for a reply where nothing hurries (connecting, setting up, calibrating): a factory-new servo
-# with its return delay, behind a slow adapter, on a busy machine.
-UNHURRIED = 0.2
+# s for a reply where nothing hurries (setting up, calibrating): a factory-new servo with its return
+# delay, behind a slow adapter, on a busy machine.
+UNHURRIED = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
