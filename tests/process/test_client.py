@@ -43,6 +43,7 @@ from tests.harness.fake_daemon import FakeDaemon
 
 Start = Callable[..., Running]
 Profile = Callable[[str], Path]
+IN_VAIN = 3.0  # s in which a busy machine, too, brings some state
 
 
 @pytest.fixture
@@ -78,7 +79,8 @@ def test_grasp_turn_and_release_on_a_running_daemon(
             assert any("grasping" in event.text for event in events)
         insist(lambda: hand.rotate(angle=math.radians(5.0)))
         hand.wait_for(lambda state: abs(state.object.angle - math.radians(5.0)) < 5e-3, 60.0)
-        states = hand.collect(0.3)
+        while not (states := hand.collect(0.3)):
+            pass  # none came to a busy machine's new subscriber
         columns = to_columns(states)
         assert np.all(np.diff(columns["seq"]) > 0)
         assert columns["left.force"].mean() == pytest.approx(5.0, rel=0.1)
@@ -116,7 +118,7 @@ def test_the_same_from_asyncio(start: Start, profile: Profile, addresses: tuple[
             await insist(hand.arm)  # it is
             assert (await hand.state()).mode == "holding"
             with pytest.raises(NotInTime, match="mode holding"):
-                await hand.wait_for(lambda state: state.mode == "releasing", timeout=0.2)
+                await hand.wait_for(lambda state: state.mode == "releasing", IN_VAIN)
             return held.mode, seen
 
     assert asyncio.run(session()) == ("holding", 44 * 44)
@@ -131,8 +133,8 @@ def test_a_fault_ends_the_waiting(fake: FakeDaemon, hand: Hand) -> None:
 
 
 def test_waiting_ends_in_time(hand: Hand) -> None:
-    with pytest.raises(NotInTime, match=r"not within 0\.2 s; the last state: mode holding"):
-        hand.wait_for(lambda state: state.mode == "released", timeout=0.2)
+    with pytest.raises(NotInTime, match="not within 3 s; the last state: mode holding"):
+        hand.wait_for(lambda state: state.mode == "released", IN_VAIN)
 
 
 def test_no_daemon_is_told(addresses: tuple[str, str]) -> None:

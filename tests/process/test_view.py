@@ -493,6 +493,13 @@ def test_the_page_answers_this_machine_alone_and_no_other_path(page: WebPage) ->
         WebPage(page.port, 1, 1)
 
 
+def test_pages_whose_port_nobody_chose_get_one_each() -> None:
+    pages = [WebPage(None, 1, 1) for _ in range(3)]  # the first one's is taken for the others
+    assert len({page.port for page in pages}) == 3
+    for page in pages:
+        page.close()
+
+
 def test_the_viewer_ends_with_its_parent_and_listens_on_the_loopback_alone(recorded: Path) -> None:
     words = ["view", str(recorded), "--web", "--no-browser"]
     process = subprocess.Popen(
@@ -501,7 +508,8 @@ def test_the_viewer_ends_with_its_parent_and_listens_on_the_loopback_alone(recor
     assert process.stdout is not None
     assert process.stderr is not None
     try:
-        assert "view: http://127.0.0.1:" in process.stdout.readline()
+        told = process.stdout.readline()
+        assert "view: http://127.0.0.1:" in told, told or process.stderr.read()
         assert "Ctrl-C ends" in process.stderr.readline()
         children = psutil.Process(process.pid).children()
         assert len(children) == 1

@@ -26,9 +26,8 @@ from softfinger.tools.terminal.progress import Progress
 from softfinger.tools.viewing.bridge import Bridge
 from softfinger.tools.viewing.known import warm_up
 from softfinger.tools.viewing.live_stream import NICE, TOPICS, ViewError, follow
-from softfinger.tools.viewing.viewer import Viewer, is_free, resident
+from softfinger.tools.viewing.viewer import Viewer, resident
 
-_PORT = 9090  # of the page, when it is free
 _MEMORY_STEP = 1.0  # s between two looks at this process's memory
 _MEMORY_SLACK = 50.0  # MB that it may grow by itself
 _AHEAD = 200  # pictures of a recording that are sent before waiting for the viewer
@@ -86,11 +85,10 @@ class Session:
 
     def _open(self) -> None:
         arguments = self._arguments
-        port = arguments.port or (_PORT if is_free(_PORT) else 0)
         memory = arguments.memory
         if arguments.web and arguments.file is None:
             memory = min(memory, _LATE)
-        viewer = self._viewer = Viewer(not arguments.web, memory, port)
+        viewer = self._viewer = Viewer(not arguments.web, memory, arguments.port)
         if viewer.address:
             print(f"view: {viewer.address} with data from port {viewer.receiver}", flush=True)
             if not arguments.no_browser:

@@ -8,9 +8,11 @@ the browser reaches this machine only.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import http.client
 import os
+import random
 import re
 import resource
 import shutil
@@ -33,22 +35,26 @@ from softfinger.tools.viewing.live_stream import LOOPBACK, ViewError
 _FILE = re.compile(r"/([\w-]+(\.[\w-]+)*)?")
 _PASSED_ON = ("Content-Type", "Content-Length", "rerun-final-length")
 _HOSTS = ("127.0.0.1", "localhost")
+_PAGE = 9090  # the page's port where nobody says another
+_PORTS = 20_000, 32_768  # of the viewer: below those that a system gives to whoever asks for any
 
 
 class WebPage:
     """Serves in a thread of its own until closed. ``port`` is the one it got."""
 
-    def __init__(self, port: int, source: int, receiver: int) -> None:
-        """Serve on ``port`` (0: a free one) what the viewer serves on ``source``.
+    def __init__(self, port: int | None, source: int, receiver: int) -> None:
+        """Serve on ``port`` what the viewer serves on ``source``.
 
-        ``receiver`` is the port from which the page gets its data. Raises ViewError when the port
-        is taken.
+        0 is any free port, None 9090 or, where that is taken, any free one. ``receiver`` is the
+        port from which the page gets its data. Raises ViewError when the port is taken.
         """
         handler = type("Handler", (_PageHandler,), {"source": source, "receiver": receiver})
         try:
-            self._server = ThreadingHTTPServer((LOOPBACK, port), handler)
+            self._server = ThreadingHTTPServer((LOOPBACK, _PAGE if port is None else port), handler)
         except (OSError, OverflowError) as error:
-            raise ViewError(f"port {port} can't be used: {error}") from None
+            if port is not None:
+                raise ViewError(f"port {port} can't be used: {error}") from None
+            self._server = ThreadingHTTPServer((LOOPBACK, 0), handler)
         self._server.daemon_threads = True
         self.port: int = self._server.server_address[1]
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
@@ -130,8 +136,8 @@ class Viewer:
     ``url`` is where data is sent, ``receiver`` its port; ``address`` the page's, if any.
     """
 
-    def __init__(self, window: bool, memory: float, port: int = 0) -> None:
-        """Start it, with ``memory`` [MB] at most; ``port`` is the page's, 0 takes a free one.
+    def __init__(self, window: bool, memory: float, port: int | None) -> None:
+        """Start it, with ``memory`` [MB] at most; ``port`` is the page's, as for WebPage.
 
         Raises ViewError when it does not start.
         """
@@ -207,21 +213,12 @@ class Viewer:
 
 
 def _free_port() -> int:
-    """A port of the loopback where nobody listens."""
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        port: int = probe.getsockname()[1]
-    return port
-
-
-def is_free(port: int) -> bool:
-    """Nobody listens on this port of the loopback."""
-    with socket.socket() as probe:
-        try:
+    """A port of the loopback where nobody listens, and that nobody is given before it is used."""
+    while True:
+        port = random.randrange(*_PORTS)
+        with socket.socket() as probe, contextlib.suppress(OSError):
             probe.bind((LOOPBACK, port))
-        except OSError:
-            return False
-    return True
+            return port
 
 
 def resident() -> float:
