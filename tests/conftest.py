@@ -46,6 +46,11 @@ def pytest_configure(config: pytest.Config) -> None:
         descendants.end_with_this_process()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what waits longest, while others compute; at the end nobody would be left to."""
+    items.sort(key=lambda item: item.get_closest_marker("waits") is None)
+
+
 def pytest_collection_finish() -> None:
     """Spare the garbage collector the million objects of all modules, which are there to stay."""
     gc.collect()

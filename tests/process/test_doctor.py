@@ -136,6 +136,7 @@ def test_a_missing_port_and_a_missing_servo(hands, capsys):
     assert "likely the power or cable" in lines[at + 1]
 
 
+@pytest.mark.waits
 def test_servos_at_another_rate_are_found(hands, capsys):
     hand = hands(baud=1_000_000)
     found = "note   found: ID 1 at 1000000 baud: XM430-W350, firmware 48"
@@ -158,6 +159,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
     assert "no such port" in capsys.readouterr().err
 
 
+@pytest.mark.waits
 def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(hands, capsys):
     hand = hands(ids=(1, 7), baud=2_000_000)
     servo = hand.emulator._servos.bus.servos[1]

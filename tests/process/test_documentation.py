@@ -164,6 +164,7 @@ def run_python(text: str, addresses: tuple[str, str]) -> None:
         exec(compile(text, "block", "exec"), {"__name__": "__main__", "print": show})
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks(
     page: Path, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
