@@ -34,6 +34,7 @@ _FEWEST = 5  # frames of a press
 _LOADS = 6  # at least, where there are frames enough, …
 _TOGETHER = 12  # … which are a load together at most
 _FEWEST_LOADS = 3  # where frames were lost
+_UNSEEN = 0.5  # of the way at most: E is 1 % off without the half, 5 % without three quarters
 _MISSED = 1.5  # periods between two frames: one is missing, …
 _SKIPPED = 3e-3  # … if they are s enough: of a faster board not each frame is taken
 _BACK = 0.95  # of the run's largest reading: below it the tip goes down yet, or is released
@@ -191,13 +192,15 @@ def _live_run(
     size = min(max(count // _LOADS, 1), _TOGETHER)
     # No load spans frames that were lost: all have the same range of depths.
     depths, counts = np.array(d[:count]), np.stack(frames[:count])
-    lost = np.flatnonzero(np.diff(depths) > speed * longest) + 1
+    steps = np.diff(d[: count + 1])
+    lost = np.flatnonzero(steps[:-1] > speed * longest) + 1
+    unseen = (steps[steps > speed * longest] - speed / rate).sum()
     loads = [
         run[k : k + size]
         for run in np.split(np.arange(count), lost)
         for k in range(0, len(run) - size + 1, size)
     ]
-    if len(loads) < _FEWEST_LOADS:
+    if len(loads) < _FEWEST_LOADS or unseen > _UNSEEN * d[count]:
         raise CalibrationError(
             f"--speed: {count} frames came of a press, with too many missing where tactile.rate "
             f"is {rate:g} Hz: press again"
