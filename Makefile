@@ -8,7 +8,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
-WORKERS := $(shell expr $$(nproc) + 1) # one waits for something while the others compute
+WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the others compute
 # Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
 LOWEST_PIP := build/lowest/bin/python -m pip --disable-pip-version-check --quiet install
