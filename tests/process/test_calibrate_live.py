@@ -213,4 +213,6 @@ def test_the_daemon_refuses_another_sensors_file_in_one_line(live, profile):
     assert done.returncode == 1
     assert "this is the calibration of another sensor: sensor A17, here B2" in done.stderr
     assert "Traceback" not in done.stderr
-    assert len([line for line in done.stderr.splitlines() if "sensor.json" in line]) == 1
+    told = [line for line in done.stderr.splitlines() if "sensor.json" in line]
+    assert len([line for line in told if "not compiled ahead" not in line]) == 1
+    assert len(told) <= 2  # where kernels are to be compiled first, they tell it once

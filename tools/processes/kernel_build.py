@@ -102,7 +102,12 @@ class _Build:
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
         self._processes: list[subprocess.Popen[str]] = []
-        self.failed = self._over = False
+        self._reasons: set[str] = set()  # told: wrong settings fail every part alike
+        self._over = False
+
+    @property
+    def failed(self) -> bool:
+        return bool(self._reasons)
 
     def run(self) -> None:
         """Build all parts; when interrupted, end every process."""
@@ -187,9 +192,10 @@ class _Build:
             self._tell("info", "compile", f"{part.name}: {self._so_far()}")
 
     def _fail(self, part: Part, reason: str) -> None:
-        if self._over:  # interrupted
-            return
-        self.failed = True
+        with self._changed:
+            if self._over or reason in self._reasons:  # interrupted, or told
+                return
+            self._reasons.add(reason)
         self._tell("warning", "compile", f"{part.name} was not compiled ahead: {reason}")
 
 
