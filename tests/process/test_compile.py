@@ -8,10 +8,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
+
+import pytest
 
 from softfinger.daemon.loop.warm_up import named
 from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.processes import kernel_build
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER
 
@@ -91,6 +95,16 @@ def alive(folder: Path) -> list[str]:
             if str(folder).encode() in (process / "environ").read_bytes():
                 found.append(process.name)
     return found
+
+
+def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: threading.Thread) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    monkeypatch.setattr(kernel_build, "is_built", lambda *_: False)
+    with pytest.raises(KeyboardInterrupt):
+        kernel_build.build_kernels(Settings(), lambda *_: None, bar=False)
 
 
 def test_ctrl_c_ends_every_process(tmp_path: Path) -> None:

@@ -129,7 +129,8 @@ class _Build:
             for process in self._processes:
                 process.kill()
             for thread in threads:
-                thread.join()
+                if thread.is_alive():  # the last one never is where Ctrl-C came before its start
+                    thread.join()
 
     def _so_far(self) -> str:
         return (
