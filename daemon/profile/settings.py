@@ -337,6 +337,7 @@ class SimulationSettings(Section):
     tip_friction: NonNegative = 0.6  # Coulomb, tip on object
     modulus_scale: Factor = 1.0  # the real tip over the settings' material
     tactile_noise: NonNegative = 1520.0  # Pa a cell
+    tactile_gain: tuple[Factor, Factor] = (1.0, 1.0)  # each sensor reads so many times the pressure
     tactile_gain_spread: Fraction = 0.0  # standard deviation of the cells' sensitivities
     tactile_dead: Fraction = 0.0  # share of cells that read 0, beside those of tactile.dead
     tactile_blur: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # m, standard deviation

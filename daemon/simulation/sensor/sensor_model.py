@@ -94,9 +94,9 @@ class Board:
 class SensorModel:
     """A pressure sensor under one simulated tip.
 
-    ``gain`` is the tip's pressure over the material's, and ``dead`` has the cells (row, col) that
-    always read 0. Two models of equal arguments and calls give equal frames. Raises ValueError for
-    arguments out of their range.
+    ``gain`` is what it reads over the material's pressure, and ``dead`` has the cells (row, col)
+    that always read 0. Two models of equal arguments and calls give equal frames. Raises ValueError
+    for arguments out of their range.
     """
 
     def __init__(

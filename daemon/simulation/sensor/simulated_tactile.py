@@ -27,7 +27,7 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
         Board(tactile.pascal_per_count, tactile.full_count, tactile.threshold),
         Imperfections.of(simulation),
         seed=(simulation.seed, finger),
-        gain=simulation.modulus_scale,
+        gain=simulation.modulus_scale * simulation.tactile_gain[finger],
         dead=tactile.dead[finger],
     )
 
