@@ -96,6 +96,9 @@ class JointPlant(Protocol):
     def current(self) -> FloatArray:
         """True motor currents [A]."""
 
+    def measured_current(self, joint: int) -> float:
+        """The motor current [A] of a joint as its servo measures it."""
+
     def advance(self, t: float) -> None:
         """Advance to time t [s]; a time that is past does nothing."""
 

@@ -70,24 +70,25 @@ class SimulatedServos:
             return
         reading.t = self._exchange()
         # As Python floats, which are faster one by one.
-        q, dq, current = self._hand.q.tolist(), self._hand.dq.tolist(), self._hand.current.tolist()
+        q, dq = self._hand.q.tolist(), self._hand.dq.tolist()
         for joint in self._joints:
             scale = self._scales[joint]
             reading.q[joint] = self._q[joint] = scale.angle(scale.position_counts(q[joint]))
             reading.dq[joint] = self._dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
-            reading.current[joint] = scale.amperes(scale.current_counts(current[joint]))
+            current = self._hand.measured_current(joint)
+            reading.current[joint] = scale.amperes(scale.current_counts(current))
         if reading.t - self._health_read >= _HEALTH_EVERY:
-            self._read_health(reading, current)
+            self._read_health(reading)
         self._seq += 1
         reading.seq = self._seq
         reading.alert = reading.lost = reading.frozen = 0
         reading.valid = True
 
-    def _read_health(self, reading: Reading, current: list[float]) -> None:
+    def _read_health(self, reading: Reading) -> None:
         passed = min(reading.t - self._health_read, _HEALTH_EVERY * 2.0)
         self._health_read = reading.t
         for joint in self._joints:
-            settled = self._model.settled_temperature(current[joint])
+            settled = self._model.settled_temperature(self._hand.current.item(joint))
             warmer = settled - self._temperature[joint]
             self._temperature[joint] += warmer * passed / reg.THERMAL_TIME
             reading.temperature[joint] = float(round(self._temperature[joint]))

@@ -1,15 +1,16 @@
-"""Faults of the emulated hand: in words ``[PART:]KIND[=VALUE][@SECONDS]``, and on the line."""
+"""Faults of the emulated hand: ``[PART:]KIND[=VALUE][@START[..END]]`` in words, and on the line."""
 
 from __future__ import annotations
 
 import math
 import random
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.simulation.measurement_faults import MEASUREMENT_FAULTS, SUDDEN
 from softfinger.daemon.types import FINGERS
 
 SERVOS = "servos"
@@ -42,10 +43,6 @@ BOARD_FAULTS = {  # kind → probability if none is given
     "saturated": 1.0,
     "zero": 1.0,
 }
-_PORT = ("unplug", "plug")
-_LOADS = ("push", "twist")  # N along the object's faces, away from the palm; N·m
-_WELL = "well"
-_WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*))?")
 
 
 class FaultSource:
@@ -93,9 +90,48 @@ class FaultEvent(NamedTuple):
     """What happens to one part of the hand."""
 
     after: float  # s
-    part: str  # ``servos``, ``left`` or ``right``: a board
+    part: str  # ``servos``, ``object``, or a finger: its board, or what it measures
     kind: str
-    value: float = 1.0  # a probability, a servo's ID, or a load
+    value: float = 1.0  # a probability, a servo's ID, a load, or a measurement's error
+    over: float = 0.0  # s in which it comes
+
+
+class _Form(NamedTuple):
+    """Kinds of faults that are written alike."""
+
+    kinds: Collection[str]
+    value: str  # how a value is written: in brackets where there may be none, empty for no value
+    parts: tuple[str, ...]  # what it happens to where the word names no finger
+    sided: bool = False  # a finger may be named
+
+    def fits(self, side: str | None, kind: str, valued: bool) -> bool:
+        """Whether a word may be of this form."""
+        optional = self.value.startswith("[")
+        return (
+            kind in self.kinds
+            and (self.sided or side is None)
+            and (optional or valued == bool(self.value))
+        )
+
+    def bounds(self, kind: str) -> tuple[float, float]:
+        """Least and greatest value."""
+        if kind in MEASUREMENT_FAULTS:
+            return MEASUREMENT_FAULTS[kind][1:]
+        return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
+
+
+# The first that fits: `silent=2` and `frozen=2` are a servo's, `left:silent` and `silent` boards'.
+_ID = "=ID"
+_FORMS = (
+    _Form(SERVO_FAULTS, _ID, (SERVOS,)),
+    _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
+    _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
+    _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
+    _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along its faces, away from the palm; N·m
+    _Form(("unplug", "plug"), "", (SERVOS,), sided=True),
+    _Form(("well",), "", (SERVOS, *FINGERS), sided=True),
+)
+_WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?")
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
@@ -104,12 +140,16 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` for both
       boards, with ``left:`` or ``right:`` before it for one; see :class:`TactileBoard`.
     - ``drop=0.01``, ``silent=2`` … for the servos; see :meth:`ServoBus.fault`.
+    - ``gain=0.5``, ``left:current=2`` … for what both fingers or one measure; see
+      MEASUREMENT_FAULTS.
     - ``unplug`` and ``plug`` for the servos' port, ``left:unplug`` … for a board's.
     - ``push=15``, ``twist=0.3`` for the object, from then on; 0 ends it.
-    - ``well`` ends what is wrong with the servos' line and boards, ``left:well`` with one board.
+    - ``well`` ends what is wrong with the servos' line, boards and measurements, ``left:well`` with
+      one finger's.
 
-    ``@SECONDS`` behind it says when it starts. ``ids`` are the servos'. Raises FaultError for a
-    word that can't be understood.
+    ``@START`` behind it says when it starts [s]; ``@START..END`` that a measurement goes wrong
+    evenly from then to then. ``ids`` are the servos'. Raises FaultError for a word that can't be
+    understood.
     """
     return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
 
@@ -123,41 +163,35 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
         return FaultError(f"fault {word!r}: {why}")
 
     match = _WORD.fullmatch(word)
-    side, kind, text, start = match.groups() if match else (None, "", None, None)
+    side, kind, text, start, end = match.groups() if match else (None, "", None, None, None)
     if side is not None and side not in FINGERS:
         raise refused(f"expected left: or right:, found {side}:")
-    after = _number(start) if start is not None else 0.0
+    value = None if text is None else _number(text)
+    if value is not None and not math.isfinite(value):
+        raise refused(f"{text!r} is not a number")
+    after = 0.0 if start is None else _number(start)
     if not 0.0 <= after < math.inf:
         raise refused(f"{start!r} is no time of 0 s or more")
-    value = _number(text) if text is not None else None
-    if value is not None and math.isnan(value):
-        raise refused(f"{text!r} is not a number")
-    probability = value is not None and 0.0 <= value <= 1.0
-    if kind in _LOADS and side is None and value is not None and math.isfinite(value):
-        return [FaultEvent(after, OBJECT, kind, value)]
-    if value is None and kind in _PORT:
-        return [FaultEvent(after, side or SERVOS, kind)]
-    if value is None and kind == _WELL:
-        return [FaultEvent(after, part, kind) for part in ((side,) if side else (SERVOS, *FINGERS))]
-    # `silent=2` and `frozen=2` are a servo's, `silent` and `left:silent` a board's.
-    if kind in BOARD_FAULTS and (side or value is None or kind not in SERVO_FAULTS):
-        if value is not None and not probability:
-            raise refused("a probability lies in 0 … 1")
-        chance = BOARD_FAULTS[kind] if value is None else value
-        return [FaultEvent(after, part, kind, chance) for part in ((side,) if side else FINGERS)]
-    if value is not None and side is None and kind in LINE_FAULTS:
-        if not probability:
-            raise refused("a probability lies in 0 … 1")
-        return [FaultEvent(after, SERVOS, kind, value)]
-    if value is not None and side is None and kind in SERVO_FAULTS:
-        if value not in ids:
-            raise refused("no servo has that ID")
-        return [FaultEvent(after, SERVOS, kind, value)]
-    raise refused(
-        f"expected for tactile boards {', '.join(BOARD_FAULTS)} [=PROBABILITY]; for the servos "
-        f"{', '.join(LINE_FAULTS)} =PROBABILITY or {', '.join(SERVO_FAULTS)} =ID; or "
-        f"{', '.join(_LOADS)} =NUMBER; unplug, plug, well"
-    )
+    until = after if end is None else _number(end)
+    if not after <= until < math.inf:
+        raise refused(f"{end!r} is no time of {start} s or more")
+    form = next((each for each in _FORMS if each.fits(side, kind, value is not None)), None)
+    if form is None:
+        known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)
+        raise refused(f"expected one of {'; '.join(known)}")
+    if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SUDDEN):
+        raise refused(f"{kind} comes at once, at {start}")
+    if form.value == _ID and value not in ids:
+        raise refused("no servo has that ID")
+    if value is None:
+        value = BOARD_FAULTS.get(kind, 1.0)
+    low, high = form.bounds(kind)
+    if not low <= value <= high:
+        raise refused(f"a {form.value.strip('[=]').lower()} lies in {low:g} … {high:g}")
+    return [
+        FaultEvent(after, part, kind, value, until - after)
+        for part in ((side,) if side else form.parts)
+    ]
 
 
 def _number(text: str) -> float:

@@ -33,6 +33,10 @@ class FreeJoints:
         self.current: FloatArray = np.zeros(count)  # A
         self._goals = [(False, 0.0, 0.0, 0.0)] * count  # torque on, signed current, angle, bound
 
+    def measured_current(self, joint: int) -> float:
+        """As :meth:`JointPlant.measured_current`."""
+        return self.current.item(joint)
+
     def advance(self, t: float) -> None:
         """Step up to time t [s]."""
         count = int((t - self._start) / STEP + 1e-9) - self._done

@@ -201,6 +201,29 @@ def test_the_control_socket_survives_rude_clients_and_is_taken_away(tmp_path, mo
     assert not place.exists()
 
 
+def test_measurements_are_wrong_and_the_hand_is_not(tmp_path: Path) -> None:
+    with emulated(tmp_path, "right:drift=0.2@0.5..1", "left:current=3@0.5") as made:
+        until(lambda: board_mean(tmp_path, 1) > 48)  # of 255
+        assert board_mean(tmp_path, 0) < 10
+        left, right = made.hand.measurement_faults
+        assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
+        assert send(tmp_path, "right:well left:gain=0@0.1..0.2") == 0
+        until(lambda: board_mean(tmp_path, 1) < 10)
+        until(lambda: left("gain", made.clock.now()) == 0.0)
+        assert left("current", 9.0) == 3.0
+        assert send(tmp_path, "well") == 0
+        assert (left("gain", 9.0), left("current", 9.0)) == (1.0, 1.0)
+
+
+def board_mean(folder: Path, finger: int) -> float:
+    """Mean count of a board's newest frame."""
+    sensor = board(folder, finger)
+    sensor.open()
+    frame = sensor.latest()
+    sensor.close()
+    return float(frame.data.mean())
+
+
 def test_an_object_that_slipped_away_is_put_back(tmp_path: Path) -> None:
     with emulated(tmp_path) as made:
         made.hand.object_pose[:] = 0.07, 0.02, 1.2

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _CYCLE = "depth=4mm speed=4mm/s hold=1s"  # of a bare --press: what `calibrate modulus` asks for
 _LOOK = 0.1  # s between two looks at a plate's way
 _FAULTS = """\
-faults, each KIND[=VALUE][@SECONDS], given as often as needed:
+faults, each KIND[=VALUE][@START], given as often as needed:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
                    both boards, or one: left:silent, right:torn=0.2
   to the servos    lose, lose-writes =PROBABILITY that an instruction reaches none of them
@@ -28,9 +28,15 @@ faults, each KIND[=VALUE][@SECONDS], given as often as needed:
                    stuck (angle stands, velocity and current read 0), jump (by 0.2 rad), frozen
                    (all registers stand, their time too), refuse (an error for each); recover =ID
   ports            unplug, plug for the servos'; left:unplug, right:plug … for a board's
+  measurements     which are wrong while the hand is as it was; of both fingers, or left:gain=0.5:
+                   gain=FACTOR of all pressures, shift-x, shift-y=CELLS of the image, mirror=1 (its
+                   columns in reverse), drift=SHARE of the largest count (below 0, too), replay=S
+                   (the last S seconds of frames, 3 at most, again and again with new numbers),
+                   current=FACTOR of what a servo reports; back with 1, 1 for factors and 0 else
   the object       push=N along its faces, away from the palm, twist=N·m; 0 ends it
-  all well again   well for the servos' line and boards, left:well for one board
-  @SECONDS         when it starts; at once without
+  all well again   well for the servos' line, boards and measurements, left:well for one finger's
+  @START           when it starts [s]; at once without. gain=0.5@3..5: a measurement goes wrong
+                   evenly from 3 to 5 s
 
 softfinger emulate --send "drop=0.01 left:frozen@2" changes a running one, by DIR/control.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import select
 import socket
@@ -37,6 +36,7 @@ from softfinger.daemon.simulation.faults import (
     LineFaults,
     parse_faults,
 )
+from softfinger.daemon.simulation.measurement_faults import MEASUREMENT_FAULTS
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
@@ -399,13 +399,16 @@ class Emulator:
             self._servos.bus.forget(t)
 
     def _apply(self, event: FaultEvent, t: float) -> None:
-        _, part, kind, value = event
+        after, part, kind, value, over = event
         if part == OBJECT:
-            angle = float(self.hand.object_pose[2])
-            load = (0.0, value) if kind == "twist" else (value, 0.0)
-            self.hand.push(-load[0] * math.sin(angle), load[0] * math.cos(angle), load[1])
+            self.hand.load(**{kind: value})
             self._pushed = t
             return
+        if kind in MEASUREMENT_FAULTS:
+            self.hand.measurement_faults[FINGERS.index(part)].begin(kind, value, after, over)
+            return
+        if kind == "well" and part in FINGERS:
+            self.hand.measurement_faults[FINGERS.index(part)].clear()
         device = self._servos if part == SERVOS else self._boards.get(part)
         if device is None:
             return

@@ -13,6 +13,7 @@ import numpy as np
 
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.measurement_faults import MeasurementFaults
 from softfinger.daemon.simulation.physics import plant
 from softfinger.daemon.simulation.physics.parameters import set_parameters, stiff_step
 from softfinger.daemon.simulation.physics.plant_state import (
@@ -96,6 +97,8 @@ class SimulatedHand:
         self.on_other_tip = self.plant.on_other_tip  # 1: the other tip is felt, not the object
         self.torque_on = goals.torque_on  # 1 where a servo has torque
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
+        # Of each finger's tactile sensor and servo, left first; the hand itself is as it was.
+        self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self._run(0)
 
     @property
@@ -141,6 +144,11 @@ class SimulatedHand:
         self._goal_q[joint] = goal_q
         self._goal_current[joint] = goal_current
 
+    def measured_current(self, joint: int) -> float:
+        """The motor current [A] that a servo's own sensor shows."""
+        scale = self.measurement_faults[joint]("current", self.t)
+        return scale * self.current.item(joint)
+
     def hold_torque_until(self, t: float) -> None:
         """End both servos' torque at ``t`` [s]; infinity: don't."""
         self._torque_until = t
@@ -148,6 +156,14 @@ class SimulatedHand:
     def push(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
         """Push the object with this force [N] and torque [N·m] from now on; zeros end it."""
         self.plant.goals.push[:] = force_x, force_y, torque
+
+    def load(self, push: float = 0.0, twist: float = 0.0) -> None:
+        """Load the object from now on: along its faces, away from the palm [N], and round [N·m].
+
+        The force keeps its direction when the object turns; zeros end it.
+        """
+        angle = self.object_pose.item(2)
+        self.push(-push * math.sin(angle), push * math.cos(angle), twist)
 
     @property
     def samples(self) -> int:

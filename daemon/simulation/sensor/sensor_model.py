@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import SimulationSettings
+from softfinger.daemon.simulation.measurement_faults import MeasurementFaults
 from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, render_curved
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
@@ -227,10 +228,14 @@ class SensorModel:
         """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""
         self._pressure[:] = pressure
 
-    def read(self, out: NDArray[np.uint16]) -> None:
-        """Write the counts of what the cells feel into ``out``."""
+    def read(
+        self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
+    ) -> None:
+        """Write the counts of what the cells feel into ``out``, with ``faults`` as at ``t`` [s]."""
         flaws = self._flaws
         np.multiply(self._pressure, self._sensitivity, out=self._signal)
+        if faults is not None:
+            faults.apply(self._signal, self._ends[1], t)
         if flaws.crosstalk > 0.0:
             crosstalk(self._signal, flaws.crosstalk, *self._lines)
         if flaws.noise > 0.0:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.measurement_faults import LONGEST_REPLAY
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.daemon.types import Frame
@@ -46,7 +49,8 @@ class SimulatedTactile:
     A frame is due at every k / ``tactile.rate`` since the hand's start, shows the contact of that
     instant and arrives ``simulation.tactile_delay`` later, or later still, or never (see
     :class:`Arrivals`). Only the newest that has arrived is read, and only when it is asked for;
-    ``seq`` counts the others too. ``stage``, where there is one, presses the tip instead of the
+    ``seq`` counts the others too. What is wrong with it is in the hand's ``measurement_faults``.
+    ``stage``, where there is one, presses the tip instead of the
     hand's object: it takes the time since the hand's start [s].
     """
 
@@ -71,6 +75,11 @@ class SimulatedTactile:
         self.stage: Callable[[float], StageTouch] | None = None
         self._pressed = -1  # number of the newest sample that the cells have felt
         self._frame: Frame | None = None
+        self._faults = hand.measurement_faults[finger]
+        self._given: deque[NDArray[np.uint16]] = deque(
+            maxlen=math.ceil(LONGEST_REPLAY * tactile.rate)
+        )
+        self._replayed: Iterator[NDArray[np.uint16]] | None = None
         self._lost = 0
         self._open = False
 
@@ -115,15 +124,22 @@ class SimulatedTactile:
             self._lost += 1
             return
         self._pressed = number
-        data: NDArray[np.uint16] = np.empty(self._shape, dtype=np.uint16)
-        self._model.read(data)
-        self._frame = Frame(
-            seq=number + 1,
-            t_sample=self._hand.start + number * self._period,
-            t_arrival=arrival,
-            valid=True,
-            data=data,
-        )
+        t = self._hand.start + number * self._period
+        data = self._counts(t)
+        self._given.append(data)
+        self._frame = Frame(seq=number + 1, t_sample=t, t_arrival=arrival, valid=True, data=data)
+
+    def _counts(self, t: float) -> NDArray[np.uint16]:
+        """What the cells read at ``t`` [s], or the next of the frames that are repeated."""
+        last = round(self._faults("replay", t) / self._period)
+        if last == 0 or not self._given:
+            self._replayed = None
+            data: NDArray[np.uint16] = np.empty(self._shape, dtype=np.uint16)
+            self._model.read(data, self._faults, t)
+            return data
+        if self._replayed is None:
+            self._replayed = itertools.cycle(list(self._given)[-last:])
+        return next(self._replayed)
 
     def _press(self, number: int) -> bool:
         """Let the cells feel sample ``number``; False when the plant no longer has it."""

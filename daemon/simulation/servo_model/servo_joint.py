@@ -187,7 +187,7 @@ class ServoJoint:
         if self.stuck is not None:
             return 0, 0, self.position()
         plant, joint, scale = self._plant, self._joint, self._scale
-        ampere = plant.current.item(joint)
+        ampere = plant.measured_current(joint)
         if self._senses_current:
             current = scale.current_counts(ampere)
         else:  # the register is present load, 0.1 %

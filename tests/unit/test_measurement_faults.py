@@ -1,0 +1,186 @@
+"""What sensors of the simulated hand read wrong, while the hand itself is as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.simulation.measurement_faults import MEASUREMENT_FAULTS, MeasurementFaults
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
+from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+
+SHAPE = (5, 7)
+
+
+class Press:
+    """A left tip that is pressed evenly deeper, and its sensor."""
+
+    def __init__(self, **simulation) -> None:
+        self.settings = Settings.model_validate(
+            {
+                "servos": {"backend": "none"},
+                "simulation": {"compression_speed": 0.01, "tactile_noise": 0.0, **simulation},
+            }
+        )
+        self.clock = VirtualClock()
+        self.hand = SimulatedHand(self.settings)
+        self.sensor = SimulatedTactile(self.settings, self.hand, self.clock, 0)
+        self.sensor.open()
+        self.faults = self.hand.measurement_faults[0]
+
+    def frames(self, count: int) -> list[np.ndarray]:
+        """The next frames' counts, each of which must be a new one by its number and times."""
+        found = []
+        for _ in range(count):
+            before = self.sensor.latest()
+            self.clock.sleep_until(self.clock.now() + 0.01)
+            frame = self.sensor.latest()
+            assert frame.seq == before.seq + 1
+            assert frame.t_sample == pytest.approx(before.t_sample + 0.01)
+            assert frame.valid
+            found.append(frame.data)
+        return found
+
+    def pressed(self, count: int) -> list[np.ndarray]:
+        """As many frames, after the first 1.4 s of the press."""
+        self.clock.sleep_until(1.4)
+        self.sensor.latest()
+        return self.frames(count)
+
+
+def signal() -> np.ndarray:
+    return np.arange(1.0, 36.0).reshape(SHAPE)
+
+
+def applied(*faults: tuple[str, float], t: float = 0.0) -> np.ndarray:
+    made, image = MeasurementFaults(), signal()
+    for kind, value in faults:
+        made.begin(kind, value, 0.0)
+    made.apply(image, 1000, t)
+    return image
+
+
+def test_each_kind_does_to_the_image_what_its_name_says() -> None:
+    image = signal()
+    np.testing.assert_array_equal(applied(), image)
+    np.testing.assert_array_equal(applied(("gain", 0.5)), 0.5 * image)
+    np.testing.assert_array_equal(applied(("drift", -0.02)), image - 20.0)
+    np.testing.assert_array_equal(applied(("mirror", 1.0)), image[:, ::-1])
+    right = applied(("shift-x", 2.0))
+    np.testing.assert_array_equal(right[:, 2:], image[:, :-2])
+    assert not right[:, :2].any()
+    up = applied(("shift-y", -3.0))
+    np.testing.assert_array_equal(up[:-3], image[3:])
+    assert not up[-3:].any()
+    between = applied(("shift-x", 0.25))
+    np.testing.assert_allclose(between[:, 1:], 0.75 * image[:, 1:] + 0.25 * image[:, :-1])
+    np.testing.assert_array_equal(applied(("current", 3.0)), image)
+    np.testing.assert_array_equal(applied(("gain", 2.0), ("gain", 1.0)), image)
+
+
+def test_they_come_evenly_in_their_time_and_end() -> None:
+    faults = MeasurementFaults()
+    faults.begin("gain", 0.5, 3.0, 2.0)
+    assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
+        *(1.0, 1.0, 0.75, 0.625, 0.5, 0.5)
+    ]
+    faults.begin("gain", 2.625, 4.5, 4.0)  # from where it is by then
+    assert [faults("gain", t) for t in (4.5, 6.5, 8.5)] == [0.625, 1.625, 2.625]
+    faults.begin("drift", 0.1, 7.0)
+    assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]
+    faults.clear()
+    assert {kind: faults(kind, 9.0) for kind in MEASUREMENT_FAULTS} == {
+        kind: fault.honest for kind, fault in MEASUREMENT_FAULTS.items()
+    }
+    with pytest.raises(KeyError):
+        faults.begin("smell", 1.0, 0.0)
+
+
+def test_a_sensor_lies_and_its_tip_feels_the_truth() -> None:
+    honest, lying = Press(), Press()
+    lying.faults.begin("gain", 0.5, 1.45, 0.1)
+    true, read = honest.pressed(30), lying.pressed(30)
+    sums = np.array([b.sum() / a.sum() for a, b in zip(true, read, strict=True)])
+    instants = 1.40 + 0.01 * np.arange(30)
+    np.testing.assert_allclose(sums, np.interp(instants, [1.45, 1.55], [1.0, 0.5]), atol=2e-3)
+    np.testing.assert_array_equal(honest.hand.force, lying.hand.force)
+    # Of the other finger nothing is wrong.
+    assert lying.hand.measurement_faults[1]("gain", 9.0) == 1.0
+
+
+def test_counts_end_where_a_boards_do() -> None:
+    press = Press()
+    press.pressed(1)
+    press.faults.begin("drift", -1.0, press.clock.now())
+    assert press.frames(2)[-1].max() == 0
+    press.faults.begin("drift", 1.0, press.clock.now())
+    assert press.frames(2)[-1].min() == press.settings.tactile.full_count
+
+
+def test_frames_are_repeated_with_new_numbers() -> None:
+    press = Press()
+    kept = press.pressed(20)
+    assert len({each.tobytes() for each in kept}) == 20
+    press.faults.begin("replay", 0.06, press.clock.now())
+    again = press.frames(18)
+    # The sensor's delay is one frame: the first was sampled before it began.
+    last = [*kept, again[0]][-6:]
+    assert [each.tobytes() for each in again[1:]] == [
+        last[k % 6].tobytes() for k in range(len(again) - 1)
+    ]
+    press.faults.clear()
+    assert press.frames(3)[-1].sum() > kept[-1].sum()
+
+
+def test_a_sensor_that_repeats_from_the_start_repeats_its_first_frame() -> None:
+    press = Press()
+    press.faults.begin("replay", 3.0, 0.0)
+    frames = press.pressed(3)
+    assert not any(each.any() for each in frames)
+
+
+def test_each_sensor_has_its_gain() -> None:
+    total = []
+    for gain in ([1.0, 1.0], [0.7, 1.0], [1.0, 0.7]):
+        total.append(float(Press(tactile_gain=tuple(gain)).pressed(1)[0].sum()))
+    assert total[1] == pytest.approx(0.7 * total[0], rel=2e-3)
+    assert total[2] == total[0]
+
+
+def test_a_servo_reports_another_current_than_flows() -> None:
+    settings = Settings()
+    hand = SimulatedHand(settings)
+    bus = ServoBus.from_settings(settings, hand)
+    bus.advance(0.0)
+    unit = bus.servos[0].model.current_unit
+    signs = settings.servos.direction
+    for servo, sign in zip((1, 2), signs, strict=True):
+        write(bus, servo, reg.TORQUE_ENABLE, b"\x01")
+        write(bus, servo, reg.GOAL_CURRENT, (200).to_bytes(2, "little"))
+        write(bus, servo, reg.GOAL_POSITION, (2048 + sign * 600).to_bytes(4, "little"))
+    bus.advance(1.5)
+    flows = hand.current.copy()
+    assert np.all(flows > 0.9 * 200 * unit)
+    hand.measurement_faults[1].begin("current", 0.5, 1.0, 1.0)
+    assert [hand.measured_current(0), hand.measured_current(1)] == [flows[0], 0.75 * flows[1]]
+    bus.advance(2.5)
+    counts = [sign * present(bus, servo) for servo, sign in zip((1, 2), signs, strict=True)]
+    assert counts == [round(hand.current[0] / unit), round(0.5 * hand.current[1] / unit)]
+    np.testing.assert_allclose(hand.current, flows, rtol=0.02)  # the goal is carried out as it was
+
+
+def write(bus: ServoBus, servo: int, address: int, data: bytes) -> None:
+    words = address.to_bytes(2, "little") + data
+    bus.feed(framing.frame(servo, framing.WRITE, words), bus.now)
+
+
+def present(bus: ServoBus, servo: int) -> int:
+    """Register 126, present current."""
+    span = reg.PRESENT_CURRENT.to_bytes(2, "little") + b"\x02\x00"
+    reply = bus.feed(framing.frame(servo, framing.READ, span), bus.now)
+    return int.from_bytes(reply[9:11], "little", signed=True)
