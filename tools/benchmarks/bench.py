@@ -33,6 +33,7 @@ MEASUREMENTS = {
 CAMPAIGNS = {
     "accuracy": "the estimator over its whole range against the Cramér-Rao bound, ten minutes",
     "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
+    "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
 PAGE = ("contact", "estimator", "tick", "servos", "startup")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤")
