@@ -238,6 +238,7 @@ def test_a_load_on_the_object_and_when_the_tips_slipped(tmp_path: Path) -> None:
         held = made.report(made.clock.now())["object"]
         assert held["pushed"] is not None
         assert held["slipped"] is None, "no tip touches it"
+        assert made.report(made.clock.now())["force"] == [0.0, 0.0]
         made.request("place twist=0.02")
         until(lambda: made.hand.object_pose[2] > 0.05)
         made.request("place forget")

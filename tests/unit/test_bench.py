@@ -182,12 +182,14 @@ def test_a_failed_campaign_is_no_success(
     [
         (["contct"], "found 'contct', expected one of contact"),
         (["faults"], "it is a campaign, `bench campaign faults`"),
-        (["campaign"], "'campaign' alone, expected one of accuracy, faults"),
+        (["campaign"], "'campaign' alone, expected one of accuracy, faults, witnesses"),
         (
             ["campaign", "faults", "--only", "no such fault"],
             "no case of faults has this in its name",
         ),
         (["campaign", "faults", "--plot", "x.png"], "campaigns have no picture"),
+        (["campaign", "faults", "--emulate"], "--emulate: faults has no such cases"),
+        (["campaign", "witnesses", "--emulate", "--only", "push"], "no case of witnesses"),
         (["tick", "--against", "/nowhere.json"], "no figures of `bench --json`"),
     ],
 )

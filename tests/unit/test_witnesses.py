@@ -9,14 +9,13 @@ from dataclasses import replace
 import pytest
 
 from softfinger.tools.benchmarks import witnesses
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 from softfinger.tools.benchmarks.witnesses import (
     ANSWERED,
     BOUNDED,
     CASES,
     SETTLES,
     GripTrial,
-    VirtualGrip,
-    Watch,
     WitnessCase,
     honest,
     measure,

@@ -58,6 +58,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
     )
     parser.add_argument(
+        "--emulate",
+        action="store_true",
+        help="some cases of a campaign through `softfinger emulate`, in real time (witnesses)",
+    )
+    parser.add_argument(
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
@@ -128,7 +133,9 @@ def _measured(
     before, tables = yardsticks(), []
     try:
         if campaign:
-            tables = _module(name).measure(arguments.trials, arguments.only)
+            module = _module(name)
+            measure = module.measure_emulated if arguments.emulate else module.measure
+            tables = measure(arguments.trials, arguments.only)
         else:
             tables = _module(name).measure(brief=arguments.brief or not arguments.names)
     except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
@@ -194,8 +201,13 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
         if name not in texts:
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
-        if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
-            raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
+        if texts is CAMPAIGNS:
+            module = _module(name)
+            cases = getattr(module, "EMULATED", ()) if arguments.emulate else module.NAMES
+            if not cases:
+                raise ValueError(f"--emulate: {name} has no such cases")
+            if not any(arguments.only in case for case in cases):
+                raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
     if arguments.plot:
         from softfinger.tools.extras import MissingExtra
         from softfinger.tools.style import settings

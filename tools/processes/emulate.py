@@ -76,6 +76,7 @@ begins the record anew, --send "report forget" does both without a gap:
     goal_currents  with --send "report goals": t and value of the newest 1000, in their order
   object           pose (x, y [m], angle [rad]) now; pushed: t of the last push or twist; slipped: t
                    when both tips last stuck before one slipped; both null when there was none
+  force            what presses each tip now [N], left first
 """
 
 

@@ -322,11 +322,7 @@ class Emulator:
         if "forget" in words:
             self._forget(now)
         if "place" in words:
-            simulation = self._simulation
-            self.hand.object_pose[:] = *simulation.object_position, simulation.object_angle
-            self.hand.object_velocity[:] = 0.0
-            self.hand.push(0.0, 0.0)
-            self.hand.refresh()
+            self.hand.place_object()
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
         self._advance_due = now  # so that what starts now does
@@ -379,7 +375,7 @@ class Emulator:
         return reply
 
     def report(self, t: float, goals: bool = False) -> dict[str, Any]:
-        """What was on the servos' wire, their state and the object's; times are the hand's [s].
+        """What was on the servos' wire, and the hand's true state; times are the hand's [s].
 
         ``monotonic`` is time.monotonic() at ``t``, to compare with times of other processes.
         """
@@ -389,7 +385,8 @@ class Emulator:
                 told["goal_currents"] = servo.goal_currents()
         pose = self.hand.object_pose.tolist()
         held = {"pose": pose, "pushed": self._pushed, "slipped": self._slipped}
-        return {"t": t, "monotonic": time.monotonic(), "servos": servos, "object": held}
+        hand = {"servos": servos, "object": held, "force": self.hand.force.tolist()}
+        return {"t": t, "monotonic": time.monotonic(), **hand}
 
     def _forget(self, t: float) -> None:
         """Begin the record anew."""

@@ -69,6 +69,7 @@ class SimulatedHand:
         state.position[:2] = settings.hand.open_angle
         state.position[2:4] = simulation.object_position
         state.position[4] = simulation.object_angle
+        self._first_pose = state.position[2:].copy()
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         # As many as may be on their way to a sensor's reader.
@@ -126,6 +127,12 @@ class SimulatedHand:
     def refresh(self) -> None:
         """Evaluate the contacts of a state that was written from outside; time stays."""
         self._run(0)
+
+    def place_object(self) -> None:
+        """Put the object back where it was at the start, at rest and without a load."""
+        self.object_pose[:], self.object_velocity[:] = self._first_pose, 0.0
+        self.load()
+        self.refresh()
 
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float

@@ -1,0 +1,141 @@
+"""A simulated hand on virtual time that grips, and the plant's word for what its tips do.
+
+The true force, the object's place and slips are judged by the plant at every tick, with nothing of
+the code that is measured.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import random
+from collections.abc import Callable, Sequence
+from statistics import fmean
+
+from softfinger.daemon.errors import Refused
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.load import checked
+from softfinger.daemon.simulation.faults import OBJECT, parse_faults
+from softfinger.daemon.types import FINGERS
+from softfinger.tools.benchmarks.rigs import Sections, merged
+from softfinger.tools.processes.kernel_build import table_cache
+
+TOO_MUCH = 1.3  # of the force asked for
+GONE = 0.1  # m that an object has slid: beyond, it no longer matters how far
+_TORQUE_ERROR = 0.1  # share by which the joints' torque constant may be off
+_RAISED = 1.25  # of the goal currents before: a firmer grip
+_LAST = 0.5  # s over which the force has settled
+_SLIPS = 0.999  # of what friction bears
+
+
+class Watch:
+    """The true forces and the object's place, tick by tick."""
+
+    def __init__(self, asked: float) -> None:
+        self.asked = asked  # N
+        self.peak = 0.0  # force over what is asked for, of either tip
+        self.above = 0.0  # longest time above `TOO_MUCH` [s]
+        self.slid = 0.0  # by how much the object was displaced with torque on [m]
+        self._mean: list[tuple[float, float]] = []  # when [s], force over what is asked for
+        self._below = math.inf  # since then above
+        self._place: Sequence[float] = ()
+
+    def see(self, t: float, forces: Sequence[float], place: Sequence[float], torque: bool) -> None:
+        """Take in time [s], both tips' forces [N], the object's place [m], whether torque is on."""
+        ratios = [force / self.asked for force in forces]
+        self._mean.append((t, fmean(ratios)))
+        self.peak = max(self.peak, *ratios)
+        self._below = min(self._below, t) if max(ratios) > TOO_MUCH else math.inf
+        self.above = max(self.above, t - self._below)
+        self._place = self._place or place
+        if torque:
+            self.slid = min(max(self.slid, math.dist(place, self._place)), GONE)
+
+    def settled(self) -> float:
+        """The mean force over what is asked for, in the end."""
+        end = self._mean[-1][0] - _LAST
+        return fmean(ratio for t, ratio in self._mean if t > end)
+
+
+class VirtualGrip:
+    """A simulated hand on virtual time and its events; ``look`` is called after each tick."""
+
+    def __init__(self, seed: int, chance: random.Random, sections: Sections) -> None:
+        drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
+        base = {"simulation": drawn, "loop": {"clock": "virtual"}}
+        self.settings = checked(merged(sections, base))
+        self.events: list[tuple[float, str]] = []  # warnings and errors: when [s], kind
+        self._daemon = Daemon(
+            self.settings, wire=False, table_cache=table_cache(), on_event=self._hear
+        )
+        self.loop, self.state = self._daemon.loop, self._daemon.loop.state
+        assert self._daemon.hand is not None
+        self.hand = self._daemon.hand
+        error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
+        self.hand.plant.parameters.torque_constant *= 1.0 + error
+        self.look: Callable[[], None] = lambda: None
+        self.loop.heartbeat = lambda _: self.look()
+        self.loop.advance(0.1)
+
+    def __enter__(self) -> VirtualGrip:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._daemon.close()
+
+    def _hear(self, level: str, kind: str, _text: str) -> None:
+        if level != "info":
+            self.events.append((self._daemon.clock.now(), kind))
+
+    def command(self, name: str, **numbers: float) -> None:
+        """Give a command, which the hand may refuse."""
+        with contextlib.suppress(Refused):
+            self.loop.command({"command": name, **numbers})
+
+    def until(self, mode: str, seconds: float) -> bool:
+        """Go on until the hand is in that mode; False when it is not within ``seconds``."""
+        end = self.state.t + seconds
+        while self.state.mode != mode and self.state.t < end:
+            self.loop.advance(self.loop.period)
+        return self.state.mode == mode
+
+    def begin(self, words: str) -> None:
+        """Let begin now what these words of `softfinger emulate --fault` say."""
+        for after, part, kind, value, over in parse_faults(words.split(), ()):
+            if part == OBJECT:
+                self.hand.load(**{kind: value})
+            else:
+                faults = self.hand.measurement_faults[FINGERS.index(part)]
+                faults.begin(kind, value, self.state.t + after, over)
+
+    def watched(self, asked: float) -> Watch:
+        """A watch that sees each tick from now on."""
+        watch, hand, state = Watch(asked), self.hand, self.state
+        self.look = lambda: watch.see(
+            state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque
+        )
+        return watch
+
+    def answer(self, words: str, seconds: float) -> float:
+        """From the onset of the slip that ``words`` cause to raised goal currents [s].
+
+        NaN where nothing slips in so many ``seconds``, infinity without an answer.
+        """
+        state, loop = self.state, self.loop
+        calm = sum(state.goal.current)
+        self.begin(words)
+        onset = answered = math.inf
+        stuck, end = state.t, state.t + seconds
+        while state.t < end:
+            loop.advance(loop.period)
+            if self._slips():
+                onset = min(onset, stuck)
+            stuck = state.t
+            if sum(state.goal.current) > _RAISED * calm:
+                answered = min(answered, state.t)
+        return answered - onset if onset < math.inf else math.nan
+
+    def _slips(self) -> bool:
+        most = _SLIPS * self.settings.simulation.tip_friction
+        tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
+        return any(abs(along) >= most * normal for along, normal in tips)
