@@ -50,8 +50,8 @@ class SimulatedTactile:
     instant and arrives ``simulation.tactile_delay`` later, or later still, or never (see
     :class:`Arrivals`). Only the newest that has arrived is read, and only when it is asked for;
     ``seq`` counts the others too. What is wrong with it is in the hand's ``measurement_faults``.
-    ``stage``, where there is one, presses the tip instead of the
-    hand's object: it takes the time since the hand's start [s].
+    ``stage``, where there is one, presses the tip instead of the hand's object: it takes the time
+    since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
