@@ -8,6 +8,7 @@ through `softfinger emulate` and the SDK.
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import random
@@ -236,6 +237,7 @@ def _measured(
             if case.aim == aim:
                 found = [one(case, seed) for seed in range(1, trials + 1)]
                 rows.append(summary(case, found))
+                gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
                 print(f"{case.name}: {rows[-1]['met']} of {trials}", file=sys.stderr, flush=True)
         if rows:
             reports.append(_report(f"force over asked: {aim}", rows))
