@@ -84,6 +84,9 @@ class Loaded:
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])
 
+    def measured_current(self, joint: int) -> float:
+        return self.current.item(joint)
+
     def advance(self, t: float) -> None: ...
 
     def hold_torque_until(self, t: float) -> None: ...
