@@ -55,7 +55,8 @@ _POLL = 0.005  # between two looks at an emulated hand
 _OPEN = 20.0  # until its fingers are open, at most
 
 _TRIES = 3  # at a trial on a busy machine
-_HELD_UP = {"late", "realtime", "servos.bus"}  # events and faults that say that it is
+# Events, faults and modes that say that it is.
+_HELD_UP = {"late", "realtime", "servos.bus", "servos.silent", "disarmed"}
 _BORNE = {"push": 2.0 * 0.6, "twist": 0.6 * 0.040}  # N, N·m a N of grip: by both tips' friction
 _SLIPPING = (1.17, 1.5)  # of that
 
