@@ -21,15 +21,11 @@ from numpy.typing import NDArray
 LANES = 5  # polynomials
 STRIDE = 8  # numbers of a vector register, and stored for each coefficient: the lanes, padded
 
-# Shapes by number: how many powers of x each power of y has, the lowest first. Squares, then
-# shapes cut to what an analytic function needs for one precision after the other, the shape for a
-# narrow strip of x, and that of a solid tip.
+# Shapes by number: how many powers of x each power of y has, the lowest first. None; shapes cut to
+# what an analytic function needs for one precision after the other; the shape for a narrow strip of
+# x, and that of a solid tip.
 SHAPES: tuple[tuple[int, ...], ...] = (
     (),
-    (2,) * 2,
-    (4,) * 4,
-    (6,) * 6,
-    (5, 5, 5, 5, 4, 4, 4, 3, 2, 2, 1),
     (7, 6, 6, 6, 6, 5, 5, 4, 4, 3, 3, 3, 2, 2, 1),
     (9, 8, 8, 7, 7, 7, 6, 6, 5, 5, 5, 4, 4, 4, 3, 3, 3, 2, 1, 1),
     (10, 9, 9, 9, 9, 8, 8, 7, 7, 7, 6, 6, 6, 6, 5, 5, 5, 5, 4, 4, 4, 3, 3, 2, 2, 1),
@@ -94,11 +90,6 @@ def _polynomials(context: Any, data: Any, at: Any, shape: Any, x: Any, y: Any) -
 
 def _in_powers(builder: Any, fma: Any, rows: list[Any], y: Any) -> Any:
     """Σ rows[j] y^j by four interleaved Horner schemes in y⁴, so that the chain is short."""
-    if len(rows) < 4:
-        total = rows[-1]
-        for row in reversed(rows[:-1]):
-            total = fma(total, y, row)
-        return total
     y2 = builder.fmul(y, y)
     y4 = builder.fmul(y2, y2)
     sums = []

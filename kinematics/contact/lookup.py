@@ -1,18 +1,20 @@
 """The lookup kernel of contact tables, and the layout of the array that it reads.
 
 What is tabulated is the ratio of each quantity to its closed form for the modulus at zero strain:
-smooth, near 1, finite at d → 0, and exact for a constant modulus. The coordinates make it analytic
-up to the edges of the domain: the height h = (a − d)/a, in pieces that divide each octave evenly,
-and y = u/h with u = √(1 − ρ²/(a² cos² θ)), which is 1 at θ = 0, 0 at the limit, even in θ, and the
-peak strain is 1 − u. Towards h = 0 the ratios are A + B log h with smooth A and B; below the lowest
-octave both are tabulated.
+smooth, near 1, finite at d → 0, and exact for a constant modulus, which has no coefficients. The
+coordinates make it analytic up to the edges of the domain: the height h = (a − d)/a, and y = u/h
+with u = √(1 − ρ²/(a² cos² θ)), which is 1 at θ = 0, 0 at the limit, even in θ, and the peak strain
+is 1 − u. The domain is cut into slabs of h, eight to an octave, which span all of y: where their
+coefficients stand depends on d alone, so that they are read while θ's cosine is being computed.
+Towards h = 0 the ratios are A + B log h with smooth A and B; below the lowest octave both are
+tabulated.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numba
 import numpy as np
@@ -35,41 +37,20 @@ _NEAR = 0.25 * math.pi
 
 START = 16  # of the coefficients in a table's array: a whole number of cache lines
 
-VERSION = 2.0
+VERSION = 3.0
 
 OCTAVES = 3  # of h above the corner
+SLAB_BITS = 3  # 2^3 slabs to an octave
 LOWEST = 0.5**OCTAVES  # h where the corner begins
 LEAST = 0.5**54  # less than any h but 0
 
-# The corner h → 0, the same for all forms: its pieces over y, and the shape of A and of B in each.
-CORNER_PIECES = 2
-CORNER_SHAPE = 8
-
-
-class Form(NamedTuple):
-    """One representation: the shape of its local polynomials in h and y, and their pieces."""
-
-    name: str
-    bits: int  # 2^bits pieces an octave of h
-    y_pieces: int
-
-
-# Forms by number, as the header has it; the number is also that of the shape. The slabs span all of
-# y, so that where their coefficients stand depends on d alone: they are read while θ's cosine is
-# being computed. Their names give the degrees in h and in y.
-FORMS = (
-    Form("closed", 0, 0),
-    Form("bilinear", 3, 16),
-    Form("bicubic", 2, 8),
-    Form("quintic", 2, 4),
-    Form("slab 4-10", 3, 1),
-    Form("slab 6-14", 3, 1),
-    Form("slab 8-19", 3, 1),
-    Form("slab 9-25", 3, 1),
-)
+# The forms of a table, as numbers in SHAPES: the closed form, and slabs by rising degree.
 CLOSED = 0
-# The cubes and quintics have to wait for y, and cost more than a slab that errs less.
-CHEAPEST_FIRST = (0, 1, 4, 5, 6, 7)
+SLABS = (1, 2, 3)
+
+# The corner h → 0, the same for all slabs: its pieces over y, and the shape of A and of B in each.
+CORNER_PIECES = 2
+CORNER_SHAPE = 4
 
 _BLOCK = 256  # points that `lookups` takes at once, so that they stay in the first cache
 _MANTISSA = 52
@@ -82,7 +63,7 @@ class TableHeader(Record):
     """What a table's array starts with."""
 
     format: float  # VERSION
-    form: float  # number in FORMS
+    form: float  # CLOSED, or one of SLABS
     radius: float  # [m]
     modulus: float  # at no strain [Pa]
     inverse_radius: float
@@ -156,67 +137,42 @@ def _sine_cosine(theta: float) -> tuple[float, float]:
 
 
 @inlined_kernel
-def _piece(h: float, bits: int) -> tuple[int, float]:
-    """Number of the piece of h in (LOWEST, 1], and h's place in it from −1 to 1.
+def _slab(h: float) -> tuple[int, float]:
+    """Number of the slab of h in (LOWEST, 1], and h's place in it from −1 to 1.
 
-    From the float's own bits: its exponent is the octave, its mantissa the piece and the place. A
-    piece has its upper end, not its lower one.
+    From the float's own bits: its exponent is the octave, its mantissa the slab and the place. A
+    slab has its upper end, not its lower one.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
-    fraction = ((number << bits) & _FRACTION) | _ONE
-    return number >> (_MANTISSA - bits), 2.0 * float(np.int64(fraction).view(np.float64)) - 3.0
+    fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
+    place = 2.0 * float(np.int64(fraction).view(np.float64)) - 3.0
+    return number >> (_MANTISSA - SLAB_BITS), place
 
 
 @inlined_kernel
 def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
-    """The five ratios by one of the forms that span y. Shapes and strides are literals."""
-    i, x = _piece(h, 3)
+    """The five ratios above the corner. The numbers of shapes are literals."""
+    i, x = _slab(h)
     y = 2.0 * y - 1.0
-    if form == 5:
-        ratios: Ratios = polynomials(p, START + i * SIZES[5], 5, x, y)
-    elif form == 6:
-        ratios = polynomials(p, START + i * SIZES[6], 6, x, y)
-    elif form == 4:
-        ratios = polynomials(p, START + i * SIZES[4], 4, x, y)
-    else:
-        ratios = polynomials(p, START + i * SIZES[7], 7, x, y)
-    return ratios
-
-
-@inner_kernel
-def _from_square(p: Pointer, form: int, h: float, y: float) -> Ratios:
-    """The five ratios by one of the forms in pieces of h and y."""
     if form == 1:
-        i, x = _piece(h, 3)
-        j, y = _share(y, 16)
-        ratios: Ratios = polynomials(p, START + (16 * i + j) * SIZES[1], 1, x, y)
+        ratios: Ratios = polynomials(p, START + i * SIZES[1], 1, x, y)
     elif form == 2:
-        i, x = _piece(h, 2)
-        j, y = _share(y, 8)
-        ratios = polynomials(p, START + (8 * i + j) * SIZES[2], 2, x, y)
+        ratios = polynomials(p, START + i * SIZES[2], 2, x, y)
     else:
-        i, x = _piece(h, 2)
-        j, y = _share(y, 4)
-        ratios = polynomials(p, START + (4 * i + j) * SIZES[3], 3, x, y)
+        ratios = polynomials(p, START + i * SIZES[3], 3, x, y)
     return ratios
-
-
-@inlined_kernel
-def _share(y: float, count: int) -> tuple[int, float]:
-    """Which of ``count`` equal parts of [0, 1] has y, and y's place in it from −1 to 1."""
-    y *= count
-    j = min(int(y), count - 1)
-    return j, 2.0 * (y - j) - 1.0
 
 
 @inner_kernel
 def from_corner(p: Pointer, h: float, y: float) -> Ratios:
     """The five ratios A + B log h below the lowest octave."""
-    j, y = _share(y, CORNER_PIECES)
+    y *= CORNER_PIECES
+    j = min(int(y), CORNER_PIECES - 1)
+    y = 2.0 * (y - j) - 1.0
     x = (2.0 / LOWEST) * h - 1.0
     at = int(header(p).corner) + 2 * j * SIZES[CORNER_SHAPE]
-    a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 8, x, y)
-    b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 8, x, y)
+    a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 4, x, y)
+    b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 4, x, y)
     # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
     scale = math.log(max(h, LEAST))
     return (
@@ -237,9 +193,7 @@ def _ratios(
         both = 1.0 / (c * h)
         inverse = both * h
         y = math.sqrt(gap) * both
-        if form > 3:
-            return inverse, from_slab(p, form, h, y)
-        return inverse, _from_square(p, form, h, y)
+        return inverse, from_slab(p, form, h, y)
     inverse = 1.0 / c
     s = abs(s)
     y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
@@ -398,10 +352,8 @@ def lookups(
                 )
                 continue
             r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0
-            if form > 3:
+            if form != CLOSED:
                 r_f, r_u, r_fd, r_ft, r_ut = from_slab(p, form, work[k - start + _BLOCK], y)
-            elif form != CLOSED:
-                r_f, r_u, r_fd, r_ft, r_ut = _from_square(p, form, work[k - start + _BLOCK], y)
             inverse = work[k - start + 2 * _BLOCK]
             slope = work[k - start + 3 * _BLOCK]
             force_d = 2.0 * push * d[k] * inverse

@@ -33,7 +33,7 @@ from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
-_SHAPE = 9
+_SHAPE = 5
 
 Lanes: TypeAlias = tuple[float, float, float, float, float]
 
@@ -124,7 +124,7 @@ def energy_lanes(table: SolidTable, t: float, square: float) -> Lanes:
     """g(t, sin² θ), ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ."""
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
-    lanes: Lanes = polynomials(address(table.coefficients), 0, 9, x, y)
+    lanes: Lanes = polynomials(address(table.coefficients), 0, 5, x, y)
     return lanes
 
 
@@ -135,7 +135,7 @@ def _held(table: SolidTable, t: float, square: float) -> Triple:
         return 1.0, 0.0, 0.0
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
-    q, q_t, q_s, _, _ = polynomials(address(table.stick), 0, 9, x, y)
+    q, q_t, q_s, _, _ = polynomials(address(table.stick), 0, 5, x, y)
     return 1.0 - square * q, -square * q_t, -q - square * q_s
 
 

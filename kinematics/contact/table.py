@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import (
-    FORMS,
+    CLOSED,
     VERSION,
     TableError,
     aligned,
@@ -98,25 +99,19 @@ class ContactTable:
         self._error = (self.max_error,)
 
     @classmethod
-    def build(
-        cls,
-        tip: Fingertip,
-        material: Material,
-        tolerance: float = 1e-9,
-        form: str | None = None,
-    ) -> ContactTable:
-        """Build the cheapest table found within ``tolerance``, relative, on all outputs.
+    def build(cls, tip: Fingertip, material: Material, tolerance: float = 1e-9) -> ContactTable:
+        """Build the table of least degree within ``tolerance``, relative, on all outputs.
 
         ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
 
-        ``form`` asks for one form of FORMS by its name, whatever its cost. Raises TableError,
-        with the best that was reached, when the tolerance can't be met within 256 KiB. For a
-        solid tip they say nothing; it raises MaterialError unless the modulus is constant. A
-        measured tip has its own curves: neither tolerance nor material count.
+        The tolerance is that of the arithmetic alone: a modulus that is 1 % off makes F 1 % off.
+        Raises TableError, with the best that was reached, when the highest degree can't meet it.
+        For a solid tip it says nothing; a solid tip raises MaterialError unless the modulus is
+        constant. A measured tip has its own curves: neither tolerance nor material count.
         """
         if tip.physics != "springs":
             return cls(solid_table(tip, material).array)
-        return cls(build(tip, material, tolerance, form))
+        return cls(build(tip, material, tolerance))
 
     def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
         """The table with its key and checksum, for :meth:`from_bytes` to read again."""
@@ -158,8 +153,11 @@ class ContactTable:
 
     @property
     def form(self) -> str:
-        """Its representation: the name of one of FORMS, or "solid"."""
-        return "solid" if self.is_solid else FORMS[int(self.header.form)].name
+        """Its representation: closed, slab with its degrees in h and in y, or solid."""
+        if self.is_solid:
+            return "solid"
+        shape = SHAPES[int(self.header.form)]
+        return f"slab {shape[0] - 1}-{len(shape) - 1}" if self.header.form != CLOSED else "closed"
 
     @property
     def tip(self) -> Fingertip:

@@ -1,4 +1,4 @@
-"""How contact tables are fitted to the reference integrals, chosen by cost, with their error.
+"""How contact tables are fitted to the reference integrals, chosen by degree, with their error.
 
 A table's error is bounded piece by piece, over the whole domain with its edges: by the sum of the
 Chebyshev coefficients that the piece leaves out, what lies beyond them, and rounding. What it rests
@@ -22,17 +22,16 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.simd import LANES, SHAPES, SIZES, STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import (
-    CHEAPEST_FIRST,
     CLOSED,
     CORNER_PIECES,
     CORNER_SHAPE,
-    FORMS,
     LEAST,
     LOWEST,
     OCTAVES,
+    SLAB_BITS,
+    SLABS,
     START,
     VERSION,
-    Form,
     TableError,
     aligned,
     header_of,
@@ -47,12 +46,14 @@ from softfinger.kinematics.contact.quadrature import (
 
 FloatArray = NDArray[np.float64]
 
-MEMORY_LIMIT = 256 * 1024  # bytes of a table
 ROUNDING = 16.0 * np.finfo(float).eps  # of the closed forms and the kernel's last products
 _MORE_ROWS, _MORE_COLUMNS = 4, 6  # Chebyshev coefficients in h and y beyond those kept
 _CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
 _CORNER_OCTAVES = (-OCTAVES, -4, -6, -9, -14, -24, -54)  # pieces of log₂ h; no float lies below
 _CORNER_NODES = 14  # in each of them
+_SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
+# Of the slabs over h, from LOWEST to 1.
+_EDGES = [LOWEST, *(LOWEST * 2.0**k * (1.0 + part) for k in range(OCTAVES) for part in _SLAB_ENDS)]
 
 
 class _Worst(NamedTuple):
@@ -85,95 +86,61 @@ class LawTerms:
         )
 
 
-def build(tip: Fingertip, material: Material, tolerance: float, form: str | None) -> FloatArray:
-    """The array of the cheapest table within ``tolerance``; see ContactTable.build."""
+def build(tip: Fingertip, material: Material, tolerance: float) -> FloatArray:
+    """The array of the table of least degree within ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
-    names = [known.name for known in FORMS]
-    if form is not None and form not in names:
-        raise TableError(f"no form is called {form!r}; there are {', '.join(names)}")
     law = LawTerms.of(material)
-    numbers = CHEAPEST_FIRST if form is None else (names.index(form),)
-    possible = [number for number in numbers if number != CLOSED or material.is_linear]
-    for number in possible:
-        data = _made(tip, law, number, tolerance, tolerance)
-        if data is not None:
+    forms = (CLOSED,) if material.is_linear else SLABS
+    for form in forms:
+        limit = math.inf if form == forms[-1] else tolerance
+        data = _made(tip, law, form, tolerance, limit)
+        best = header_of(data).max_error
+        if best <= tolerance:
             return data
-    made = [_made(tip, law, number, tolerance, math.inf) for number in possible]
-    best = min((header_of(data).max_error for data in made if data is not None), default=math.inf)
     raise TableError(
-        f"no table within {MEMORY_LIMIT // 1024} KiB reaches {tolerance:.3g} for this material; "
-        f"the best reached {best:.4g}"
+        f"no contact table of this material reaches {tolerance:.3g}; the best reached {best:.4g}"
     )
 
 
-def _made(
-    tip: Fingertip, law: LawTerms, number: int, tolerance: float, limit: float
-) -> FloatArray | None:
-    """The array of one form; None where it is too large, or its error's bound above ``limit``."""
-    data = _header(tip, law, number, tolerance)
-    if data.nbytes > MEMORY_LIMIT:
-        return None
-    worst = _Worst(ROUNDING, 0.5, 0.0)
-    if number != CLOSED:
-        for found in _filled(data, law, number):
-            worst = max(worst, found)
-            if not worst.bound <= limit:
-                return None
-    if not worst.bound <= limit:
-        return None
-    header, theta = header_of(data), _tilt(worst)
-    header.max_error = worst.bound
-    header.worst_d, header.worst_theta = tip.radius * (1.0 - worst.h), theta
-    return data
-
-
-def _header(tip: Fingertip, law: LawTerms, number: int, tolerance: float) -> FloatArray:
-    """The array with its header filled in, coefficients zero."""
-    pieces = _h_pieces(FORMS[number]) * FORMS[number].y_pieces
-    corner = START + pieces * SIZES[number]
-    corner_size = 2 * CORNER_PIECES * SIZES[CORNER_SHAPE] if number != CLOSED else 0
-    data = aligned(corner + corner_size)
+def _made(tip: Fingertip, law: LawTerms, form: int, tolerance: float, limit: float) -> FloatArray:
+    """The array of one form, left unfinished where its error's bound passes ``limit``."""
+    corner = START + len(_EDGES[1:]) * SIZES[form]
+    size = corner + 2 * CORNER_PIECES * SIZES[CORNER_SHAPE]
+    data = aligned(START if form == CLOSED else size)
     header = header_of(data)
-    header.format, header.form, header.tolerance, header.corner = VERSION, number, tolerance, corner
+    header.format, header.form, header.tolerance, header.corner = VERSION, form, tolerance, corner
     header.radius, header.modulus = tip.radius, law.modulus
     header.inverse_radius = 1.0 / tip.radius
+    worst = _Worst(ROUNDING, 0.5, 0.0)
+    for found in _filled(data, law, form) if form != CLOSED else ():
+        worst = max(worst, found)
+        if worst.bound > limit:
+            break
+    header.max_error = worst.bound
+    header.worst_d, header.worst_theta = tip.radius * (1.0 - worst.h), _tilt(worst)
     return data
 
 
-def _h_pieces(form: Form) -> int:
-    return OCTAVES << form.bits
-
-
-def _h_piece(form: Form, i: int) -> tuple[float, float]:
-    octave, part = divmod(i, 1 << form.bits)
-    base = 0.5 ** (OCTAVES - octave)
-    width = base / (1 << form.bits)
-    return base + part * width, base + (part + 1) * width
-
-
-def _filled(data: FloatArray, law: LawTerms, number: int) -> Iterator[_Worst]:
-    """Fill in a form's coefficients piece by piece; yields the bound of each piece's error."""
-    form, columns = FORMS[number], SHAPES[number]
+def _filled(data: FloatArray, law: LawTerms, form: int) -> Iterator[_Worst]:
+    """Fill in the coefficients slab by slab; yields the bound of each one's error."""
+    columns = SHAPES[form]
     # More than needed in each direction, for what is left out.
     rows, width = columns[0] + _MORE_ROWS, len(columns) + _MORE_COLUMNS
     kept = np.zeros((rows, width), dtype=np.bool_)
     for j, count in enumerate(columns):
         kept[:count, j] = True
-    x, y = _nodes(rows)[0], _nodes(width)[0]
+    x, y = _nodes(rows)[0], 0.5 * (_nodes(width)[0] + 1.0)
     at = START
-    for i in range(_h_pieces(form)):
-        low, high = _h_piece(form, i)
+    for low, high in pairwise(_EDGES):
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
-        for j in range(form.y_pieces):
-            places = (j + 0.5 * (y + 1.0)) / form.y_pieces
-            values = _ratios_at(law, h[:, None], places[None, :])
-            terms = _terms(values)
-            numbers = _powers(terms * kept, columns)
-            data[at : at + numbers.size] = numbers
-            at += numbers.size
-            rounding = _rounding(terms * kept, (high + low) / (high - low), form.y_pieces, low)
-            yield _bound(values, terms * ~kept, rounding, h, places)
+        values = _ratios_at(law, h[:, None], y[None, :])
+        terms = _terms(values)
+        numbers = _powers(terms * kept, columns)
+        data[at : at + numbers.size] = numbers
+        at += numbers.size
+        rounding = _rounding(terms * kept, (high + low) / (high - low), 1, low)
+        yield _bound(values, terms * ~kept, rounding, h, y)
     for j in range(CORNER_PIECES):
         fitted = _corner(law, j)
         numbers = np.concatenate([_powers(part, SHAPES[CORNER_SHAPE]) for part in fitted])

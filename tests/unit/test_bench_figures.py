@@ -123,8 +123,8 @@ def test_growth_has_slopes_and_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(cells.rows) == 21
     for row in errors.rows:
         assert 0.5 < row["median"] / row["Cramér-Rao bound"] < 2.0
-    lookups, sizes, builds = growth.tolerances((1e-3, 1e-9), 1)
-    assert [row["tolerance"] for row in lookups.rows] == [1e-3, 1e-9]
+    lookups, sizes, builds = growth.tolerances((1e-9, 1e-12), 1)
+    assert [row["tolerance"] for row in lookups.rows] == [1e-9, 1e-12]
     assert sizes.rows[0]["median"] < sizes.rows[1]["median"]
     assert len(builds.rows) == 2
 

@@ -30,7 +30,6 @@ from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import address, further
-from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.detection import presses_outside
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.likelihood import accumulate, press
@@ -140,16 +139,7 @@ def _always_packed(daemon: Daemon) -> None:
     publishing._publisher._link.wanted = bit(schema.STATE) | bit(schema.TACTILE)
 
 
-def _tabulated(daemon: Daemon) -> None:
-    """The constant modulus through the form of table that other materials get."""
-    can(daemon)
-    model = daemon.models[0]
-    table = ContactTable.build(model.table.tip, model.material, form="quintic")
-    daemon.loop.perception.filter._tables = (table.data, table.data)
-
-
 ONE = {"scene": {"fingers": ("left",)}}
-CONSTANT = {"material": {"law": "constant"}}
 HOLDING, IDLE, ONE_IDLE = "two fingers holding", "idle and open", "one finger, idle"
 NO_SENSORS, NO_SERVOS = "servos without sensors, idle", "sensors without servos, one tip touched"
 SCENES = {
@@ -177,7 +167,6 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
     ),
     "the fit starts from the last contact": (SCENES[HOLDING], TimedScene(alter=_always_cold)),
     "no blur": (SCENES[HOLDING], TimedScene({"tactile": {"blur": 0.5e-3}})),
-    "a modulus that is constant": (TimedScene(CONSTANT), TimedScene(CONSTANT, alter=_tabulated)),
     "topics without subscribers": (SCENES[HOLDING], TimedScene(alter=_always_packed)),
     "state at 100 Hz, not each tick": (
         TimedScene(topics=("hand/state",)),
