@@ -12,7 +12,7 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import accuracy, bench, measuring, servos, tick
+from softfinger.tools.benchmarks import accuracy, bench, measuring, startup, tick
 from softfinger.tools.benchmarks.measuring import (
     Report,
     Row,
@@ -22,19 +22,6 @@ from softfinger.tools.benchmarks.measuring import (
     slopes,
     slower,
 )
-
-REPORT = """\
-# /dev/cpu_dma_latency set to 0us
-# Histogram
-000000 000000
-000014 000003
-000015 000001
-# Total: 000000004
-# Min Latencies: 00014
-# Avg Latencies: 00022
-# Max Latencies: 00250
-# Histogram Overflows: 00002
-"""
 
 
 def test_a_table_is_aligned_and_leaves_out_what_is_missing() -> None:
@@ -102,14 +89,6 @@ def test_slopes_are_exponents_or_cost_for_each_more() -> None:
     )
 
 
-def test_a_report_of_cyclictest_is_read_with_what_its_histogram_does_not_reach() -> None:
-    assert tick.histogram(REPORT).tolist() == pytest.approx(
-        [14.5e-6, 14.5e-6, 14.5e-6, 15.5e-6, 250e-6, 250e-6]
-    )
-    with pytest.raises(ValueError, match="nothing that can be read"):
-        tick.histogram("usage: cyclictest")
-
-
 # The command line
 
 
@@ -119,7 +98,7 @@ def canned(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 
     def set_time(micros: float) -> None:
         rows = [figure("pipeline alone, nobody subscribed", "µs", [micros] * 5)]
-        table = Report("tick", rows, page=("pipeline",))
+        table = Report("tick", rows)
         monkeypatch.setattr(tick, "measure", lambda brief: [table])
 
     monkeypatch.setattr(bench, "PAGE", ("tick",))
@@ -154,10 +133,10 @@ def test_a_measurement_that_fails_leaves_the_others(
     def let_go(brief: bool) -> list[Report]:
         raise Refused("the hand let go")
 
-    monkeypatch.setattr(servos, "measure", let_go)
-    assert cli.main(["bench", "servos", "tick"]) == 1
+    monkeypatch.setattr(startup, "measure", let_go)
+    assert cli.main(["bench", "startup", "tick"]) == 1
     printed = capsys.readouterr()
-    assert "bench: servos: the hand let go" in printed.err
+    assert "bench: startup: the hand let go" in printed.err
     assert "pipeline alone" in printed.out
 
 

@@ -14,24 +14,18 @@ from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks import accuracy, contact, control, estimator, growth, scenes
 from softfinger.tools.benchmarks.contact import LAW, MODULUS, TIP
-from softfinger.tools.benchmarks.estimator import GRID, LINEAR, NOISE, TRUTH
+from softfinger.tools.benchmarks.estimator import LINEAR, NOISE
 from softfinger.tools.benchmarks.reflex import reaction
 from softfinger.tools.benchmarks.rigs import merged
 
 
 def test_lookups_have_their_errors() -> None:
     tables = contact.measure(brief=True, rounds=1, count=32)
-    errors = {row["name"]: row[contact.ERROR] for table in tables[:3] for row in table.rows}
+    errors = {row["name"]: row[contact.ERROR] for table in tables for row in table.rows}
     assert errors["closed form, constant E"] < 4e-15
     assert 1e-12 < errors["table to 1e-09"] <= 1e-9
     assert errors["table to 1e-12"] <= 1e-12
-    assert errors["quadrature: 18 nodes a piece"] < 1e-13
     assert 1e-12 < errors["RectBivariateSpline: degree 3"] < 1e-7
-    assert all(
-        0.0 < row["median"] <= row["aim ≤"] for row in tables[3].rows if row["unit"] == "KiB"
-    )
-    for table in tables[:2]:
-        assert len(table.on_page) >= len(table.page), "the page's rows are there"
 
 
 def test_compiled_loops_compute_what_they_time() -> None:
@@ -48,24 +42,16 @@ def test_without_scipy_its_rows_are_left_out(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "scipy.interpolate", None)
-    d, theta = contact.points(16)
-    assert list(contact._scipy(d, theta, np.ones((6, 16)))) == []
+    assert contact._scipy() == {}
     assert "pip install '.[dev]'" in capsys.readouterr().err
 
 
-def test_estimates_stand_beside_the_bound(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "cv2", None)
+def test_estimates_stand_beside_the_bound() -> None:
     (table,) = estimator.measure(brief=True, rounds=1)
-    assert "pip install opencv-python-headless" in capsys.readouterr().err
     error = {row["name"]: row.get(estimator.ERROR) for row in table.rows}
     limit = error["Cramér-Rao bound"]
-    for way in ("warm, kernel", "cold, kernel", "warm, call"):
+    for way in ("warm, kernel", "cold, kernel"):
         assert 0.6 * limit < error[f"ml: {way}"] < 1.6 * limit
-    assert error["ml: warm, call"] == pytest.approx(error["ml: warm, kernel"], rel=0.01)
-    for name in ("NumPy moments over a threshold", "SciPy ndimage center_of_mass, label"):
-        assert 2.0 * limit < error[name] < 50.0 * limit
     assert error["decode: cobs"] is None
 
 
@@ -116,17 +102,12 @@ def test_frames_of_a_board_are_what_it_would_send() -> None:
     np.testing.assert_allclose(found[:, :4], seen, rtol=1e-9)
 
 
-def test_growth_has_slopes_and_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(growth, "MATERIALS", {"Table I": LAW})
+def test_growth_has_slopes_and_bounds() -> None:
     cells, errors = growth.cells((16, 24, 32), 1)
     assert all("∝ (cells a side)^" in note for note in cells.notes)
     assert len(cells.rows) == 21
     for row in errors.rows:
         assert 0.5 < row["median"] / row["Cramér-Rao bound"] < 2.0
-    lookups, sizes, builds = growth.tolerances((1e-9, 1e-12), 1)
-    assert [row["tolerance"] for row in lookups.rows] == [1e-9, 1e-12]
-    assert sizes.rows[0]["median"] < sizes.rows[1]["median"]
-    assert len(builds.rows) == 2
 
 
 def test_steps_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,9 +148,3 @@ def test_the_reaction_is_the_first_goal_of_both_that_is_a_quarter_more() -> None
     # 0.82 A before, whatever the bounds' sign; 0.90 and 1.00 A are not a quarter more.
     assert math.isclose(reaction(report(left, right)), 0.006)
     assert reaction(report(left[:4], right[:4])) == math.inf
-
-
-def test_frames_are_those_of_the_truth() -> None:
-    frame = GRID.pressure(TIP, LINEAR, *TRUTH)
-    found = estimator.contact_of(estimator._numpy())(frame)
-    np.testing.assert_allclose(found, TRUTH, rtol=0.03)

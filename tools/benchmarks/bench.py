@@ -21,21 +21,20 @@ if TYPE_CHECKING:
 
 MEASUREMENTS = {
     "contact": "lookup of force and energy, run time against error, beside SciPy",
-    "estimator": "pressure grid to d and tilt, run time against error, beside OpenCV and others",
-    "tick": "the tick back to back, in place and over ptys; wake-ups beside cyclictest",
-    "servos": "read + write of two servos over a pty, beside the plain SDK",
+    "estimator": "pressure grid to d and tilt, run time against error",
+    "tick": "the tick back to back, in place and over ptys",
     "startup": "start to the first published state, memory",
     "control": "what each grip law leaves of an object's angle",
     "reflex": "from a slip's onset to the servos' bytes",
     "scenes": "what each thing that a scene skips saves, a tick and at the first start",
-    "growth": "cost and error against cells, tolerance, subscribers, sensors, rate",
+    "growth": "cost and error against cells, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
     "accuracy": "the estimator over its whole range against the Cramér-Rao bound, ten minutes",
     "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
-PAGE = ("contact", "estimator", "tick", "servos", "startup")
+PAGE = ("contact", "estimator", "tick", "startup")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤")
 _CAMPAIGN = "campaign"
 FAILED, SLOWER = 1, 3  # exit statuses; 2 is for words that are refused
@@ -49,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         nargs="*",
         help=f"what to measure: {single}; without a name one page of the figures that matter, in "
-        f"some two minutes; or '{_CAMPAIGN}' and one of {long}",
+        f"about a minute; or '{_CAMPAIGN}' and one of {long}",
     )
     parser.add_argument(
         "--trials", type=_count, metavar="N", help="trials of each case of a campaign"
@@ -105,11 +104,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.names:
         title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
         print(Report(title, _page(tables)))
-        tables = [
-            table if table.x else replace(table, rows=table.on_page)
-            for table in tables
-            if table.on_page
-        ]
     if arguments.json:
         about = {"machine": _processor(), "cores": os.cpu_count(), "load": load}
         content = about | {"python": platform.python_version(), "rows": rows}
@@ -163,7 +157,7 @@ def _page(tables: list[Report]) -> list[Row]:
         {"name": f"{table.title}: {row['name']}"}
         | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.x) if key}
         for table in tables
-        for row in table.on_page
+        for row in table.rows
     ]
 
 

@@ -29,21 +29,15 @@ class Report:
     """Rows under a title.
 
     ``x`` names the column that the picture draws the medians against, where there is one, with
-    lines and slopes where ``grows``. ``page`` are the beginnings of the names that the page shows.
+    lines and slopes where ``grows``.
     """
 
     title: str
     rows: list[Row]
     x: str = ""
-    page: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     grows: bool = False
     failed: bool = False
-
-    @property
-    def on_page(self) -> list[Row]:
-        """The rows that the page shows."""
-        return [row for row in self.rows if str(row["name"]).startswith(self.page or ("\0",))]
 
     def __str__(self) -> str:
         """Aligned text; numbers with four digits, nothing for None and NaN."""

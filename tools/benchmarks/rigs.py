@@ -335,20 +335,20 @@ class Rig:
         most = 0.0
         for process in (self.daemon, self.hand):
             if process is not None:
-                seconds = busy_seconds(process.pid, waiting=True)
+                seconds = _waited_seconds(process.pid)
                 most = max(most, seconds - self._last_waited.get(process.pid, seconds))
                 self._last_waited[process.pid] = seconds
         return most
 
 
-def busy_seconds(process: int, waiting: bool = False) -> float:
-    """How long a process's threads have run, or been ready to run and did not, altogether [s].
+def _waited_seconds(process: int) -> float:
+    """How long a process's threads have been ready to run and did not, altogether [s].
 
     All of them: while one waits with the interpreter's lock, the others can't go on.
     """
     try:
         tasks = list(Path(f"/proc/{process}/task").iterdir())
-        return 1e-9 * sum(int((task / "schedstat").read_text().split()[waiting]) for task in tasks)
+        return 1e-9 * sum(int((task / "schedstat").read_text().split()[1]) for task in tasks)
     except (OSError, IndexError, ValueError):
         return 0.0
 

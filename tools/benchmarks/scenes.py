@@ -18,8 +18,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +25,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
-from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.compiled.layout import Records
-from softfinger.kinematics.compiled.simd import address, further
-from softfinger.kinematics.estimation.detection import presses_outside
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.kinematics.estimation.likelihood import accumulate, press
-from softfinger.kinematics.estimation.state import EstimatorState
-from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.tools.benchmarks.measuring import Report, Row, Subject, figure, interleave
 from softfinger.tools.benchmarks.rigs import (
     SOFTFINGER,
@@ -87,51 +78,6 @@ def _always_fitted(daemon: Daemon) -> None:
         options.peak_level = options.patch_level = -1e9
 
 
-def _always_cold(daemon: Daemon) -> None:
-    can(daemon)
-    for finger in daemon.loop.perception.fingers:
-        estimator = finger._estimator
-
-        def cold(*arguments: Any, e: Any = estimator, then: Any = estimator.update) -> Any:
-            e.reset()
-            return then(*arguments)
-
-        estimator.update = cold  # type: ignore[assignment,method-assign]
-
-
-def _after_each_fit(more: Callable[[Any, Any], None], daemon: Daemon) -> None:
-    """Have this kernel run over the state of each new estimate."""
-    can(daemon)
-    for finger in daemon.loop.perception.fingers:
-        estimator = finger._estimator
-
-        def both(*arguments: Any, e: Any = estimator, then: Any = estimator.update) -> Any:
-            found = then(*arguments)
-            more(e.state.array, e.arena[0])
-            return found
-
-        estimator.update = both  # type: ignore[assignment,method-assign]
-
-
-@kernel
-def _all_cells(states: Records[EstimatorState], arena: FloatArray) -> None:
-    """One step's sums over the whole grid's cells."""
-    state = states[0]
-    state.fit.count = state.model.rows * state.model.cols
-    packed = further(address(arena), state.at.packed)
-    press(state, packed)
-    accumulate(state, packed)
-
-
-@kernel
-def _second_contact(states: Records[EstimatorState], arena: FloatArray) -> None:
-    """The search for pressure off the footprint, over readings that have none."""
-    state = states[0]
-    centres = further(address(arena), state.at.centres)
-    readings = further(address(arena), state.at.packed)
-    state.estimate.second = presses_outside(None, state, readings, centres, 1e9)
-
-
 def _always_packed(daemon: Daemon) -> None:
     can(daemon)
     publishing = daemon.loop._publishing
@@ -157,15 +103,6 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
         TimedScene(alter=lambda daemon: can(daemon, every_tick=True)),
     ),
     "no contact, no fit": (SCENES[IDLE], TimedScene(holds=False, alter=_always_fitted)),
-    "cells off the footprint": (
-        SCENES[HOLDING],
-        TimedScene(alter=partial(_after_each_fit, _all_cells)),
-    ),
-    "the search for a second contact": (
-        SCENES[HOLDING],
-        TimedScene(alter=partial(_after_each_fit, _second_contact)),
-    ),
-    "the fit starts from the last contact": (SCENES[HOLDING], TimedScene(alter=_always_cold)),
     "no blur": (SCENES[HOLDING], TimedScene({"tactile": {"blur": 0.5e-3}})),
     "topics without subscribers": (SCENES[HOLDING], TimedScene(alter=_always_packed)),
     "state at 100 Hz, not each tick": (

@@ -1,7 +1,6 @@
 """Start-up: from starting the process to the first published state, with cold and warm kernels.
 
-Time and memory (peak resident set) of the daemon and, when cold, of the largest of the processes
-that compile for it; the size of what is kept.
+Time and memory (peak resident set) of the daemon.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import zmq
 
@@ -20,41 +18,27 @@ from softfinger.tools.benchmarks.measuring import Report, figure
 from softfinger.tools.benchmarks.rigs import SOFTFINGER
 
 
-class Start(NamedTuple):
-    """What one start took."""
-
-    seconds: float
-    daemon: float  # MB
-    worker: float  # MB
-
-
 def measure(brief: bool = False) -> list[Report]:
     """Seconds to the first ``hand/state`` of the built-in simulated hand, and what it takes."""
     with tempfile.TemporaryDirectory() as name:
         cold = start(Path(name))
         warm = [start(Path(name)) for _ in range(2 if brief else 5)]
-        kept = sum(file.stat().st_size for file in Path(name, "softfinger").rglob("*"))
     seconds = [
-        figure("cold kernel cache", "s", [cold.seconds], aim=15.0),
-        figure("warm kernel cache", "s", [each.seconds for each in warm], aim=0.8),
+        figure("cold kernel cache", "s", [cold[0]], aim=15.0),
+        figure("warm kernel cache", "s", [each[0] for each in warm], aim=0.8),
     ]
     memory = [
-        figure("daemon's peak, cold", "MB", [cold.daemon], aim=300.0),
-        figure("daemon's peak, warm", "MB", [each.daemon for each in warm], aim=150.0),
-        figure("a compiling process's peak", "MB", [cold.worker]),
-        figure("kernels on disk", "MB", [kept / 1e6]),
+        figure("daemon's peak, cold", "MB", [cold[1]], aim=300.0),
+        figure("daemon's peak, warm", "MB", [each[1] for each in warm], aim=150.0),
     ]
-    return [
-        Report("start to the first state", seconds, page=("",)),
-        Report("memory", memory, page=("daemon",)),
-    ]
+    return [Report("start to the first state", seconds), Report("memory", memory)]
 
 
-def start(folder: Path, *words: str) -> Start:
-    """One start with this folder for kernels and tables; ``words`` go to ``softfinger run``."""
+def start(folder: Path) -> tuple[float, float]:
+    """Seconds and MB of one start with this folder for kernels and tables."""
     stream = f"ipc://{folder}/stream"
     addresses = {"stream.address": stream, "commands.address": f"ipc://{folder}/commands"}
-    words += tuple(w for key, value in addresses.items() for w in ("--set", f"{key}={value}"))
+    words = [word for key, value in addresses.items() for word in ("--set", f"{key}={value}")]
     environment = os.environ | {"XDG_CACHE_HOME": str(folder)}
     for each in ("NUMBA_CACHE_DIR", "PYTHONDONTWRITEBYTECODE"):  # a user has neither
         environment.pop(each, None)
@@ -68,13 +52,11 @@ def start(folder: Path, *words: str) -> Start:
         process = subprocess.Popen(
             [*SOFTFINGER, "run", *words], env=environment, stderr=subprocess.DEVNULL
         )
-        largest = 0.0
         try:
             while not socket.poll(200):
                 if process.poll() is not None:
                     raise RuntimeError(f"the daemon ended with status {process.returncode}")
-                largest = max([largest, *map(_peak, _children(process.pid))])
-            return Start(time.perf_counter() - before, _peak(process.pid), largest)
+            return time.perf_counter() - before, _peak(process.pid)
         finally:
             process.terminate()
             process.wait()
@@ -87,9 +69,3 @@ def _peak(process: int) -> float:
         if found:
             return 1024e-6 * float(rest.split()[0])
     return 0.0
-
-
-def _children(process: int) -> list[int]:
-    with contextlib.suppress(OSError):
-        return list(map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split()))
-    return []

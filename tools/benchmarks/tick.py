@@ -1,56 +1,53 @@
-"""The tick: back to back, in place; and how late it wakes up, beside cyclictest.
+"""The tick: back to back, in place, and with emulated servos over a pty; a second on virtual time.
 
 Back to back the pipeline's ticks follow each other; in place each wakes from the sleep before it,
-as in a running daemon. Both take turns, on canned readings and the same hand.
+as in a running daemon. Both take turns, on canned readings and the same hand. With hardware in the
+loop the servos are emulated by another process: unpaced, and at a baud rate, where their bytes take
+a line's own time.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-import re
-import shutil
-import subprocess
-import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.daemon.clock import RealClock
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
+from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.types import Goal, Reading
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, Row, figure, timed
-from softfinger.tools.benchmarks.rigs import can, hold, must_hold, virtual_daemon
-
-Samples = NDArray[np.float64]
+from softfinger.tools.benchmarks.rigs import HIL, can, emulator, hold, must_hold, virtual_daemon
 
 _PRIORITY = 40  # of SCHED_FIFO
-_LONGEST = 20_000  # µs that cyclictest's histogram reaches
+# Fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6.
+_BITS = 10 * (16 + 36 + 28)
+_IN_TURN = 20  # cycles
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Ticks of a hand that holds an object [µs], a second on virtual time [ms], wake-ups [µs]."""
+    """Ticks of a hand that holds an object [µs], a second on virtual time [ms]."""
     rows = _in_turns(10 if brief else 40)
     with virtual_daemon({}) as daemon:
         hold(daemon)
-        whole = timed(partial(daemon.loop.advance, 1.0), 3 if brief else 20)
-        row = figure("with the simulated hand", "µs", ticks(daemon, 2_000 if brief else 20_000))
-        plant = SimulatedHand(daemon.settings)
-        alone = [timed(partial(plant.advance, 1.0 + k))[0] for k in range(len(whole) + 1)][1:]
-    second = [
-        figure("the whole daemon", "ms", 1e-3 * np.array(whole), 50.0),
-        figure("the plant alone", "ms", 1e-3 * np.array(alone), 5.0),
-    ]
-    rows.append(row)
+        second = timed(partial(daemon.loop.advance, 1.0), 3 if brief else 20)
+        rows.append(figure("with the simulated hand", "µs", ticks(daemon, 2_000)))
+    whole = figure("the whole daemon", "ms", 1e-3 * np.array(second), 50.0)
     return [
-        Report("tick", rows, page=("",)),
-        Report("a second on virtual time", second, page=("",)),
-        wake_ups(*(3, 0.5) if brief else (8, 2.0)),
+        Report("tick", rows),
+        Report("a second on virtual time", [whole]),
+        *(in_the_loop(10 if brief else 60, baud) for baud in (0, 2_000_000)),
     ]
 
 
@@ -133,38 +130,6 @@ def in_place(
     return samples
 
 
-# Wake-ups
-
-
-def wake_ups(rounds: int, seconds: float, rate: float = 1000.0) -> Report:
-    """How late after their deadlines: the daemon's loop, a plain sleep, cyclictest, in turns."""
-    turns: dict[str, Callable[[], Samples]] = {"time.sleep": partial(_plain, seconds, rate)}
-    late: dict[str, list[Samples]] = {}
-    daemons = []
-    try:
-        for priority in (0, _PRIORITY) if may_be_real_time() else (0,):
-            words = f", SCHED_FIFO {priority}" if priority else ""
-            sections = {"loop": {"rate": rate}, "realtime": {"priority": priority}}
-            daemons.append(Daemon(Settings.model_validate(sections), wire=False))
-            turns[f"the daemon's loop{words}"] = partial(_our_loop, daemons[-1], seconds)
-            if shutil.which("cyclictest"):
-                turns[f"cyclictest{words}"] = partial(_cyclictest, seconds, rate, priority)
-        for _ in range(rounds):
-            for name, turn in turns.items():
-                late.setdefault(name, []).append(turn())
-    finally:
-        for daemon in daemons:
-            daemon.close()
-    if not shutil.which("cyclictest"):
-        print("bench tick: no cyclictest here (apt-get install rt-tests)", file=sys.stderr)
-    rows = []
-    for name, found in late.items():
-        all_of_them = 1e6 * np.concatenate(found)
-        tail = {"p99.9": float(np.percentile(all_of_them, 99.9)), "max": float(all_of_them.max())}
-        rows.append(figure(name, "µs", all_of_them, **tail))
-    return Report(f"wake-up late at {rate:g} Hz", rows, page=("",))
-
-
 def may_be_real_time() -> bool:
     """Whether SCHED_FIFO is allowed here."""
     settings = Settings.model_validate({"realtime": {"priority": _PRIORITY}})
@@ -172,54 +137,71 @@ def may_be_real_time() -> bool:
         return any(each.granted and "FIFO" in each.text for each in measures.outcomes)
 
 
-def _our_loop(daemon: Daemon, seconds: float) -> Samples:
-    loop, late = daemon.loop, []
-    tick = loop.tick
+def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
+    """Ticks over ptys of a hand that holds, and what its servos' exchanges take, in turns.
 
-    def kept(now: float) -> float:
-        late.append(loop.state.timing.wake_late_s)
-        return tick(now)
-
-    with RealTime(daemon.settings):
-        loop.advance(0.1)  # after the others' turn the simulated hand is behind
-        loop.tick = kept  # type: ignore[method-assign]
-        loop.advance(seconds)
-        loop.tick = tick  # type: ignore[method-assign]
-    return np.array(late)
-
-
-def _plain(seconds: float, rate: float) -> Samples:
-    late, deadline = [], time.monotonic()
-    for _ in range(round(seconds * rate)):
-        time.sleep(max(deadline - time.monotonic(), 0.0))
-        now = time.monotonic()
-        late.append(now - deadline)
-        deadline = max(deadline + 1.0 / rate, now)
-    return np.array(late)
-
-
-def _cyclictest(seconds: float, rate: float, priority: int) -> Samples:
-    words = ["--interval", f"{1e6 / rate:.0f}", "--loops", f"{seconds * rate:.0f}"]
-    words += ["--priority", str(priority)] if priority else []
-    done = subprocess.run(
-        ["cyclictest", "--quiet", "--mlockall", "--histogram", str(_LONGEST), *words],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return histogram(done.stdout)
-
-
-def histogram(text: str) -> Samples:
-    """The samples [s] of a report of cyclictest, which counts whole µs, rounded down.
-
-    Each counts as its middle; those beyond the histogram all count as the largest.
+    ``baud`` 0 is unpaced; ``changes`` go over the profile. A failed Report where the hand lets go,
+    as on a machine that is busy.
     """
-    found = re.findall(r"^(\d{6})\s+(\d+)\s*$", text, re.MULTILINE)
-    longest = re.search(r"^# Max Latencies: *(\d+)", text, re.MULTILINE)
-    beyond = re.search(r"^# Histogram Overflows: *(\d+)", text, re.MULTILINE)
-    if not found or longest is None:
-        raise ValueError("cyclictest printed nothing that can be read")
-    values = [1e-6 * (int(value) + 0.5) for value, _ in found] + [1e-6 * int(longest[1])]
-    counts = [int(count) for _, count in found] + [int(beyond[1]) if beyond else 0]
-    return np.repeat(values, counts)
+    title = f"hardware in the loop, {f'{1e-6 * baud:g} Mbaud' if baud else 'unpaced'}"
+    in_place: list[float] = []
+    exchanges: list[float] = []
+    back_to_back: list[float] = []
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        stack.enter_context(emulator(folder, HIL, "--baud", str(baud)))
+        daemon = stack.enter_context(Daemon(load(HIL, folder, changes), wire=False))
+        stack.enter_context(RealTime(daemon.settings))
+        loop, clock, state = daemon.loop, daemon.clock, daemon.loop.state
+        try:
+            hold(daemon)
+        except SoftfingerError as error:
+            return Report(title, [], notes=(str(error),), failed=True)
+        servos: Any = loop.servos
+        loop.servos = shared = _Timed(servos)
+
+        def cycle() -> None:
+            servos.read(state.reading)
+            servos.write(state.goal)
+
+        deadline = clock.now()
+        for _ in range(turns):
+            for _ in range(_IN_TURN):
+                deadline = max(deadline + loop.period, clock.now())
+                clock.sleep_until(deadline)
+                shared.spent = 0.0
+                in_place += timed(lambda: loop.tick(clock.now()))
+                exchanges.append(shared.spent)
+            back_to_back += timed(cycle, _IN_TURN)
+        held = state.mode == "holding"
+        loop.command({"command": "stop"})
+        loop.tick(clock.now())
+    if not held:
+        return Report(title, [], notes=("the hand let go",), failed=True)
+    base = float(np.median(back_to_back))
+    rows = [
+        figure("tick", "µs", in_place, None if baud else 1.5 * base),
+        figure("its read + write", "µs", exchanges),
+        figure("read + write back to back", "µs", back_to_back, None if baud else 120.0),
+    ]
+    if baud:
+        over = np.array(back_to_back) / (1e6 * _BITS / baud)
+        rows.append(figure("read + write over its bytes' own time", "×", over, 1.15))
+    return Report(title, rows)
+
+
+class _Timed:
+    """Servos, and the time that was spent in their reads and writes [µs]."""
+
+    def __init__(self, servos: Any) -> None:
+        self._servos = servos
+        self.spent = 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._servos, name)
+
+    def read(self, reading: Reading) -> None:
+        self.spent += timed(lambda: self._servos.read(reading))[0]
+
+    def write(self, goal: Goal) -> None:
+        self.spent += timed(lambda: self._servos.write(goal))[0]
