@@ -23,12 +23,9 @@ from tests.harness.servos import make_bus
 SEEDS = (
     frame(1, framing.READ, struct.pack("<HH", 0, 147)),
     frame(2, framing.WRITE, struct.pack("<HI", reg.GOAL_POSITION, 9)),
-    frame(1, framing.WRITE, struct.pack("<HB", reg.OPERATING_MODE, 16)),
-    frame(1, framing.REG_WRITE, struct.pack("<HB", reg.LED, 1)),
-    frame(2, framing.ACTION),
+    frame(1, framing.WRITE, struct.pack("<HB", reg.OPERATING_MODE, 4)),
     frame(1, framing.REBOOT),
     frame(2, framing.CLEAR, b"\x01DXL\x22"),
-    frame(1, framing.BACKUP, b"\x01CTRL"),
     frame(2, framing.FACTORY_RESET, b"\x02"),
     frame(BROADCAST, framing.PING),
     frame(BROADCAST, framing.SYNC_READ, struct.pack("<HHBB", 126, 10, 1, 2)),

@@ -86,10 +86,6 @@ def test_goals_through_group_writes_and_indirect_addresses() -> None:
     assert hand.report(1)["goal_q"] == pytest.approx([30 * RADIAN] * 2)
     assert hand.report(2)["goal_q"] == pytest.approx([-30 * RADIAN] * 2)  # the right one's sense
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
-    # A registered write is on the wire before its action.
-    kept = struct.pack("<Hi", reg.GOAL_POSITION, 2048 + 90)
-    hand.bus.feed(frame(1, framing.REG_WRITE, kept), hand.t)
-    assert hand.report(1)["goal_q"][1] == pytest.approx(90 * RADIAN)
 
 
 def test_torque_on_far_from_the_goal() -> None:

@@ -84,9 +84,8 @@ def test_other_calls_of_the_sdk_work_through_our_handler(line: Line) -> None:
     assert handler.ping(port, 1) == (1020, OK, 0)
     assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
     assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
-    assert handler.regWriteTxRx(port, 2, reg.LED, 1, [1]) == (OK, 0)
-    assert handler.action(port, 2) == OK
-    # The SDK does not wait for that reply, which must not be taken for the next one's.
+    assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
+    # Nobody waits for that reply, which must not be taken for the next one's.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
     bulk = sdk.GroupBulkRead(port, handler)
     bulk.addParam(1, reg.PRESENT_POSITION, 4)

@@ -22,12 +22,9 @@ INSTRUCTIONS = [
     (BROADCAST, framing.PING, "", "FFFFFD00FE0300 01 3142"),
     (1, framing.READ, "84000400", "FFFFFD00010700 02 84000400 1D15"),
     (1, framing.WRITE, "740000020000", "FFFFFD00010900 03 740000020000 CA89"),
-    (1, framing.REG_WRITE, "6800C8000000", "FFFFFD00010900 04 6800C8000000 AE8E"),
-    (1, framing.ACTION, "", "FFFFFD00010300 05 02CE"),
     (1, framing.FACTORY_RESET, "01", "FFFFFD00010400 06 01 A1E6"),
     (1, framing.REBOOT, "", "FFFFFD00010300 08 2F4E"),
     (1, framing.CLEAR, "0144584C22", "FFFFFD00010800 10 0144584C22 B1DC"),
-    (1, framing.BACKUP, "014354524C", "FFFFFD00010800 20 014354524C 16F5"),
     (BROADCAST, framing.SYNC_READ, "840004000102", "FFFFFD00FE0900 82 840004000102 CEFA"),
     (
         BROADCAST,
@@ -90,7 +87,6 @@ def test_published_status_packets() -> None:
     [
         # Printed with the CRC of the fast sync read example.
         (BROADCAST, framing.FAST_BULK_READ, "0384000400 077C000200 0492000100", "20F2"),
-        (1, framing.BACKUP, "024354524C", "92F5"),
     ],
 )
 def test_published_packets_whose_printed_crc_is_wrong(

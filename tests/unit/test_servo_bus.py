@@ -66,7 +66,6 @@ THREE = {**XC330, "ids": (3, 7, 4), "counts": (166, 2079, 1023)}
         (XC330, "010400 06 01 A1E6", [DONE]),
         (XC330, "010300 08 2F4E", [DONE]),
         (XC330, "010800 10 0144584C22 B1DC", [DONE]),
-        (XC330, "010800 20 014354524C 16F5", [DONE]),
     ],
     ids=[
         "ping",
@@ -77,7 +76,6 @@ THREE = {**XC330, "ids": (3, 7, 4), "counts": (166, 2079, 1023)}
         "factory reset",
         "reboot",
         "clear",
-        "backup",
     ],
 )
 def test_published_exchanges(options: dict[str, Any], asked: str, answers: list[str]) -> None:
@@ -91,11 +89,6 @@ def test_published_writes() -> None:
     assert left.get(reg.GOAL_POSITION) == 512
     assert bus.feed(hexes("FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287"), 0.0) == b""
     assert [servo.table.get(reg.GOAL_POSITION) for servo in bus.servos] == [150, 170]
-    before = left.get(reg.GOAL_VELOCITY)
-    assert bus.feed(hexes("FFFFFD00010900 04 6800C8000000 AE8E"), 0.0) == hexes(DONE)
-    assert (left.get(reg.GOAL_VELOCITY), left.get(reg.REGISTERED_INSTRUCTION)) == (before, 1)
-    assert bus.feed(hexes("FFFFFD00010300 05 02CE"), 0.0) == hexes(DONE)
-    assert (left.get(reg.GOAL_VELOCITY), left.get(reg.REGISTERED_INSTRUCTION)) == (200, 0)
 
 
 def test_published_bulk_read_and_bulk_write() -> None:
@@ -141,14 +134,6 @@ def test_status_return_level(level: int, answers: tuple[bool, bool, bool]) -> No
     )
     assert tuple(bool(reply) for reply in replies) == answers
     assert c.bus.servos[0].table.get(reg.LED) == 1
-
-
-def test_a_shadow_id_obeys_and_never_answers() -> None:
-    c = client()
-    assert c.write(reg.SHADOW_ID, 9, 1, packet_id=2) == 0
-    assert c.send(9, framing.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
-    assert c.send(9, framing.PING) == b""
-    assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [0, 1]
 
 
 def test_a_new_id_takes_effect_after_the_reply_under_the_old_one() -> None:

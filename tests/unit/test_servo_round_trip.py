@@ -25,7 +25,6 @@ DATA = st.one_of(
 SPANS = st.tuples(ADDRESSES, st.integers(1, 30))
 STEPS = st.one_of(
     st.tuples(st.just("write"), st.sampled_from([1, 2]), ADDRESSES, DATA),
-    st.tuples(st.just("registered"), st.sampled_from([1, 2]), ADDRESSES, DATA),
     st.tuples(st.just("sync write"), st.just(0), ADDRESSES, DATA),
     st.tuples(st.just("bulk write"), st.just(0), ADDRESSES, DATA),
     st.tuples(st.just("read"), st.sampled_from([1, 2]), ADDRESSES, st.integers(1, 30)),
@@ -44,7 +43,7 @@ def placed(angles: tuple[float, float]) -> ServoBus:
 def out_of_reach(address: int, data: bytes) -> bool:
     """Whether a write would change who answers to what, which direct access does not know of."""
     span = range(address, address + len(data))
-    kept = (reg.ID, reg.SHADOW_ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
+    kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
     # Indirect addresses could point at those.
     return any(a in span for a in kept) or address >= 168
 
@@ -73,15 +72,6 @@ def test_any_instruction_equals_direct_access(
                     sdk.COMM_SUCCESS,
                     servos[servo_id].write(address, what, t),
                 )
-            elif kind == "registered":
-                result, error = handler.regWriteTxRx(port, servo_id, address, len(what), list(what))
-                error &= 0x7F
-                assert (result, error) == (
-                    sdk.COMM_SUCCESS,
-                    servos[servo_id].register(address, what),
-                )
-                handler.action(port, servo_id)
-                servos[servo_id].action(t)
             else:
                 if kind == "sync write":
                     group = sdk.GroupSyncWrite(port, handler, address, len(what))

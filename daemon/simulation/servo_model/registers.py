@@ -43,7 +43,6 @@ class Item:
     low: int = 0
     high: int = 0
     signed: bool = False
-    backed_up: bool = False  # RAM kept by a control table backup
 
     @property
     def saved(self) -> bool:
@@ -55,14 +54,12 @@ def _read_only(address: int, size: int, default: int = 0, signed: bool = False) 
     return Item(address, size, default=default, signed=signed)
 
 
-def _setting(
-    address: int, size: int, default: int, low: int, high: int, *, backed_up: bool = False
-) -> Item:
-    return Item(address, size, True, default, low, high, low < 0, backed_up)
+def _setting(address: int, size: int, default: int, low: int, high: int) -> Item:
+    return Item(address, size, True, default, low, high, low < 0)
 
 
 def _gain(address: int, default: int) -> Item:
-    return _setting(address, 2, default, 0, _GAIN_MAX, backed_up=True)
+    return _setting(address, 2, default, 0, _GAIN_MAX)
 
 
 def _items_of(model: ServoModel, firmware: int) -> list[Item]:
@@ -76,8 +73,8 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         _setting(reg.BAUD_RATE, 1, 1, 0, model.highest_baud),
         _setting(reg.RETURN_DELAY_TIME, 1, 250, 0, 254),
         _setting(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),
-        _setting(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, 16),
-        _setting(reg.SHADOW_ID, 1, 255, 0, 255),
+        _setting(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, reg.CURRENT_BASED_POSITION_MODE),
+        _setting(reg.SHADOW_ID, 1, 255, 253, 255),
         _setting(reg.PROTOCOL_TYPE, 1, 2, 2, 2),
         _setting(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
         _setting(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
@@ -104,8 +101,8 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         _setting(reg.BUS_WATCHDOG, 1, 0, 0, reg.WATCHDOG_MAX),
         _setting(reg.GOAL_PWM, 2, 885, -885, 885),
         _setting(reg.GOAL_VELOCITY, 4, 0, -model.velocity_max, model.velocity_max),
-        _setting(reg.PROFILE_ACCELERATION, 4, 0, 0, _PROFILE_MAX, backed_up=True),
-        _setting(reg.PROFILE_VELOCITY, 4, 0, 0, _PROFILE_MAX, backed_up=True),
+        _setting(reg.PROFILE_ACCELERATION, 4, 0, 0, _PROFILE_MAX),
+        _setting(reg.PROFILE_VELOCITY, 4, 0, 0, _PROFILE_MAX),
         _setting(reg.GOAL_POSITION, 4, 0, -_MULTI_TURN, _MULTI_TURN),
         _read_only(reg.REALTIME_TICK, 2),
         _read_only(reg.MOVING, 1),
@@ -126,12 +123,12 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
     if model.pwm_slope is not None:
         items.append(_setting(reg.PWM_SLOPE, 1, model.pwm_slope, 1, 255))
     if firmware >= _STARTUP_FIRMWARE:
-        items.append(_setting(reg.STARTUP_CONFIGURATION, 1, 0, 0, 3))
+        items.append(_setting(reg.STARTUP_CONFIGURATION, 1, 0, 0, 0))
         items.append(_read_only(reg.BACKUP_READY, 1))
     highest = model.highest_address(firmware)
     for address, data, entries in model.indirect_blocks(firmware):
         for i in range(entries):
-            items.append(_setting(address + 2 * i, 2, data + i, reg.RAM, highest, backed_up=True))
+            items.append(_setting(address + 2 * i, 2, data + i, reg.RAM, highest))
             items.append(_setting(data + i, 1, 0, 0, 255))
     return sorted(items, key=lambda item: item.address)
 
@@ -161,9 +158,9 @@ class ControlTable:
             for address, data, entries in model.indirect_blocks(firmware)
             for i in range(entries)
         }
+        self._pointers = frozenset(self._indirect.values())
         self._first_indirect = min(self._indirect)
         self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int]]]] = {}
-        self._backup: dict[int, int] = {}
         self.reset()
 
     # --- values ----------------------------------------------------------------------------------
@@ -178,13 +175,13 @@ class ControlTable:
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
-        if item.backed_up:  # indirect addresses are among these
+        if address in self._pointers:
             self._layouts.clear()
 
     def put(self, item: Item, value: int) -> None:
         """Store a value that lies in the item's range."""
         self._pack[item.address](self.memory, item.address, value)
-        if item.backed_up:
+        if item.address in self._pointers:
             self._layouts.clear()
 
     def reset(self, keep: tuple[int, ...] = ()) -> None:
@@ -194,33 +191,10 @@ class ControlTable:
                 self.set(item.address, item.default)
 
     def reset_ram(self) -> None:
-        """RAM as after a power-up: defaults, or the backup where the settings ask for it."""
+        """RAM as after a power-up."""
         for item in self.items:
             if not item.saved:
                 self.set(item.address, item.default)
-        if self._backup:
-            if self.memory[reg.STARTUP_CONFIGURATION] & 2:
-                self._restore(saved=False)
-            self.set(reg.BACKUP_READY, 1)
-
-    def back_up(self) -> None:
-        """Keep EEPROM, and the RAM that the manual names, over reboots."""
-        self._backup = {
-            item.address: self.get(item.address)
-            for item in self.items
-            if item.writable and (item.saved or item.backed_up)
-        }
-        self.set(reg.BACKUP_READY, 1)
-
-    def restore(self) -> bool:
-        """Bring EEPROM back from the backup; False when there is none."""
-        self._restore(saved=True)
-        return bool(self._backup)
-
-    def _restore(self, saved: bool) -> None:
-        for address, value in self._backup.items():
-            if self.at[address].saved == saved:
-                self.set(address, value)
 
     # --- reading ---------------------------------------------------------------------------------
 

@@ -1,8 +1,9 @@
 """One emulated Dynamixel X servo: what its registers do, over a joint of a plant.
 
-Torque, operating modes, limits, profiles, bus watchdog, hardware errors and shutdown, reboot,
-backup; packets belong to :mod:`simulation.servo_model.servo_bus`. Choices of our own, where the
-manuals say nothing: a write that breaks any rule changes nothing at all; torque on after a
+Torque, operating modes, limits, profiles, bus watchdog, hardware errors and shutdown, reboot;
+packets belong to :mod:`simulation.servo_model.servo_bus`. PWM mode, a secondary ID and a startup
+configuration, which no client is known to set, are out of range here. Choices of our own, where
+the manuals say nothing: a write that breaks any rule changes nothing at all; torque on after a
 shutdown is refused with RESULT_FAIL.
 """
 
@@ -39,9 +40,7 @@ _EFFECTIVE = frozenset(  # registers whose writing does more than change them
     )
 )
 _CLEAR_FIRMWARE = 42
-_BACKUP_FIRMWARE = {True: 46, False: 45}  # X330, the others
 _CLEAR_KEY = b"\x01DXL\x22"
-_BACKUP_KEY = b"CTRL"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
@@ -78,7 +77,6 @@ class EmulatedServo:
         self.health = ServoHealth(model)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
-        self._registered: tuple[int, bytes] | None = None
         self._watched = 0.0  # time of the last packet the watchdog knows of
         self._booted = t
         self._boot_at = -math.inf  # a reboot ends then
@@ -95,11 +93,6 @@ class EmulatedServo:
         return self._memory[reg.ID]
 
     @property
-    def shadow_id(self) -> int:
-        """The second ID it obeys without answering; above 252 it has none."""
-        return self._memory[reg.SHADOW_ID]
-
-    @property
     def baud(self) -> int:
         return reg.BAUD_RATES[self._memory[reg.BAUD_RATE]]
 
@@ -112,10 +105,6 @@ class EmulatedServo:
     def status_return_level(self) -> int:
         """0 answers pings only, 1 reads too, 2 everything."""
         return self._memory[reg.STATUS_RETURN_LEVEL]
-
-    def obeys(self, servo_id: int) -> bool:
-        """Whether it does what is asked of ``servo_id``."""
-        return servo_id == self._memory[reg.ID] or servo_id == self._memory[reg.SHADOW_ID]
 
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
         """Whether it answers group reads from ``servo_id``."""
@@ -222,23 +211,6 @@ class EmulatedServo:
         self._joint.drive()
         return framing.OK
 
-    def register(self, address: int, data: bytes) -> int:
-        """Keep a write for :meth:`action`."""
-        error, _ = self._checked(address, data)
-        if error == framing.OK:
-            self._registered = (address, data)
-            self.table.set(reg.REGISTERED_INSTRUCTION, 1)
-        return error
-
-    def action(self, t: float) -> int:
-        """Do the write that was kept."""
-        if self._registered is None:
-            return framing.INSTRUCTION_ERROR
-        address, data = self._registered
-        self._registered = None
-        self.table.set(reg.REGISTERED_INSTRUCTION, 0)
-        return self.write(address, data, t)
-
     def reboot(self, t: float) -> None:
         """Torque off, silence for REBOOT_TIME, then RAM as after power-up."""
         self.table.set(reg.TORQUE_ENABLE, 0)
@@ -272,22 +244,6 @@ class EmulatedServo:
         self.table.set(reg.GOAL_POSITION, self.table.get(reg.GOAL_POSITION) - shift)
         self._joint.profile.hold(self._joint.profile.position - shift)
         self._joint.drive()
-        return framing.OK
-
-    def backup(self, parameters: bytes, t: float) -> int:
-        """Store the control table (1), or restore its EEPROM and reboot (2)."""
-        if self.firmware < _BACKUP_FIRMWARE[self.model.small]:
-            return framing.INSTRUCTION_ERROR
-        if len(parameters) != 5 or parameters[1:] != _BACKUP_KEY or parameters[0] not in (1, 2):
-            return framing.DATA_RANGE
-        if self.torque_on:
-            return framing.RESULT_FAIL
-        if parameters[0] == 1:
-            self.table.back_up()
-            return framing.OK
-        if not self.table.restore():
-            return framing.RESULT_FAIL
-        self.reboot(t)
         return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
@@ -387,7 +343,6 @@ class EmulatedServo:
         """Power-up, or the end of a reboot."""
         table = self.table
         table.reset_ram()
-        self._registered = None
         self.health.restart()
         self._booted = self._watched = t
         self._joint.forget_turns()
@@ -395,8 +350,6 @@ class EmulatedServo:
         self._joint.hold()
         self._next_step = math.inf
         self._next_sense = t + SENSE
-        if table.memory[reg.STARTUP_CONFIGURATION] & 1:
-            table.set(reg.TORQUE_ENABLE, 1)
         self._joint.drive()
 
     # --- what happens by itself ------------------------------------------------------------
@@ -406,8 +359,6 @@ class EmulatedServo:
         table = self.table
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
-        elif self.mode == reg.PWM_MODE:
-            table.set(reg.GOAL_PWM, 0)
         table.set(reg.GOAL_VELOCITY, 0)
         table.set(reg.PROFILE_ACCELERATION, 0)
         table.set(reg.PROFILE_VELOCITY, 0)

@@ -3,6 +3,8 @@
 It takes bytes and the time and gives bytes, so that tests and fuzzers need no port; the
 pseudo-terminal around it is :mod:`simulation.emulator.pty_bus`. In group reads a servo answers
 after it has heard the one named before it; so where one is missing, those after it stay silent.
+Registered writes and control table backups, which no client is known to send, are answered with an
+instruction error.
 """
 
 from __future__ import annotations
@@ -38,12 +40,9 @@ _READS = _GROUP_READS | {framing.PING, framing.READ}
 _TO_ALL = frozenset(  # what a broadcast may ask besides reads, without an answer
     (
         framing.WRITE,
-        framing.REG_WRITE,
-        framing.ACTION,
         framing.FACTORY_RESET,
         framing.REBOOT,
         framing.CLEAR,
-        framing.BACKUP,
     )
 )
 _FACTORY_RESET_GUARD = 42  # firmware that ignores a broadcast reset of everything
@@ -218,8 +217,6 @@ class ServoBus:
                     # The alert bit is taken after the instruction was done.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
-            elif servo.shadow_id == packet.id and instruction != framing.PING:
-                _execute(servo, instruction, packet.parameters, t)
         return _at_once(replies)
 
     def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[TimedReply]:
@@ -301,7 +298,7 @@ def _write_each(
     """What a group write asks of each servo: ID, address, data."""
     for servo_id, address, data in items:
         for servo in servos:
-            if servo.obeys(servo_id):
+            if servo.id == servo_id:
                 servo.write(address, data, t)
 
 
@@ -339,15 +336,10 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
             address, length = _SPAN.unpack(data)
             values = servo.read(address, length, t)
             return (framing.ACCESS, b"") if values is None else (framing.OK, values)
-        case framing.WRITE | framing.REG_WRITE:
+        case framing.WRITE:
             if len(data) < 3:
                 return framing.DATA_LENGTH, b""
-            address = data[0] | data[1] << 8
-            if instruction == framing.WRITE:
-                return servo.write(address, data[2:], t), b""
-            return servo.register(address, data[2:]), b""
-        case framing.ACTION:
-            return servo.action(t), b""
+            return servo.write(data[0] | data[1] << 8, data[2:], t), b""
         case framing.FACTORY_RESET:
             return servo.factory_reset(data, t), b""
         case framing.REBOOT:
@@ -355,8 +347,6 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
             return framing.OK, b""
         case framing.CLEAR:
             return servo.clear(data, t), b""
-        case framing.BACKUP:
-            return servo.backup(data, t), b""
     return framing.INSTRUCTION_ERROR, b""
 
 

@@ -18,7 +18,7 @@ from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
-STEP = 0.001  # s: trajectories, velocity and PWM modes
+STEP = 0.001  # s: trajectories, velocity mode
 OVERLOAD_TIME = 2.0  # s at the current limit
 SENSE = 0.010  # s between two looks
 _VOLTAGE, _HEAT, _OVERLOAD = 0, 2, 5  # bits of the hardware error status
@@ -143,7 +143,7 @@ class ServoJoint:
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             return self.profile.busy
-        return mode in (reg.VELOCITY_MODE, reg.PWM_MODE)
+        return mode == reg.VELOCITY_MODE
 
     def follow(self) -> None:
         """One STEP of whatever moves by itself."""
@@ -170,17 +170,9 @@ class ServoJoint:
         elif mode == reg.CURRENT_MODE:
             current = self._scale.amperes(self.sign * table.get(reg.GOAL_CURRENT))
             self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
-        elif mode == reg.PWM_MODE:
-            self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, self._pwm_current())
         else:
             goal = self._angle(self.profile.position)
             self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
-
-    def _pwm_current(self) -> float:
-        """Current [A] under goal PWM: supply less back-EMF, over the resistance."""
-        duty = self.sign * self._scale.direction * self._table.get(reg.GOAL_PWM) / 885.0
-        speed = float(self._plant.dq[self._joint]) * self._scale.direction * self._speed
-        return self._model.stall_current * (duty - speed)
 
     def _motion(self) -> tuple[int, int, int]:
         """Registers 126, 128 and 132: current (or load), velocity, position."""
