@@ -17,7 +17,7 @@ from matplotlib.text import Text
 from softfinger.daemon.wire import schema
 from softfinger.tools import style
 from softfinger.tools.analysis import plot, plots_model
-from softfinger.tools.analysis.plots_data import MODES, Missing, RecordedRun, load_run
+from softfinger.tools.analysis.plots_data import Missing, RecordedRun, load_run
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.conftest import Inline
@@ -27,7 +27,6 @@ DUE = {
     50: {"command": "arm"},
     60: {"command": "grasp", "force": 6.0},
     700: {"command": "rotate", "angle": 0.1},
-    760: {"command": "grasp", "force": 99.0},  # refused: no target
     1100: {"command": "grasp", "force": 4.0},
     1450: {"command": "release"},
 }
@@ -91,53 +90,12 @@ def test_command_line_writes_every_page_in_print_quality(path: Path, inline: Inl
 
 
 def test_a_page_by_name_as_svg(path: Path, tmp_path: Path, call: Call) -> None:
-    words = ("--pages", "angle", "timing", "--format", "svg", "--from", 1, "--to", 2)
+    words = ("--pages", "angle", "error", "--format", "svg", "--from", 1, "--to", 2)
     assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
     files = sorted((tmp_path / "a" / "b").iterdir())
-    assert [each.name for each in files] == ["angle.svg", "timing.svg"]
+    assert [each.name for each in files] == ["angle.svg", "error.svg"]
     for each in files:
         assert ElementTree.parse(each).getroot().tag.endswith("svg")
-
-
-def test_targets_are_what_was_asked_for_while_the_grip_lasts(run: RecordedRun, path: Path) -> None:
-    seq, mode = run.states["seq"], run.modes
-    force, angle = run.requested_force(), run.requested_angle()
-    gripping = run.gripping
-    assert set(np.unique(force[gripping & (seq < 1100)])) == {6.0}
-    assert set(np.unique(force[gripping & (seq >= 1100)])) == {4.0}
-    assert np.isnan(force[~gripping]).all()
-    assert np.isnan(angle[seq < 700]).all()
-    assert set(np.unique(angle[gripping & (seq >= 700)])) == {0.1}
-    assert np.isnan(angle[mode == MODES.index("releasing")]).all()
-    # A part that begins in the grip knows what was requested before.
-    part = load_run(Recording(path), 1.8, 2.0, None)
-    assert set(np.unique(part.requested_force())) == {6.0}
-    assert set(np.unique(part.requested_angle())) == {0.1}
-
-
-def test_time_page_shows_force_at_its_target(run: RecordedRun) -> None:
-    figure = drawn(run, "time")
-    said = texts(figure)
-    for part in ("force F [N]", "energy U [mJ]", "displacement d [mm]", "rotating", "goal"):
-        assert part in said
-    (t, force) = lines(figure, "left")[0]
-    at = np.searchsorted(t, 1.35)
-    assert force[at] == pytest.approx(6.0, rel=0.05)
-    assert lines(figure, "goal")[0][1][at] == 6.0
-    assert not lines(figure, "requested")  # it was what the hand went to
-    assert np.isnan(force[0])  # nothing is drawn where nothing touches
-
-
-def test_a_goal_that_the_hand_raised_is_shown_beside_what_was_asked_for(run: RecordedRun) -> None:
-    states = dict(run.states)
-    asked = run.requested_force()
-    raised = (run.t > 1.3) & (run.t < 1.5)
-    states["goal_force"] = np.where(raised, 1.4 * asked, asked)
-    figure = drawn(replace(run, states=states), "time")
-    (t, goal), (_, wanted) = lines(figure, "goal")[0], lines(figure, "requested")[0]
-    at = np.searchsorted(t, 1.4)
-    assert (goal[at], wanted[at]) == (pytest.approx(8.4), 6.0)
-    assert np.isnan(wanted[np.searchsorted(t, 1.2)])
 
 
 def test_model_page_has_points_on_the_models_curves(run: RecordedRun) -> None:
@@ -197,29 +155,10 @@ def test_error_page_tells_errors_and_how_honest_the_spread_is(run: RecordedRun) 
     assert 0.0 < np.nanstd(error[holding]) < 60.0
 
 
-def test_timing_page_of_a_real_clock_and_of_none(run: RecordedRun) -> None:
-    assert "none above 0" in texts(drawn(run, "timing"))  # virtual time costs none
-    rng = np.random.default_rng(5)
-    late = rng.lognormal(-12.0, 1.0, run.t.size)
-    busy = run.states | {"wake_late_s": late, "compute_s": 3.0 * late, "tick_s": 0.002 + late}
-    changed = RecordedRun(**{**vars_of(run), "states": busy})
-    figure = drawn(changed, "timing")
-    assert f"median {np.median(late) * 1e6:.3g}" in texts(figure)
-    (table,) = figure.axes[-1].tables
-    cells = [cell.get_text().get_text() for cell in table.get_celld().values()]
-    assert {"p99.9 [µs]", "publish"} <= set(cells)
-    without = RecordedRun(**{**vars_of(run), "stats": None})
-    assert len(drawn(without, "timing").axes) == 3
-
-
-def vars_of(run: RecordedRun) -> dict[str, object]:
-    return {name: getattr(run, name) for name in RecordedRun.__dataclass_fields__}
-
-
 def test_a_gap_in_the_stream_breaks_the_line(run: RecordedRun) -> None:
     keep = (run.t < 1.0) | (run.t > 1.5)
     states = {name: values[keep] for name, values in run.states.items()}
-    part = RecordedRun(**{**vars_of(run), "states": states, "modes": run.modes[keep]})
+    part = replace(run, states=states)
     t, force = part.gapped(part.states["left.force"])
     (at,) = np.flatnonzero(np.isnan(force))
     assert (round(t[at], 1), round(t[at + 1], 1)) == (1.0, 1.5)
@@ -229,21 +168,22 @@ def test_a_gap_in_the_stream_breaks_the_line(run: RecordedRun) -> None:
 
 def test_pages_are_left_out_with_a_word(tmp_path: Path, call: Call) -> None:
     path = tmp_path / "a.mcap"
-    record_hand(path, {50: {"command": "arm"}}, 0.5, without=(schema.TRUTH, schema.SETTINGS))
+    due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 6.0}}
+    record_hand(path, due, 1.5, without=(schema.TRUTH,))
     status, said = call(path, "--out", tmp_path / "out")
     assert status == 0
     drawn = sorted(each.name for each in (tmp_path / "out").iterdir())
-    assert drawn == ["joints.png", "timing.png"]
-    assert "page time left out: no contact in it" in said
+    assert drawn == ["angle.png", "landscape.png"]
     assert "page error left out: no hand/truth in it" in said
     status, said = call(path, "--pages", "error", "--out", tmp_path / "none")
     assert status == 1
+    status, said = call(path, "--pages", "angle", "--to", "0.2", "--out", tmp_path / "none")
+    assert status == 1
+    assert "page angle left out: no contact in it" in said
 
 
 def test_without_settings_there_is_no_model(path: Path, run: RecordedRun) -> None:
-    bare = RecordedRun(
-        **{**vars_of(run), "settings": None, "models": None, "why_no_model": "no reason"}
-    )
+    bare = replace(run, models=None, why_no_model="no reason")
     for page in ("angle", "landscape"):
         with pytest.raises(Missing, match="no reason"):
             plot.pages()[page](bare)
@@ -263,24 +203,24 @@ def test_one_finger_alone(tmp_path: Path) -> None:
 
 
 def test_files_that_are_no_good(tmp_path: Path, path: Path, call: Call) -> None:
-    time = ("--pages", "time", "--out")
+    page = ("--pages", "error", "--out")
     (tmp_path / "empty.mcap").touch()
     RecordingWriter(tmp_path / "nothing.mcap").close()
     for name, reason in (
         ("empty.mcap", "empty"),
         ("none.mcap", "No such file"),
-        ("nothing.mcap", "page time left out: no hand/state in it"),
+        ("nothing.mcap", "page error left out: no hand/state in it"),
     ):
-        status, said = call(tmp_path / name, *time, tmp_path / "out")
+        status, said = call(tmp_path / name, *page, tmp_path / "out")
         assert status == 1
         assert reason in said
     whole = path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
-    status, said = call(tmp_path / "cut.mcap", *time, tmp_path / "cut")
+    status, said = call(tmp_path / "cut.mcap", *page, tmp_path / "cut")
     assert status == 0
     assert "cut short" in said
-    assert (tmp_path / "cut" / "time.png").exists()
+    assert (tmp_path / "cut" / "error.png").exists()
     (tmp_path / "file").touch()
-    status, said = call(path, *time, tmp_path / "file")
+    status, said = call(path, *page, tmp_path / "file")
     assert status == 1
     assert "File exists" in said

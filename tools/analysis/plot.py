@@ -1,4 +1,7 @@
-"""``softfinger plot FILE.mcap``: pictures of a recording."""
+"""``softfinger plot FILE.mcap``: a recording beside the contact model, and its errors.
+
+What is drawn over time alone is left to programs that open the file, Foxglove and PlotJuggler.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +20,16 @@ if TYPE_CHECKING:
     from softfinger.tools.analysis.plots_data import RecordedRun
 
 PAGES = {
-    "time": "force, energy, displacement and the object's angle over time, with their targets",
     "angle": "force and energy against θ beside the model's curves",
     "landscape": "the path over U(d, θ) with its local minimum",
     "error": "estimate minus truth within ± 2σ, of a simulated hand",
-    "joints": "joint angles and currents with their goals, temperatures",
-    "timing": "histograms of tick, compute and wake-up times",
 }
 
 _EPILOG = "pages:\n" + "\n".join(f"  {name:10} {what}" for name, what in PAGES.items())
 _EPILOG += """
 
 A page whose data the recording lacks is left out, with the reason. Needs the extra 'plot'.
+Foxglove and PlotJuggler open the file, too, and draw any field over time.
 Exit status: 0 when at least one page was drawn."""
 
 
@@ -59,10 +60,8 @@ def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
     """What draws each page; matplotlib is imported when one is drawn."""
     from softfinger.tools.analysis.plots_error import draw_error
     from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
-    from softfinger.tools.analysis.plots_time import draw_joints, draw_time, draw_timing
 
-    functions = draw_time, draw_angle, draw_landscape, draw_error, draw_joints, draw_timing
-    return dict(zip(PAGES, functions, strict=True))
+    return dict(zip(PAGES, (draw_angle, draw_landscape, draw_error), strict=True))
 
 
 def run(arguments: argparse.Namespace) -> int:

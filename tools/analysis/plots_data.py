@@ -1,8 +1,7 @@
-"""A recording as columns for pictures: states, truth, statistics, commands, the model."""
+"""A recording as columns for pictures: states, truth, the model."""
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from array import array
@@ -15,11 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
 from softfinger.daemon.loop.process_replay import with_calibrations
 from softfinger.daemon.perception.finger_model import FingerModel, make_models
-from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.reader import Recording
@@ -28,17 +25,8 @@ from softfinger.tools.recordings.recomputed import recorded_settings
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-MODES = tuple(mode.value for mode in Mode)
-GRIPS = (Mode.GRASPING.value, Mode.HOLDING.value, Mode.ROTATING.value)
-
-_TICK = (
-    *("seq", "mono_ns", "timestamp", "tick_s", "compute_s", "wake_late_s", "overruns"),
-    *("goal_force", "goal_angle"),
-)
-_FINGER = (
-    *("valid", "contact", "q", "goal_q", "current", "goal_current", "temperature"),
-    *("d", "theta", "force", "energy", "d_std", "theta_std", "gain"),
-)
+_TICK = ("mono_ns", "timestamp")
+_FINGER = ("valid", "contact", "d", "theta", "force", "energy", "d_std", "theta_std", "gain")
 _OBJECT = ("valid", "angle")
 _TRUE = ("d", "theta", "force")
 _TRUE_OBJECT = ("angle",)
@@ -54,20 +42,14 @@ class RecordedRun:
     """A recording, or a part of it. SI units; ``t`` counts from the recording's first message.
 
     ``states`` and ``truth`` are one array a field, by the names of the stream, nested ones with a
-    dot; ``modes`` are indices into MODES. ``truth`` is empty, and ``stats`` None, where the
-    recording has none. ``commands`` are those that were carried out, in order.
+    dot. ``truth`` is empty where the recording has none.
     """
 
     name: str
-    settings: Settings | None
     models: tuple[FingerModel, FingerModel] | None
     why_no_model: str
     states: dict[str, FloatArray]
-    modes: NDArray[np.int64]
-    faults: list[tuple[float, str]]  # t and reason of each that was latched
     truth: dict[str, FloatArray]
-    stats: dict[str, Any] | None
-    commands: list[dict[str, Any]]
     offset: float  # timestamp at t = 0
 
     @cached_property
@@ -96,38 +78,6 @@ class RecordedRun:
         longest = max(_GAP, 10.0 * float(np.median(steps))) if steps.size else math.inf
         at = np.flatnonzero((steps > longest) | (steps < 0.0)) + 1
         return np.insert(t, at, t[at - 1] if at.size else t[:0]), np.insert(values, at, np.nan)
-
-    @cached_property
-    def gripping(self) -> BoolArray:
-        """Where the hand grasps, holds or rotates an object."""
-        return np.isin(self.modes, [MODES.index(mode) for mode in GRIPS])
-
-    def requested_force(self) -> FloatArray:
-        """The force of the last ``grasp`` while its grip lasts [N], else NaN.
-
-        The grip's goal is more where the tips would slip.
-        """
-        default = math.nan if self.settings is None else self.settings.control.force_default
-        return self._requested("grasp", "force", default)
-
-    def requested_angle(self) -> FloatArray:
-        """The angle of the last ``rotate`` while the grip lasts [rad], else NaN."""
-        return self._requested("rotate", "angle", math.nan)
-
-    def _requested(self, command: str, key: str, default: float) -> FloatArray:
-        """The value in the last such command of the same grip, at each state."""
-        seq = self.states["seq"]
-        requested = np.full(seq.size, np.nan)
-        edges = np.flatnonzero(np.diff(self.gripping)) + 1
-        for first, last in zip([0, *edges], [*edges, seq.size], strict=True):
-            if not self.gripping[first:last].any():
-                continue
-            began = seq[first - 1] if first else -math.inf
-            for each in self.commands:
-                if each["command"] == command and began <= each["tick"] <= seq[last - 1]:
-                    value = json.loads(each["request"]).get(key, default)
-                    requested[first:last][seq[first:last] >= each["tick"]] = value
-        return requested
 
     def matched(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Indices of the states and the truths of the same ticks."""
@@ -166,55 +116,33 @@ def load_run(
     """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
     states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT})
     true_fingers = {f"true_{name}": _TRUE for name in FINGERS}
-    truth = _Columns(("seq", "mono_ns"), {**true_fingers, "true_object": _TRUE_OBJECT})
-    modes, faults, commands = array("q"), [], []
-    stats: dict[str, Any] | None = None
-    fault = ""
-    wanted = {schema.STATE, schema.TRUTH, schema.STATS}
-    for topic, message in recording.messages(wanted, start, end, progress):
-        if topic == schema.TRUTH:
-            truth.take(message)
-        elif topic == schema.STATS:
-            stats = message
-        elif states.take(message):
-            mode = message.get("mode")
-            modes.append(MODES.index(mode) if mode in MODES else -1)
-            before, fault = fault, str(message.get("fault") or "")
-            if fault and fault != before:
-                faults.append((message["timestamp"] - recording.start, fault))
-    # From the file's start on: a request from before the part may still hold in it.
-    for _, message in recording.messages({schema.COMMAND}, end=end):
-        if message.get("ok") is True and isinstance(message.get("tick"), int):
-            commands.append(message)
-    settings, models, why = _model(recording, cache)
+    truth = _Columns(("mono_ns",), {**true_fingers, "true_object": _TRUE_OBJECT})
+    for topic, message in recording.messages({schema.STATE, schema.TRUTH}, start, end, progress):
+        (states if topic == schema.STATE else truth).take(message)
+    models, why = _model(recording, cache)
     return RecordedRun(
         recording.path.name,
-        settings,
         models,
         why,
         states.arrays(),
-        np.array(modes, np.int64),
-        faults,
         truth.arrays() if truth.count else {},
-        stats,
-        commands,
         recording.start,
     )
 
 
 def _model(
     recording: Recording, cache: Path | None
-) -> tuple[Settings | None, tuple[FingerModel, FingerModel] | None, str]:
+) -> tuple[tuple[FingerModel, FingerModel] | None, str]:
     try:
         settings, calibrations = recorded_settings(recording)
     except RecordingError as error:
-        return None, None, str(error).removeprefix(f"{recording.path}: ")
+        return None, str(error).removeprefix(f"{recording.path}: ")
     try:
         with tempfile.TemporaryDirectory() as folder:
             models = make_models(with_calibrations(settings, calibrations, Path(folder)), cache)
     except (SettingsError, TactileError, ValueError) as error:
-        return settings, None, f"its model can't be made: {error}"
-    return settings, models, ""
+        return None, f"its model can't be made: {error}"
+    return models, ""
 
 
 class _Columns:
@@ -227,18 +155,17 @@ class _Columns:
         self._values = array("d")
         self.count = 0
 
-    def take(self, message: dict[str, Any]) -> bool:
-        """One more row; False for a map that is none."""
+    def take(self, message: dict[str, Any]) -> None:
+        """One more row, unless the map lacks a field."""
         try:
             row = [float(message[name]) for name in self._own]
             for part, names in self._nested.items():
                 inner = message[part]
                 row += [float(inner[name]) for name in names]
         except (KeyError, TypeError, ValueError):
-            return False
+            return
         self._values.extend(row)
         self.count += 1
-        return True
 
     def arrays(self) -> dict[str, FloatArray]:
         """By name, float64 [rows]."""

@@ -9,7 +9,7 @@ import numpy as np
 from softfinger.daemon.types import FINGERS
 from softfinger.tools import style
 from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, RecordedRun
-from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
+from softfinger.tools.analysis.plots_model import DEGREES, LINES, time_axis, titled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

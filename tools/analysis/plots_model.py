@@ -16,16 +16,31 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools import style
 from softfinger.tools.analysis.plots_data import FloatArray, RecordedRun
-from softfinger.tools.analysis.plots_time import DEGREES, LINES, time_axis, titled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+DEGREES = 180.0 / np.pi
+LINES: dict[str, dict[str, Any]] = {
+    "left": {"color": style.KINDS[0], "linestyle": "-"},
+    "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
+}
 _POINTS = 700  # of each finger in one panel; more hide each other
 _CURVES = 5
 _SYMBOLS = {"left": "o", "right": "s"}
 _GRID = 241  # of the landscape along each axis
+
+
+def time_axis(panel: Axes, t: FloatArray) -> None:
+    """Label and limits of the time axis."""
+    panel.set_xlabel("time [s]")
+    panel.set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
+
+
+def titled(figure: Figure, run: RecordedRun, text: str) -> None:
+    """The recording's name and ``text`` above a figure."""
+    figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
 def _some(indices: NDArray[np.intp], count: int = _POINTS) -> NDArray[np.intp]:
