@@ -7,12 +7,12 @@ hand lets go where a servo's EEPROM has to be written; nothing is ever stiffened
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.diagnosis.ports import check_latency_timer
-from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
@@ -36,7 +36,7 @@ _LISTEN = 0.5  # s of a board's frames
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
 
 
-def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Result]:
+def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]:
     """Each servo of the scene; where one does not answer, what answers at every rate instead.
 
     ``wait`` [s] is given to each rate that is searched.
@@ -51,21 +51,20 @@ def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Result]:
         if not all(each.answers for each in found):
             results += _search(settings, model, wait) or _blame_power(found)
     except ServoError as error:
-        return [Result("FAIL", "servos", str(error))]
+        return [Finding("FAIL", "servos", str(error))]
     return results
 
 
-def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Result]:
+def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Finding]:
     name = servo.name
     if not servo.answers:
         problem = f"no answer at {settings.servos.baud} baud"
         fix = "check its power and cable, then see what was found below"
-        return [Result("FAIL", name, problem, fix)]
-    results = [_result("FAIL", each) for each in servo.errors]
-    results += [_result("warn", each) for each in servo.notices]
+        return [Finding("FAIL", name, problem, fix)]
+    results = [*servo.errors, *servo.notices]
     if servo.table and not servo.errors:
-        described = Result("pass", name, _described(servo, model))
-        results.append(_result("FAIL", servo.stray) if servo.stray else described)
+        described = Finding("pass", name, _described(servo, model))
+        results.append(servo.stray or described)
     return results
 
 
@@ -78,42 +77,38 @@ def _described(servo: Examined, model: ServoModel) -> str:
     )
 
 
-def _result(status: Status, finding: Finding) -> Result:
-    return Result(status, finding.subject, finding.problem, finding.fix.replace("`", ""))
-
-
-def _search(settings: Settings, model: ServoModel, wait: float) -> list[Result]:
+def _search(settings: Settings, model: ServoModel, wait: float) -> list[Finding]:
     """What answers on the port at any rate that the model has, and what is to be done about it."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, wait, {FACTORY_ID, *servos.ids})
     if not found.servos and not found.garbled:
         problem = f"nothing answers on {servos.port} at any rate"
-        return [Result("FAIL", "servos", problem, "check the bus's power and cable")]
+        return [Finding("FAIL", "servos", problem, "check the bus's power and cable")]
     what = plan(found, settings, model, model.baud_rates)
-    lines = [Result("FAIL", "servos", str(each), ALONE) for each in found.garbled]
+    lines = [Finding("FAIL", "servos", str(each), ALONE) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id
         other = f"servos.baud = {change.servo.baud}" if same else "servos.ids as it is"
         fix = f"softfinger doctor --fix makes it {change.name}: {change}; or set {other}"
-        lines.append(Result("note", "found", str(change.servo), fix))
+        lines.append(Finding("note", "found", str(change.servo), fix))
     for each in what.strangers:
         fix = ALONE if what.missing and each.number == model.number else ""
-        lines.append(Result("note", "found", str(each), fix))
+        lines.append(Finding("note", "found", str(each), fix))
     return lines
 
 
-def _blame_power(examined: list[Examined]) -> list[Result]:
+def _blame_power(examined: list[Examined]) -> list[Finding]:
     """What is most likely where servos are missing and no other ones answer instead."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo answers at any rate"
     if not volts:
-        return [Result("note", "found", problem)]
+        return [Finding("note", "found", problem)]
     fix = "likely the power or cable from one servo to the next: swap it, then look at the supply"
-    return [Result("note", "found", f"{problem}; {min(volts):.1f} V at those that do", fix)]
+    return [Finding("note", "found", f"{problem}; {min(volts):.1f} V at those that do", fix)]
 
 
-def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Result:
+def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Finding:
     """Whether a board sends frames of the settings' grid at their rate; ``listen`` s are heard."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
@@ -126,8 +121,8 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
     except TactileError as error:
         what, _, fix = str(error).rpartition(": ")
         if fix.startswith(("set ", "move ")):
-            return Result("FAIL", name, what, fix)
-        return Result("FAIL", name, str(error), "check tactile.port, its baud and its cable")
+            return Finding("FAIL", name, what, fix)
+        return Finding("FAIL", name, str(error), "check tactile.port, its baud and its cable")
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(listen)
@@ -141,15 +136,15 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Res
     lost = after.get("skipped_bytes", 0) - before.get("skipped_bytes", 0)
     if lost:
         fix = "check its cable and what else loads the USB hub"
-        return Result("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
+        return Finding("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
     # One frame more or less falls into the time that was listened for.
     if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
         text = f"{found}, not {tactile.rate:g}"
-        return Result("warn", name, text, f"set tactile.rate = {rate:.0f}")
-    return Result("pass", name, found)
+        return Finding("warn", name, text, f"set tactile.rate = {rate:.0f}")
+    return Finding("pass", name, found)
 
 
-def repair_latency_timer(path: str, *sysfs: Path) -> Result | None:
+def repair_latency_timer(path: str, *sysfs: Path) -> Finding | None:
     """Set the adapter's latency timer to 1 ms; None when there is nothing to do."""
     place = latency_file(path, *sysfs)
     found = check_latency_timer(path, 1.0, *sysfs)
@@ -160,18 +155,17 @@ def repair_latency_timer(path: str, *sysfs: Path) -> Result | None:
         place.write_text("1")
     except OSError as error:
         problem = f"could not be set: {(error.strerror or 'refused').lower()}"
-        return Result("warn", subject, problem, f"echo 1 | sudo tee {place}")
-    return Result("fixed", subject, "set to 1 ms")
+        return Finding("warn", subject, problem, f"echo 1 | sudo tee {place}")
+    return Finding("fixed", subject, "set to 1 ms")
 
 
-def repair_servos(settings: Settings) -> list[Result]:
+def repair_servos(settings: Settings) -> list[Finding]:
     """Set the scene's servos up as the daemon needs them; one line for each thing done."""
     try:
-        result = provision(settings)
+        found = provision(settings)
     except ServoError as error:
-        return [Result("warn", "servos", f"not repaired: {error}")]
-    problems = [
-        Result("warn", each.subject, f"not repaired: {each.problem}", each.fix.replace("`", ""))
-        for each in result.problems
+        return [Finding("warn", "servos", f"not repaired: {error}")]
+    return [
+        each if each.status == "fixed" else replace(each, text=f"not repaired: {each.text}")
+        for each in found
     ]
-    return problems + [Result("fixed", name, change) for name, change in result.done]

@@ -11,10 +11,10 @@ import resource
 import time
 from pathlib import Path
 
-from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop.realtime import GRANT_LATENCY, GRANT_MEMORY_LOCK, GRANT_PRIORITY
 from softfinger.daemon.loop.warm_up import is_built, parts
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import find_folder
 
 _MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
@@ -23,7 +23,7 @@ _PERIOD = 0.002  # s
 _OLDEST = 1_700_000_000.0  # Unix s: a clock that says less was never set
 
 
-def check_machine() -> list[Result]:
+def check_machine() -> list[Finding]:
     """Every check of this module."""
     return [
         check_scheduling(),
@@ -37,7 +37,7 @@ def check_machine() -> list[Result]:
     ]
 
 
-def check_scheduling() -> Result:
+def check_scheduling() -> Finding:
     """Whether SCHED_FIFO is allowed; it is tried for an instant, on this thread alone."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
@@ -45,41 +45,41 @@ def check_scheduling() -> Result:
     except OSError:
         soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
         problem = f"not allowed (RLIMIT_RTPRIO {soft}): other processes can hold up a tick"
-        return Result("warn", "scheduling", f"SCHED_FIFO is {problem}", GRANT_PRIORITY)
+        return Finding("warn", "scheduling", f"SCHED_FIFO is {problem}", GRANT_PRIORITY)
     os.sched_setscheduler(0, *before)
-    return Result("pass", "scheduling", "SCHED_FIFO is allowed")
+    return Finding("pass", "scheduling", "SCHED_FIFO is allowed")
 
 
-def check_memory_lock(limit: int) -> Result:
+def check_memory_lock(limit: int) -> Finding:
     """Judge RLIMIT_MEMLOCK [bytes], RLIM_INFINITY for none."""
     if os.geteuid() == 0:
-        return Result("pass", "memory lock", "not limited for root")
+        return Finding("pass", "memory lock", "not limited for root")
     if limit == resource.RLIM_INFINITY:
-        return Result("pass", "memory lock", "not limited")
+        return Finding("pass", "memory lock", "not limited")
     size = f"{limit >> 10} KiB"
     if limit >= _MEMORY:
-        return Result("pass", "memory lock", size)
+        return Finding("pass", "memory lock", size)
     problem = f"{size} of {_MEMORY >> 20} MiB may be locked: pages of the loop can be swapped out"
-    return Result("warn", "memory lock", problem, GRANT_MEMORY_LOCK)
+    return Finding("warn", "memory lock", problem, GRANT_MEMORY_LOCK)
 
 
-def check_idle_states(path: Path) -> Result:
+def check_idle_states(path: Path) -> Finding:
     """Whether the processors can be kept out of deep idle states, from which waking takes long."""
     name = str(path)
     if not path.exists():
-        return Result("warn", name, "this kernel has none: wake-ups take what idle states take")
+        return Finding("warn", name, "this kernel has none: wake-ups take what idle states take")
     if os.access(path, os.W_OK):
-        return Result("pass", name, "may be held")
+        return Finding("pass", name, "may be held")
     problem = "no permission to hold it: wake-ups take what idle states take"
-    return Result("warn", name, problem, GRANT_LATENCY)
+    return Finding("warn", name, problem, GRANT_LATENCY)
 
 
-def check_clock_source(path: Path) -> Result:
+def check_clock_source(path: Path) -> Finding:
     """Whether reading the time is cheap and fine enough."""
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     if resolution > 1e-6:
         problem = f"monotonic time has steps of {resolution * 1e6:g} µs, not ≤ 1 µs"
-        return Result("warn", "clock", problem)
+        return Finding("warn", "clock", problem)
     try:
         source = path.read_text().strip()
     except OSError:
@@ -87,17 +87,17 @@ def check_clock_source(path: Path) -> Result:
     if source in ("hpet", "acpi_pm", "jiffies"):
         problem = f"the kernel reads {source}, about a microsecond each time"
         fix = "boot with clocksource=tsc where the processor's is stable"
-        return Result("warn", "clock", problem, fix)
-    return Result("pass", "clock", f"monotonic, {resolution * 1e9:g} ns, source {source}")
+        return Finding("warn", "clock", problem, fix)
+    return Finding("pass", "clock", f"monotonic, {resolution * 1e9:g} ns, source {source}")
 
 
-def check_wall_clock(now: float) -> Result:
+def check_wall_clock(now: float) -> Finding:
     """Whether Unix time ``now`` [s] can be one: it stands in every published message."""
     if now >= _OLDEST:
-        return Result("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
+        return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
     problem = f"says {date}: published timestamps will be wrong"
-    return Result("warn", "wall clock", problem, "sudo timedatectl set-ntp true")
+    return Finding("warn", "wall clock", problem, "sudo timedatectl set-ntp true")
 
 
 def wake_ups() -> list[float]:
@@ -111,27 +111,27 @@ def wake_ups() -> list[float]:
     return late
 
 
-def check_wake_ups(late: list[float]) -> Result:
+def check_wake_ups(late: list[float]) -> Finding:
     """Judge how late wake-ups were [s]: half a tick's period is too late."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
     text = f"late by {middle * 1e6:.0f} µs, at most {worst * 1e6:.0f} µs in {len(late)} ticks"
     if middle < 0.25 * _PERIOD:
-        return Result("pass", "wake-ups", text)
+        return Finding("pass", "wake-ups", text)
     problem = f"{text}: the machine is busy or slow to wake"
-    return Result("warn", "wake-ups", problem, "end what else runs")
+    return Finding("warn", "wake-ups", problem, "end what else runs")
 
 
-def check_kernels(settings: Settings) -> list[Result]:
+def check_kernels(settings: Settings) -> list[Finding]:
     """Whether compiled kernels can be kept, and whether those of this scene are there."""
     try:
         folder = find_folder()
     except (OSError, RuntimeError) as error:
         problem = f"can't be used, so every start compiles: {error}"
         fix = "export NUMBA_CACHE_DIR=FOLDER, one that is yours alone"
-        return [Result("warn", "kernel cache", problem, fix)]
+        return [Finding("warn", "kernel cache", problem, fix)]
     cold = [part.name for part in parts(settings) if not is_built(part, settings)]
     if not cold:
-        return [Result("pass", "kernels", f"compiled, in {folder}")]
+        return [Finding("pass", "kernels", f"compiled, in {folder}")]
     problem = f"{', '.join(cold)} not compiled yet: the next start takes longer"
-    return [Result("warn", "kernels", problem, "softfinger compile, or just start it")]
+    return [Finding("warn", "kernels", problem, "softfinger compile, or just start it")]

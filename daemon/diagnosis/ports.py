@@ -14,9 +14,9 @@ from pathlib import Path
 from serial.tools import list_ports
 
 from softfinger.daemon.client.command_client import NoAnswer, send
-from softfinger.daemon.diagnosis.result import Result, Status
 from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.port import bring_it, latency_file
 from softfinger.daemon.wire.keys import load_client
 
@@ -28,15 +28,15 @@ def serial_ports() -> list[tuple[str, str]]:
     return sorted((port.device, port.description) for port in list_ports.comports())
 
 
-def note_ports() -> Result:
+def note_ports() -> Finding:
     """The ports there are, in one line."""
     found = [
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
-    return Result("note", "serial ports", ", ".join(found) or "none on this machine")
+    return Finding("note", "serial ports", ", ".join(found) or "none on this machine")
 
 
-def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
+def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     """Whether a port is there, may be opened, and nobody else has it; it is not kept open.
 
     ``key`` is the setting that names it, ``mode_of_daemon`` that of the daemon which answers
@@ -48,20 +48,20 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
         dangling = Path(path).is_symlink()
         why = "leads nowhere" if dangling else (error.strerror or "not found").lower()
         fix = f"{bring_it(path)}, or set {key} to one of the ports there are"
-        return Result("FAIL", path, why, fix)
+        return Finding("FAIL", path, why, fix)
     if not stat.S_ISCHR(mode.st_mode):
-        return Result("FAIL", path, "is not a serial port", f"set {key}")
+        return Finding("FAIL", path, "is not a serial port", f"set {key}")
     if not os.access(path, os.R_OK | os.W_OK):
-        return Result("FAIL", path, "no permission to open it", _permission(path, mode))
+        return Finding("FAIL", path, "no permission to open it", _permission(path, mode))
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         if error.errno == errno.EBUSY:
             return _busy(path, mode_of_daemon)
-        return Result("FAIL", path, f"can't be opened: {error.strerror}", "plug it in again")
+        return Finding("FAIL", path, f"can't be opened: {error.strerror}", "plug it in again")
     try:
         if not os.isatty(descriptor):
-            return Result("FAIL", path, "is not a serial port", f"set {key}")
+            return Finding("FAIL", path, "is not a serial port", f"set {key}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return _busy(path, mode_of_daemon)
@@ -70,7 +70,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Result:
     others = users(path)
     if others:
         return _busy(path, mode_of_daemon)
-    return Result("pass", path, "there, may be opened, nobody else has it")
+    return Finding("pass", path, "there, may be opened, nobody else has it")
 
 
 def _permission(path: str, mode: os.stat_result) -> str:
@@ -84,15 +84,17 @@ def _permission(path: str, mode: os.stat_result) -> str:
     return f"sudo usermod -aG {group.gr_name} $USER, then log in again"
 
 
-def _busy(path: str, mode_of_daemon: str) -> Result:
+def _busy(path: str, mode_of_daemon: str) -> Finding:
     others = users(path)
     daemons = [pid for pid, _ in others if _is_daemon(pid)]
     if mode_of_daemon and daemons:
         text = f"the softfinger daemon that runs here has it ({mode_of_daemon}, process "
-        return Result("warn", path, f"{text}{daemons[0]})", "end that one to have its port checked")
+        return Finding(
+            "warn", path, f"{text}{daemons[0]})", "end that one to have its port checked"
+        )
     names = ", ".join(f"process {pid} ({name})" for pid, name in others) or "another process"
     fix = "kill " + " ".join(str(pid) for pid, _ in others) if others else "end that one"
-    return Result("FAIL", path, f"in use by {names}", fix)
+    return Finding("FAIL", path, f"in use by {names}", fix)
 
 
 def _is_daemon(process: int) -> bool:
@@ -157,7 +159,7 @@ def _pseudo_terminal(folder: Path, link: Path) -> int:
 # --- latency timer ---------------------------------------------------------------------------
 
 
-def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Result | None:
+def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
     """Judge a USB adapter's latency timer against the time [s] a reply may take; None without one.
 
     A reply waits in the adapter until the timer is over, so 16 ms hold a read to 60 Hz.
@@ -169,34 +171,34 @@ def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Result
     try:
         latency = int(place.read_text())
     except (OSError, ValueError) as error:
-        return Result("warn", subject, f"can't be read: {error}")
+        return Finding("warn", subject, f"can't be read: {error}")
     if latency <= 1:
-        return Result("pass", subject, f"{latency} ms")
+        return Finding("pass", subject, f"{latency} ms")
     status: Status = "FAIL" if latency * 1e-3 >= reply_timeout else "warn"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
-    return Result(status, subject, f"{latency} ms, so every read takes that long", fix)
+    return Finding(status, subject, f"{latency} ms, so every read takes that long", fix)
 
 
 _PATIENCE = 0.5  # s for a daemon to answer
 
 
-def check_addresses(settings: Settings) -> list[Result]:
+def check_addresses(settings: Settings) -> list[Finding]:
     """Whether the stream's and the commands' address can be bound, and who has them if not."""
     return [_check(settings, "stream"), _check(settings, "commands")]
 
 
-def _check(settings: Settings, section: str) -> Result:
+def _check(settings: Settings, section: str) -> Finding:
     address, key = getattr(settings, section).address, f"{section}.address"
     subject, trouble = f"socket {address}", why_not_free(address)
     if not trouble:
-        return Result("pass", subject, "free")
+        return Finding("pass", subject, "free")
     if trouble != "in use":
-        return Result("FAIL", subject, trouble, f"set {key}")
+        return Finding("FAIL", subject, trouble, f"set {key}")
     if mode := daemon_mode(settings.commands.address, settings.access.keys):
         text = f"a softfinger daemon runs here already ({mode}); a second one will not start"
-        return Result("warn", subject, text, "end that one before you start another")
+        return Finding("warn", subject, text, "end that one before you start another")
     text = "in use by something that is not a softfinger daemon"
-    return Result("FAIL", subject, text, f"end it, or set {key} to another address")
+    return Finding("FAIL", subject, text, f"end it, or set {key} to another address")
 
 
 def daemon_mode(address: str, keys: str = "") -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +11,23 @@ from numpy.typing import NDArray
 from softfinger.daemon.types import Goal, Reading
 
 FloatArray = NDArray[np.float64]
+Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something wrong with, or worth saying about, one part of the hand."""
+    """What was found in one part of the hand or of the machine, and how to put it right.
 
+    ``FAIL`` keeps the daemon from working, ``warn`` makes it work worse, the others are well.
+    """
+
+    status: Status
     subject: str  # as ``servo 1 (left)``
-    problem: str  # what was found, and what was expected
+    text: str  # what was found, and what was expected
     fix: str = ""  # a command or an action; empty when nothing is to be done
 
     def __str__(self) -> str:
-        text = f"{self.subject}: {self.problem}"
+        text = f"{self.subject}: {self.text}"
         return f"{text}: {self.fix}" if self.fix else text
 
 

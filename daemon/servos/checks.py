@@ -85,7 +85,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
                 "answers a ping but no read (status return level 0, two servos with this ID, or a "
                 "bad line)"
             )
-            errors, notices = [Finding(name, why, FIX)], []
+            errors, notices = [Finding("FAIL", name, why, FIX)], []
         found.append(Examined(finger, servo_id, True, table, tuple(errors), tuple(notices), stray))
     return found
 
@@ -96,7 +96,7 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
         return None
     problem = f"an {model.name} has no {reg.MODE_NAMES[mode]} mode"
     return Finding(
-        name, problem, 'use a model that senses current, or set servos.mode = "position"'
+        "FAIL", name, problem, 'use a model that senses current, or set servos.mode = "position"'
     )
 
 
@@ -115,7 +115,7 @@ def check_servo(
     found: list[Finding] = []
 
     def wrong(problem: str, fix: str = FIX) -> None:
-        found.append(Finding(name, problem, fix))
+        found.append(Finding("FAIL", name, problem, fix))
 
     number = table.word(reg.MODEL_NUMBER)
     if number != model.number:
@@ -208,7 +208,7 @@ def notice_servo(
         ),
         (present >= limit - _NEAR_LIMIT, f"{present} °C, near its limit of {limit} °C"),
     )
-    return [Finding(name, text) for true, text in notices if true]
+    return [Finding("warn", name, text) for true, text in notices if true]
 
 
 def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Finding | None:
@@ -221,7 +221,7 @@ def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Fin
         return None
     found, least, most = (f"{math.degrees(angle):.0f}°" for angle in (q, low, high))
     problem = f"the joint is at {found}, not in {least} … {most}"
-    return Finding(name, problem, "turn it there by hand, or correct servos.zero")
+    return Finding("FAIL", name, problem, "turn it there by hand, or correct servos.zero")
 
 
 def latency_of(path: str) -> tuple[float, list[Finding]]:
@@ -234,4 +234,4 @@ def latency_of(path: str) -> tuple[float, list[Finding]]:
     if milliseconds <= 1:
         return milliseconds * 1e-3, []
     problem = f"the adapter's latency timer is {milliseconds} ms, so a read takes that long"
-    return milliseconds * 1e-3, [Finding(path, problem, f"{FIX} sets it to 1 ms")]
+    return milliseconds * 1e-3, [Finding("warn", path, problem, f"{FIX} sets it to 1 ms")]

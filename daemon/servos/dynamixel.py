@@ -143,7 +143,7 @@ class DynamixelServos:
             notices += each.notices
             if not each.answers:
                 fix = "check its cable and ID; `softfinger doctor` looks for it at every rate"
-                errors.append(Finding(each.name, f"no answer at {port.baudrate} baud", fix))
+                errors.append(Finding("FAIL", each.name, f"no answer at {port.baudrate} baud", fix))
         if errors:
             raise ServoError("\n".join(map(str, errors)))
         for joint, each in zip(self._joints, found, strict=True):

@@ -11,7 +11,7 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from dynamixel_sdk.robotis_def import COMM_RX_TIMEOUT
 
@@ -207,23 +207,17 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 # --- setting them up -----------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
-class Provisioned:
-    """What was changed, and what could not be: (servo, change) and findings."""
-
-    done: list[tuple[str, str]] = field(default_factory=list)
-    problems: list[Finding] = field(default_factory=list)
-
-
-def provision(settings: Settings, search_time: float = SEARCH_TIME) -> Provisioned:
+def provision(settings: Settings, search_time: float = SEARCH_TIME) -> list[Finding]:
     """Set each servo of the scene up: ID, rate, mode, no return delay, reads answered, no errors.
 
+    Returns what was ``fixed``, and as ``warn`` what could not be.
     ``search_time`` [s] is given to each rate where a servo has to be searched for.
 
     Raises:
         ServoError: the port can't be opened.
     """
-    servos, result = settings.servos, Provisioned()
+    servos = settings.servos
+    result: list[Finding] = []
     model = by_name(servos.model)
     names = {
         servos.ids[finger]: servo_name(servos.ids[finger], finger)
@@ -236,18 +230,18 @@ def provision(settings: Settings, search_time: float = SEARCH_TIME) -> Provision
         what = plan(found, settings, model, model.baud_rates)
         for change in what.changes:
             _identify(servos.port, change, model, result)
-        result.problems += _unknown(settings, found, what)
+        result += _unknown(settings, found, what)
     with open_line(servos.port, servos.baud) as line:
         for servo_id, name in names.items():
             number = line.ping(servo_id)
             if number is None:
-                if name not in [each.subject for each in result.problems]:
-                    result.problems.append(Finding(name, f"no answer at {servos.baud} baud"))
+                if name not in [each.subject for each in result if each.status == "warn"]:
+                    result.append(Finding("warn", name, f"no answer at {servos.baud} baud"))
             elif number != model.number:
-                problem = Finding(name, f"is not an {model.name}", "set servos.model")
-                result.problems.append(problem)
+                text = f"is not an {model.name}"
+                result.append(Finding("warn", name, text, "set servos.model"))
             elif is_garbled(line, servo_id):
-                result.problems.append(Finding(name, "its replies come damaged", ALONE))
+                result.append(Finding("warn", name, "its replies come damaged", ALONE))
             else:
                 mode = reg.MODE_NUMBERS[servos.mode]
                 _set_up(line, servo_id, name, mode if mode in model.modes else None, result)
@@ -257,21 +251,21 @@ def provision(settings: Settings, search_time: float = SEARCH_TIME) -> Provision
 def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     """Why servos that are still missing are not known."""
     if found.garbled:
-        return [Finding("servos", str(each), ALONE) for each in found.garbled]
+        return [Finding("warn", "servos", str(each), ALONE) for each in found.garbled]
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
     fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
     if not fit:
         fix = "check its power and cable"
-        return [Finding(name, "no answer at any rate", fix) for name in names]
-    return [Finding(name, f"may be any of {fit}", ALONE) for name in names]
+        return [Finding("warn", name, "no answer at any rate", fix) for name in names]
+    return [Finding("warn", name, f"may be any of {fit}", ALONE) for name in names]
 
 
-def _identify(path: str, change: Change, model: ServoModel, result: Provisioned) -> None:
+def _identify(path: str, change: Change, model: ServoModel, result: list[Finding]) -> None:
     """Give a servo its ID and rate."""
     old, new, name = change.servo.id, change.id, change.name
 
     def failed(problem: str, fix: str = "") -> None:
-        result.problems.append(Finding(name, problem, fix))
+        result.append(Finding("warn", name, problem, fix))
 
     if change.baud not in model.baud_rates:
         return failed(f"an {model.name} has no {change.baud} baud", "set servos.baud")
@@ -295,17 +289,17 @@ def _identify(path: str, change: Change, model: ServoModel, result: Provisioned)
     with open_line(path, change.baud) as line:
         if line.ping(new) != model.number:
             return failed(f"no answer after its rate was set to {change.baud} baud")
-    result.done.append((name, str(change)))
+    result.append(Finding("fixed", name, str(change)))
     return None
 
 
 def _set_up(
-    line: ServoLine, servo_id: int, name: str, mode: int | None, result: Provisioned
+    line: ServoLine, servo_id: int, name: str, mode: int | None, result: list[Finding]
 ) -> None:
     """Everything but ID and rate."""
 
     def failed(problem: str) -> None:
-        result.problems.append(Finding(name, problem))
+        result.append(Finding("warn", name, problem))
 
     # A level of 0 leaves reads unanswered, so it is set before anything is read.
     if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
@@ -317,7 +311,7 @@ def _set_up(
         error = reg.hardware_error_names(table[reg.HARDWARE_ERROR_STATUS])
         if not _reboot(line, servo_id):
             return failed(f"no answer after a reboot ({error})")
-        result.done.append((name, f"rebooted, since it had a hardware error: {error}"))
+        result.append(Finding("fixed", name, f"rebooted, since it had a hardware error: {error}"))
     elif table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
     now, drive, delay = (
@@ -334,15 +328,15 @@ def _set_up(
         if line.store(address, {servo_id: bytes((value,))}):
             failed(f"{text} could not be set to {value}")
         else:
-            result.done.append((name, f"{text} → {value}"))
+            result.append(Finding("fixed", name, f"{text} → {value}"))
     return None
 
 
-def _torque_off(line: ServoLine, servo_id: int, name: str, result: Provisioned) -> bool:
+def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]) -> bool:
     if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
-        result.problems.append(Finding(name, "torque could not be switched off"))
+        result.append(Finding("warn", name, "torque could not be switched off"))
         return False
-    result.done.append((name, "torque off, since EEPROM is locked while it is on"))
+    result.append(Finding("fixed", name, "torque off, since EEPROM is locked while it is on"))
     return True
 
 

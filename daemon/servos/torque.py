@@ -155,10 +155,10 @@ class Torque:
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
             if raw is None:
-                found.append(Finding(joint.name, "no answer", "check its cable and power"))
+                found.append(Finding("FAIL", joint.name, "no answer", "check its cable and power"))
             elif raw[0]:
                 error = f"hardware error: {reg.hardware_error_names(raw[0])}"
-                found.append(Finding(joint.name, error, REBOOT_FIX))
+                found.append(Finding("FAIL", joint.name, error, REBOOT_FIX))
         if found:
             raise ServoError("\n".join(map(str, found)))
 

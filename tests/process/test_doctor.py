@@ -16,11 +16,11 @@ import pytest
 
 from softfinger.daemon.diagnosis import devices, machine, ports
 from softfinger.daemon.diagnosis import machine as kernels
-from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
@@ -265,7 +265,7 @@ def latency(tmp_path: Path, value: str) -> tuple[str, Path]:
 def test_latency_timer_is_judged_and_repaired(tmp_path):
     path, sysfs = latency(tmp_path, "16\n")
     slow = ports.check_latency_timer(path, 0.004, sysfs)
-    assert slow.failed
+    assert slow.status == "FAIL"
     assert "softfinger doctor --fix" in slow.fix
     assert ports.check_latency_timer(path, 0.05, sysfs).status == "warn"
     assert devices.repair_latency_timer(path, sysfs).status == "fixed"
@@ -376,7 +376,7 @@ def test_a_running_daemon_is_recognised(addresses):
     assert "runs here already (holding)" in found.text
 
 
-def check(settings: Settings) -> list[Result]:
+def check(settings: Settings) -> list[Finding]:
     return ports.check_addresses(settings)
 
 

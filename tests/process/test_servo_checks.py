@@ -202,7 +202,7 @@ def test_an_adapters_latency_timer_is_asked_to_be_low(
     fix = "`softfinger doctor --fix` sets it to 1 ms"
     assert refusal(bus.path, reply_timeout=0.004)[0] == f"{bus.path}: {text}: {fix}"
     backend = connected(bus)  # a reply may take longer than the timer
-    assert (backend.notices[0].problem, backend.notices[0].fix) == (text, fix)
+    assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
     # The mode is there: a driver then sets the timer to 1 ms by itself.
     asked = []

@@ -122,8 +122,8 @@ class Bus:
     def provision(self, **servos: Any) -> tuple[list[str], list[str]]:
         changed = self.settings.servos.model_copy(update=servos)
         result = provision(self.settings.model_copy(update={"servos": changed}))
-        done = [f"{name}: {change}" for name, change in result.done]
-        return done, [str(each) for each in result.problems]
+        done = [str(each) for each in result if each.status == "fixed"]
+        return done, [str(each) for each in result if each.status == "warn"]
 
     def addresses(self) -> list[tuple[int, int]]:
         return [(each.id, each.baud) for each in self.servos]

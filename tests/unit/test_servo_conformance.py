@@ -314,7 +314,7 @@ def test_position_limits_that_the_joint_does_not_fit_in_are_told(monkeypatch):
         rig.servos.connect()
     table.set(reg.MAX_POSITION_LIMIT, 4095)
     rig.servos.connect()
-    notices = [each.problem for each in rig.servos.notices]
+    notices = [each.text for each in rig.servos.notices]
     assert notices.count("in position mode nothing bounds its current") == 2
     rig.close()
 

@@ -23,8 +23,8 @@ from softfinger.daemon.diagnosis.ports import (
     daemon_mode,
     note_ports,
 )
-from softfinger.daemon.diagnosis.result import Result
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.kernel_build import build_kernels, print_event
@@ -55,17 +55,17 @@ def run(arguments: argparse.Namespace) -> int:
         counts[result.status] = counts.get(result.status, 0) + 1
         print(f"{result.status:5}  {result.subject}: {result.text}", flush=True)
         if result.fix:
-            print(f"       → {result.fix}", flush=True)
+            print(f"       → {result.fix.replace('`', '')}", flush=True)
     print(f"{counts['pass']} passed, {counts['warn']} warnings, {counts['FAIL']} failed")
     return 1 if counts["FAIL"] else 0
 
 
-def results(settings: Settings, fix: bool) -> Iterator[Result]:
+def results(settings: Settings, fix: bool) -> Iterator[Finding]:
     """All checks in the order of what needs what, with what was repaired before them."""
     ports = _ports(settings)
     for kind in KINDS:
         for entries in installed(kind.group).values():
-            yield from (Result("note", kind.group, source(entry)) for entry in entries)
+            yield from (Finding("note", kind.group, source(entry)) for entry in entries)
     yield note_ports()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
     free = {}
@@ -78,7 +78,7 @@ def results(settings: Settings, fix: bool) -> Iterator[Result]:
     yield from _servos(settings, free, fix)
     tactile = settings.tactile
     if not TACTILE[tactile.backend].metal:
-        yield Result("note", "tactile", f"{tactile.backend}: no board to ask")
+        yield Finding("note", "tactile", f"{tactile.backend}: no board to ask")
     else:
         for name in settings.scene.fingers:
             finger = FINGERS.index(name)
@@ -103,7 +103,7 @@ def _ports(settings: Settings) -> list[tuple[str, str]]:
     return ports
 
 
-def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Result]:
+def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
     if fix:
         repaired = repair_latency_timer(path)
         if repaired is not None:
@@ -115,14 +115,14 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Result]:
         yield found
 
 
-def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Result]:
+def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Finding]:
     servos = settings.servos
     if not SERVOS[servos.backend].metal:
-        yield Result("note", "servos", f"{servos.backend}: no servo to ask")
+        yield Finding("note", "servos", f"{servos.backend}: no servo to ask")
         return
     if SERVOS[servos.backend].source:
         text = f"{servos.backend}: a plugin's, which softfinger.testing.check_servos tries"
-        yield Result("note", "servos", text)
+        yield Finding("note", "servos", text)
         return
     if not free[servos.port]:
         return
