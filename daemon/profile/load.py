@@ -7,6 +7,7 @@ What each key allows stands in `profile.settings`, what they don't allow togethe
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -23,16 +24,7 @@ from softfinger.daemon.profile.validation import problems, shown
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
 _DEEPEST = 8  # tables and arrays in each other
-_EXPECTED = (
-    ("Input should ", ""),
-    ("Tuple should have ", ""),
-    ("be ", ""),
-    (" after validation", ""),
-    ("a valid tuple", "an array"),
-    ("a valid integer", "a whole number"),
-    ("a valid ", "a "),
-    ("True or False", "true or false"),
-)
+_LEAD = re.compile(r"\w+ should (be |have )?")  # of pydantic's messages
 
 
 def load(
@@ -196,9 +188,7 @@ def _line(
         return f"{key}: found an unknown key, expected a known one{nearest}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
-    expected = details["msg"]
-    for old, new in _EXPECTED:
-        expected = expected.replace(old, new, 1)
+    expected = _LEAD.sub("", details["msg"], count=1)
     if details["type"] == "less_than_equal" and not above and _is_length(location):
         metres = 1e-3 * float(details["input"])
         expected += f" m; {details['input']:g} mm are {metres:g}" if metres < 1.0 else " m"

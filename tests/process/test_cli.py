@@ -90,7 +90,7 @@ def test_duration_ends_by_itself_and_settings_come_from_the_command_line(
     path = str(profile(""))
     done = inline("run", "--config", path, "--set", "loop.rate=quick", "--set", "tip.radius=9")
     assert done.returncode == 2
-    assert '--set: loop.rate: found "quick", expected a number' in done.stderr
+    assert '--set: loop.rate: found "quick", expected a valid number' in done.stderr
     done = softfinger("run", "--config", path, "--set", "loop.rate=100", "--duration", "0.3")
     assert done.returncode == 0, done.stderr
     assert "simulated, 100 Hz" in done.stderr
@@ -110,7 +110,7 @@ def test_bad_settings_end_it_with_the_whole_report(profile: Profile, inline: Inl
     done = inline("run", "--config", path)
     assert done.returncode == 2
     assert done.stderr.splitlines() == [
-        f'{path}: tip.radius: found "big", expected a number',
+        f'{path}: tip.radius: found "big", expected a valid number',
         f"{path}: lop: found an unknown key, expected a known one; nearest: loop",
     ]
 

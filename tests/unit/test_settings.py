@@ -89,16 +89,16 @@ def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path: Pa
         [
             "hand.pivot_seperation: found an unknown key, expected a known one; "
             "nearest: pivot_separation",
-            'hand.finger_length: found "long", expected a number',
-            "hand.q_min: found [1, 2, 3], expected at most 2 items, not 3",
-            "servos.baud: found 1.5, expected a whole number",
+            'hand.finger_length: found "long", expected a valid number',
+            "hand.q_min: found [1, 2, 3], expected at most 2 items after validation, not 3",
+            "servos.baud: found 1.5, expected a valid integer",
             "servos.ids.1: found 300, expected less than or equal to 252",
             "servos.backend: found \"dynamxl\", expected 'simulated', 'dynamixel' or 'none'",
             "tip.radius: found -1, expected greater than or equal to 0.0001",
             "lop: found an unknown key, expected a known one; nearest: loop",
             "tactile.noise: found nan, expected a finite number",
-            'scene.fingers: found "left", expected an array',
-            "scene.object_model: found 1, expected a boolean",
+            'scene.fingers: found "left", expected a valid tuple',
+            "scene.object_model: found 1, expected a valid boolean",
         ]
     )
 
@@ -175,7 +175,7 @@ def test_dir_fills_the_ports(tmp_path: Path) -> None:
 def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
     lines = report(tmp_path, '[servos]\nids = [3, 3]\n[tip]\nradius = "big"\n')
     assert lines == [
-        'tip.radius: found "big", expected a number',
+        'tip.radius: found "big", expected a valid number',
         "servos.ids: found [3, 3], expected two different ids",
     ]
 
@@ -214,7 +214,7 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> N
         ("[hand]\nfinger_length = 1e300", "hand.finger_length: found 1e+300"),
         ("[tip]\nradius = 1e-300", "tip.radius: found 1e-300"),
         ("[simulation]\ntactile_delay = 1e9", "simulation.tactile_delay: found 1000000000.0"),
-        ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a number"),
+        ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a valid number"),
         ('"\\u001b[31m" = 1', "?[31m: found an unknown key"),
         ("[safety]\nframe_age_hold = 20.0", "safety.frame_age_hold: found 20, expected below"),
         (
@@ -266,7 +266,7 @@ def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> Non
         load(file, changes=["loop.rate=fast", "tip.radios=0.02"])
     assert str(report.value).splitlines() == [
         "--set: tip.radios: found an unknown key, expected a known one; nearest: radius",
-        '--set: loop.rate: found "fast", expected a number',
+        '--set: loop.rate: found "fast", expected a valid number',
     ]
 
 
