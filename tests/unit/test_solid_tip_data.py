@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import softfinger.kinematics.contact as contact
-from softfinger.tools.solid_tip.fit import NU, THETA_MAX, SolidTip, rms_difference
+from research.solid_tip.fit import NU, THETA_MAX, SolidTip, rms_difference
 
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"

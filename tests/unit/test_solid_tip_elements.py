@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softfinger.tools.solid_tip.fit import SolidTip, rms_difference
+from research.solid_tip.fit import SolidTip, rms_difference
 from tests.unit.test_solid_tip_data import CELLS, FILE, PITCH
 
 pytest.importorskip("scipy")
@@ -15,10 +15,10 @@ THETA, D = np.radians(20.0), 0.25
 
 
 def test_a_coarse_mesh_presses_as_the_data_file_says() -> None:
-    from softfinger.tools.solid_tip.contact import TiltedPlane
-    from softfinger.tools.solid_tip.fit import RING_EDGES, Samples
-    from softfinger.tools.solid_tip.green import green
-    from softfinger.tools.solid_tip.ways import StickingPlane, straight
+    from research.solid_tip.contact import TiltedPlane
+    from research.solid_tip.fit import RING_EDGES, Samples
+    from research.solid_tip.green import green
+    from research.solid_tip.ways import StickingPlane, straight
 
     surface = green(rings=12, poisson=0.48, bonded=True, base_harmonics=9)
     press = TiltedPlane(surface, THETA, D).press(D)

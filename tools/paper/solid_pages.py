@@ -1,7 +1,7 @@
 """Figs. 7 and 10 with a tip of solid rubber: what of the paper's measurements does it explain?
 
 Without friction both are run in simulation (`paper.runs`). What a sticking face does depends on its
-way; `solid_tip.ways` has computed the paper's ways, and alternatives, by finite elements.
+way; `research.solid_tip.ways` has computed the paper's ways, and alternatives, by finite elements.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _DOT: dict[str, Any] = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 
 class Way(NamedTuple):
-    """Columns of `solid_tip.ways`, in mm and the paper's degrees, for E = 1 Pa: N and J."""
+    """Columns of `research.solid_tip.ways`: mm, the paper's degrees; N and J for E = 1 Pa."""
 
     d: FloatArray
     theta: FloatArray

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from softfinger.tools.solid_tip.green import FloatArray, Green
+from research.solid_tip.green import FloatArray, Green
 
 BEYOND = 0.06  # cells may touch that far outside of the undeformed overlap [a]
 

@@ -1,6 +1,6 @@
 """What a sticking face does on its way: pressed down at a tilt, rotated, rolled.
 
-``python -m softfinger.tools.solid_tip.ways tools/paper/solid_ways.npz`` writes it: an array for
+``python -m research.solid_tip.ways tools/paper/solid_ways.npz`` writes it: an array for
 each way, with columns d, θ and `Forces`, for E = a = 1. What comes to touch stays at its point of
 the plane until it is pulled. So forces depend on the way, which no function of d and θ tells;
 `solid_tip.npz` has one way alone, straight along the plane's normal.
@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from softfinger.tools.solid_tip.contact import TiltedPlane
-from softfinger.tools.solid_tip.green import FloatArray, Green, green
+from research.solid_tip.contact import TiltedPlane
+from research.solid_tip.green import FloatArray, Green, green
 
 TILTED, ROLLED = np.radians(11.5), np.radians(20.7)  # the paper's path
 TILTS = range(0, 35, 5)  # [°]
@@ -155,9 +155,7 @@ def rows(surface: Green) -> Iterator[tuple[str, float, float, Forces]]:
 
 def main() -> None:
     """Compute all ways of a bonded tip of ν = 0.49 and write them."""
-    parser = argparse.ArgumentParser(
-        prog="python -m softfinger.tools.solid_tip.ways", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m research.solid_tip.ways", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=32, help="elements along the arc")
     arguments = parser.parse_args()

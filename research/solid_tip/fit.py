@@ -17,8 +17,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.tools.solid_tip.contact import Press
-from softfinger.tools.solid_tip.green import GAUSS, FloatArray, quadratic
+from research.solid_tip.contact import Press
+from research.solid_tip.green import GAUSS, FloatArray, quadratic
 
 D_MAX, THETA_MAX = 0.4, np.radians(36.0)  # sin 36° < 1 − D_MAX: the plane stays above the base
 NU = (0.45, 0.4995)

@@ -1,4 +1,4 @@
-"""``python -m softfinger.tools.solid_tip``: compute the solid tip's data anew (extra ``fem``)."""
+"""``python -m research.solid_tip``: compute the solid tip's data anew."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.tools.solid_tip import fit
-from softfinger.tools.solid_tip.contact import TiltedPlane
-from softfinger.tools.solid_tip.fit import SolidTip, rms_difference
-from softfinger.tools.solid_tip.green import green, shear_response
+from research.solid_tip import fit
+from research.solid_tip.contact import TiltedPlane
+from research.solid_tip.fit import SolidTip, rms_difference
+from research.solid_tip.green import green, shear_response
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -24,7 +24,7 @@ BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
 HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are not fitted
 
 NOTES = """Hemisphere of linear elastic rubber pressed by a rigid plane, by finite elements:
-python -m softfinger.tools.solid_tip, {rings} elements along the arc ({sticking} where the face
+python -m research.solid_tip, {rings} elements along the arc ({sticking} where the face
 sticks), {nodes} values of ν. The plane is without friction, or (…-sticking) holds each point where
 it touched, coming straight along its normal from first touch on: T = N sin θ cos θ P[coef_0] is
 the force along (cos θ, 0, −sin θ) against the tip. It is negative.
@@ -90,9 +90,7 @@ def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float
 
 def main() -> None:
     """Compute, fit, write, and print how far the file is from the presses."""
-    parser = argparse.ArgumentParser(
-        prog="python -m softfinger.tools.solid_tip", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=64, help="elements along the arc")
     parser.add_argument("--sticking", type=int, default=48, help="the same where the face sticks")
