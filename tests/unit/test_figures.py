@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from softfinger.tools import cli, style
 from softfinger.tools.paper import appendix, figures
-from softfinger.tools.paper.integrals import double_integrals
+from softfinger.tools.paper.model_pages import double_integrals
 from softfinger.tools.paper.sheets import sheet
 
 # Radius 20 mm, E = 0.304 MPa: d [mm], θ [deg], F [N], U [mJ].

@@ -12,6 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import ArrayLike
 
 from softfinger.kinematics.contact.closed_form import Fingertip, closed_forms
 from softfinger.kinematics.contact.material import (
@@ -20,7 +22,6 @@ from softfinger.kinematics.contact.material import (
     TABLE_I_STRAIN,
     Material,
 )
-from softfinger.tools.paper.integrals import double_integrals
 from softfinger.tools.paper.sheets import (
     DrawnCurve,
     Erratum,
@@ -40,6 +41,7 @@ TIP = Fingertip(radius=0.020)
 MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
 MILLI = 1e-3
 MPA = 1e-6
+_NODES = 64  # of the double integrals
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 CIRCLE: dict[str, Any] = {"marker": "o", "linestyle": "none", "mfc": "none"}
@@ -108,6 +110,35 @@ def _entries(axes: Axes, curve: Sheet, table: Sheet) -> None:
 
 
 # Figs. 4 and 5
+
+
+def double_integrals(
+    radius: float, modulus: float, d: ArrayLike, theta: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """(F, U) [N], [J] of eqs. 3 and 10 as printed, at d [m] and θ [rad], which broadcast.
+
+    By product Gauss quadrature: with the closed forms each is a check of the other.
+
+    Relative error ≤ 1e-10 within 6° of θ's limit and further in; zeros at d = 0.
+    """
+    points, weights = leggauss(_NODES)
+    angle = 0.5 * np.pi * points  # x and y over the ellipse as sines: its rim costs no accuracy
+    weight = 0.5 * np.pi * weights * np.cos(angle)
+    depth, tilt = np.broadcast_arrays(np.asarray(d, float), np.asarray(theta, float))
+    force = np.empty(depth.shape)
+    energy = np.empty(depth.shape)
+    for i in np.ndindex(depth.shape):
+        s, c, h = np.sin(tilt[i]), np.cos(tilt[i]), radius - depth[i]
+        rho = np.sqrt(depth[i] * (radius + h))
+        x = (h * s + rho * c * np.sin(angle))[:, None]
+        b = np.sqrt(np.maximum(rho**2 - ((x - h * s) / c) ** 2, 0.0))  # eq. 6
+        y = b * np.sin(angle)
+        area = (rho * c * weight)[:, None] * b * weight
+        z = np.sqrt(radius**2 - x**2 - y**2)
+        q = (h - x * s) / c  # height of the object's face over the base
+        force[i] = modulus * np.sum((1.0 - q / z) * area)
+        energy[i] = 0.5 * modulus * np.sum((z - 2.0 * q + q**2 / z) * area)  # eq. 9
+    return force, energy
 
 
 @dataclass(frozen=True)
