@@ -38,10 +38,11 @@ class Watched:
     def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self._daemon = Daemon(settings, wire=False)
+        self.control = self._daemon.loop._control
         assert self._daemon.hand is not None
         self.plant = self._daemon.hand
         self.contact_filter = self._daemon.loop.perception.filter
-        self._friction = settings.simulation.tip_friction
+        self.settings = settings
 
     def __enter__(self) -> Watched:
         return self
@@ -80,6 +81,6 @@ class Watched:
         loop, plant = self._daemon.loop, self.plant
         for _ in range(max(round(seconds / loop.period), 1)):
             loop.advance(loop.period)
-            normal = self._friction * np.maximum(plant.normal, 1e-9)
+            normal = self.settings.simulation.tip_friction * np.maximum(plant.normal, 1e-9)
             used = np.where(plant.normal > 0.1, np.abs(plant.tangential) / normal, 0.0)
             yield self.now, tuple(plant.force), float(plant.object_pose[2]), float(used.max())

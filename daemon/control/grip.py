@@ -9,17 +9,15 @@ and one that moves the object (q1 + δ, q2 − δ), so every law has two parts:
    error is integrated and fed antisymmetrically to the joints' goal, joint PD follows that goal.
    The object turns by φ̇ = turn1 q̇1 − turn2 q̇2, against the fingers' own sense.
 
-``control.law`` says where the levers come from: ``two_phase`` takes the force's arm about the
-pivot, ``energy`` the gradient of the tables' energy along the rolling increments, in which the
-tips' moments and shear forces are counted, too. ``position`` commands angles and no torques, for
-comparison.
+With ``control.law = "energy"`` the levers are the gradient of the tables' energy along the rolling
+increments, in which the tips' moments and shear forces are counted, too.
 
-Two laws are blind: until the object is steered by a command, they don't use its angle. ``blind``
-gives both joints one torque, with damping, as in the literature on blind grasping, and is there for
-comparison, too. ``upright`` makes use of the tips' elastic energy: it adds a spring between the
-fingers that puts the energy's minimum where the object stands upright, whatever shear is stuck in
-the tips (`hand.upright`), and shakes the fingers against each other until nothing but the minimum
-holds the object. Then it keeps the fingers' lean.
+``upright`` doesn't use the object's angle until it is steered by a command. It gives both joints
+one torque, with damping, as in the literature on blind grasping, and makes use of the tips' elastic
+energy: it adds a spring between the fingers that puts the energy's minimum where the object stands
+upright, whatever shear is stuck in the tips (`hand.upright`), and shakes the fingers against each
+other until nothing but the minimum holds the object. Then it keeps the fingers' lean. Steered, it
+takes the force's arm about the pivot as its lever.
 """
 
 from __future__ import annotations
@@ -41,9 +39,9 @@ class Grip:
     def __init__(self, settings: Settings, fingers: list[int], grasp: GraspState) -> None:
         """``fingers`` take part, left first; ``grasp`` is read at each tick."""
         control = settings.control
-        both, dt = len(fingers) == 2, 1.0 / settings.loop.rate
+        dt = 1.0 / settings.loop.rate
         self._control = control
-        self._alone = None if both else fingers[0]
+        self._alone = None if len(fingers) == 2 else fingers[0]
         self._grasp = grasp
         self._state = state = GripState()
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of the tips [N]
@@ -65,11 +63,7 @@ class Grip:
         law.friction_speed = control.friction_speed
         law.torque_max = settings.safety.current_max * control.torque_constant
         law.rest = math.exp(-2.0 * dt / control.smooth_time)
-        law.by_energy = control.law == "energy" and both
-        # The torques of joints that are held to angles show no load.
-        law.watched = control.law != "position" and both
         law.upright = control.law == "upright"
-        law.blind = law.upright or control.law == "blind"
         hand = settings.hand
         law.half_separation = 0.5 * hand.pivot_separation
         law.length, law.offset = hand.finger_length, hand.finger_offset
@@ -79,9 +73,9 @@ class Grip:
         state.joint_stiffness = control.joint_stiffness
 
     @property
-    def blind(self) -> bool:
+    def upright(self) -> bool:
         """Whether a grip is not to look at the object's angle by itself."""
-        return self._state.law.blind
+        return self._state.law.upright
 
     @property
     def shaking(self) -> bool:
@@ -163,16 +157,3 @@ class Grip:
             return (torque, 0.0) if finger == 0 else (0.0, torque)
         dq1, dq2 = reading.dq
         return kernels.coast(self._state.array, self._grasp.array, (dq1, dq2))
-
-    def angles(self, pose: ObjectPose) -> tuple[float, float]:
-        """Joint goals [rad] of pure position control.
-
-        What it can't do is why the other laws exist: its finest step is one count of the joints.
-        """
-        return kernels.place(
-            self._state.array,
-            self._grasp.array,
-            self.force.windows,
-            self.angle.windows,
-            pose.angle if pose.valid else math.nan,
-        )

@@ -43,10 +43,7 @@ class GripLaw(Record):
     friction_speed: float  # from which on all of it is given [rad/s]
     torque_max: float  # [N·m]
     rest: float  # what is left of a turning a tick later without frames
-    by_energy: bool  # the lever is the tables' energy's
-    watched: bool  # the margin against slipping is kept
-    blind: bool  # the object's angle is neither looked at nor kept until it is steered
-    upright: bool  # and the fingers' shaking brings it upright
+    upright: bool  # the fingers' shaking brings the object upright, its angle is not looked at
     half_separation: float  # of the hand, in m as its other lengths
     length: float
     offset: float
@@ -74,7 +71,6 @@ class GripState(Record):
     shaken: float  # since the dither began [s]
     seen: float  # when the joints were last read while both pushed alike [s]
     shift: float  # of the offset, to share the force out between the tips [rad]
-    closed: float  # goal of (q1 + q2)/2 in pure position control [rad]
     closing_friction: float  # share of the joints' friction that is given for closing
     torque: Pair  # last of both joints [N·m]
 
@@ -93,7 +89,6 @@ def start(
     setpoint.reset(g.force, force_windows, felt)
     g.integral = g.shift = g.closing_friction = g.shaken = 0.0
     g.offset = 0.5 * (q[0] - q[1])
-    g.closed = mean(q)
     g.steering = False
     g.seen = grasps[0].t
 
@@ -121,13 +116,12 @@ def squeeze(
     """
     g = grips[0]
     grasp = grasps[0]
-    if g.law.watched:
-        g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
-        if g.slip.reflex and g.force.target > g.force.value:
-            setpoint.reset(g.force, force_windows, g.force.target)
+    g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
+    if g.slip.reflex and g.force.target > g.force.value:
+        setpoint.reset(g.force, force_windows, g.force.target)
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
     g.push = wanted + _correction(g, wanted, mean(grasp.force))
-    if g.law.blind and not g.steering:
+    if g.law.upright and not g.steering:
         torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
         return torque1, torque2, g.force.target, g.slip.turned
     lean = 0.0
@@ -174,26 +168,6 @@ def coast_alone(
 ) -> float:
     """In the place of `press` while frames are late."""
     return _torque_alone(grips[0], grasps[0], finger, 0.0, dq)
-
-
-@kernel
-def place(
-    grips: Records[GripState],
-    grasps: Records[GraspState],
-    force_windows: FloatArray,
-    angle_windows: FloatArray,
-    turned: float,
-) -> tuple[float, float]:
-    """Goals of both joints [rad] of pure position control: both setpoints moved into angles."""
-    g = grips[0]
-    grasp = grasps[0]
-    error = setpoint.advance(g.force, force_windows, g.force_rate) - mean(grasp.force)
-    lean = 0.0
-    if g.steering:
-        lean = _steer(g, angle_windows, grasp, turned)
-    way = g.law.force_bandwidth * error / (_mean_stiffness(grasp) * mean(grasp.arm))
-    g.closed += (_closing(grasp, g.force.speed, lean) + way) * g.law.dt
-    return g.closed + g.offset, g.closed - g.offset
 
 
 @inner_kernel
@@ -276,7 +250,7 @@ def _torques(
     error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
     turn = g.joint_stiffness * error
     turn += law.damping * math.sqrt(g.joint_stiffness) * (lean - 0.5 * (dq[0] - dq[1]))
-    lever = grasp.lever if law.by_energy else grasp.arm
+    lever = grasp.arm if law.upright else grasp.lever
     g.torque[0] = lever[0] * g.push + calm + turn + _friction(law, close + lean)
     g.torque[1] = lever[1] * g.push + calm - turn + _friction(law, close - lean)
     return g.torque[0], g.torque[1]
@@ -288,8 +262,8 @@ def _equal_torques(
 ) -> tuple[float, float]:
     """Torques of two fingers that push alike, whatever the object's angle.
 
-    The upright law adds the spring of `hand.upright` between the fingers, and a dither that fades
-    and so leaves the joints' friction without a bias. Then the joints keep to their lean.
+    With the spring of `hand.upright` between the fingers, and a dither that fades and so leaves the
+    joints' friction without a bias. Then the joints keep to their lean.
     """
     law, q = g.law, grasp.q
     close = _closing(grasp, g.force.speed, 0.0)
@@ -301,9 +275,7 @@ def _equal_torques(
     push = arm * g.push + calm * (close - 0.5 * (dq[0] + dq[1])) + _friction(law, close)
     lean = 0.5 * (q[0] - q[1])
     turn = -0.5 * calm * (dq[0] - dq[1])
-    if not law.upright:
-        g.offset = lean
-    elif g.shaken < law.dither_time:
+    if g.shaken < law.dither_time:
         lengths = (law.half_separation, law.length, law.offset, law.radius)
         depth = mean(grasp.d)
         spring = min(

@@ -36,7 +36,6 @@ class Control:
         self._settings = settings
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._grip = Grip(settings, self._fingers, grasp)
-        self._by_position = settings.control.law == "position" and len(self._fingers) == 2
         self._force = settings.control.force_default  # N that the next grip goes to
         self.mode = Mode.DISARMED
         self.torque = False  # what the servos' torque shall be
@@ -196,7 +195,7 @@ class Control:
 
         But for a grip's, which are torques: its joints are damped, and a turn comes to rest.
         """
-        if goal.valid and self._gripping and self._lost == 0.0 and not self._by_position:
+        if goal.valid and self._gripping and self._lost == 0.0:
             self._pull(self._grip.coast(self._reading), goal)
 
     def _rest(self, goal: Goal, current: float) -> None:
@@ -259,11 +258,7 @@ class Control:
         self._lost = 0.0
         if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
             self._is_empty(dt)
-        if self._by_position:
-            goal.q[:] = self._grip.angles(self._pose)
-            goal.current[0] = goal.current[1] = self._settings.safety.current_max
-        else:
-            self._pull(self._grip.torques(self._reading, self._pose, holding), goal)
+        self._pull(self._grip.torques(self._reading, self._pose, holding), goal)
         if self._grip.slipped or self._raised or self._grip.given != self._grip.asked:
             self._watch_slip()
         if self.mode is Mode.ROTATING:
@@ -348,7 +343,7 @@ class Control:
         self._waiting = self._waiting + dt if settled else 0.0
         if self._waiting <= _SETTLED_FOR:
             return
-        if pose.valid and math.isnan(grip.kept_angle) and not grip.blind:
+        if pose.valid and math.isnan(grip.kept_angle) and not grip.upright:
             grip.steer(pose.angle, pose.angle)
         grip.begin_holding()
         self._enter(Mode.HOLDING)

@@ -183,8 +183,6 @@ def _grip(scene: WantedScene) -> None:
     grip.begin_holding()
     grip.torques(reading, pose, True)
     grip.coast(reading)
-    if len(fingers) == len(FINGERS):
-        grip.angles(pose)
 
 
 def _joints(scene: WantedScene) -> None:

@@ -37,7 +37,7 @@ Ratio = Annotated[float, Field(ge=0.1, le=10)]
 Finger = Literal["left", "right"]
 Index = Annotated[int, Field(ge=0, le=255)]
 Cells = tuple[tuple[Index, Index], ...]
-LawName = Literal["energy", "two_phase", "upright", "blind", "position"]
+LawName = Literal["energy", "upright"]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
@@ -254,7 +254,7 @@ class ControlSettings(Section):
     move_speed: Positive = 1.0  # rad/s
     contact_force: Positive = 0.5  # N at which a finger counts as touching
     force_default: Positive = 5.0  # N, grasp without force=
-    law: LawName = "energy"  # "position" and "blind" are for comparison
+    law: LawName = "energy"  # "upright" needs no angle
     force_time: Seconds = 0.1  # s in which the force goes from what is felt to what is wanted
     smooth_time: Seconds = 0.1  # s over which references are averaged: bounds their jerk
     force_gain: NonNegative = 1.0  # N a N of force error

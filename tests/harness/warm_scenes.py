@@ -40,11 +40,11 @@ SCENES: dict[str, dict[str, Any]] = {
     },
     "sensors without servos": {"servos": {"backend": "none"}},
     "servos without sensors": {"tactile": {"backend": "none"}},
-    "moments, imperfect sensors, current mode, two-phase grip": {
+    "moments, imperfect sensors, current mode, upright grip": {
         "estimator": {"method": "moments"},
         "simulation": {"tactile_blur": 5e-4, "tactile_jitter": 0.004},
         "servos": {"mode": "current"},
-        "control": {"law": "two_phase"},
+        "control": {"law": "upright"},
     },
     "position mode": {"servos": {"mode": "position"}},
 }
@@ -111,19 +111,19 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 def calibrated(folder: Path) -> dict[str, Any]:
-    """The position grip, and a left sensor with a calibration, so that its frames are pressures."""
+    """A left sensor with a calibration, so that its frames are pressures."""
     settings = Settings()
     cells = [[0.0] * settings.tactile.cols for _ in range(settings.tactile.rows)]
     tare = TareStep(date=now(), zero=cells, noise=1520.0, frames=16)
     path = folder / "left.json"
     calibration = Calibration(sensor=sensor_of(settings, 0), date=now(), tare=tare)
     save_calibration(path, calibration)
-    return {"tactile": {"calibration": (str(path), "")}, "control": {"law": "position"}}
+    return {"tactile": {"calibration": (str(path), "")}}
 
 
 def main(folder: Path) -> None:
     """Run each scene in a fork, then, on ``folder``'s stand-in hand, the daemon over bytes."""
-    sections = {**SCENES, "calibrated sensor, position grip": calibrated(folder)}
+    sections = {**SCENES, "calibrated sensor": calibrated(folder)}
     scenes = {
         name: Settings.model_validate({"loop": {"clock": "virtual"}, **scene})
         for name, scene in sections.items()

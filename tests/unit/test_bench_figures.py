@@ -122,7 +122,18 @@ def test_steps_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_each_way_to_come_upright_has_settings_that_a_profile_may_have() -> None:
     for law, tips, _ in control.WAYS.values():
-        assert checked(merged({"control": law}, tips)).control.law == law["law"]
+        assert checked(merged({"control": law}, tips)).tip.physics in ("springs", "solid")
+
+
+def test_laws_that_are_there_for_comparison_leave_the_object_askew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = ("position alone", "two-phased", "energy")
+    monkeypatch.setattr(control, "WAYS", {name: control.WAYS[name] for name in names})
+    (table,) = control.measure(brief=True)
+    left = {row["name"]: row["median"] for row in table.rows}
+    assert all(4.0 < each < 5.0 for each in left.values())
+    assert len({round(each, 3) for each in left.values()}) == 3
 
 
 def test_a_saving_is_told_from_chance() -> None:

@@ -35,7 +35,7 @@ def test_outside_of_it_the_reply_says_what_and_why() -> None:
     held = settings(0.040, tip_friction=0.25, object_load=4.8)
     assert Envelope(held).warning(10.0) == ""
     # Another hand, and another law: nothing is known.
-    assert Envelope(settings(0.002, law="position")).warning(10.0) == ""
+    assert Envelope(settings(0.002, law="upright")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
     assert Envelope(other).warning(10.0) == ""
 
@@ -70,6 +70,6 @@ def test_a_map_is_found_printed_drawn_and_read_back(
     with pytest.raises(
         SettingsError, match=r"another hand's: control\.law: found energy, expected"
     ):
-        Envelope(settings(envelope=own, law="position"))
+        Envelope(settings(envelope=own, law="upright"))
     with pytest.raises(SettingsError, match=r"control.envelope: .*none.toml: no map"):
         Envelope(settings(envelope=str(tmp_path / "none.toml")))

@@ -13,6 +13,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_share, upright_spring
+from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.watched import Watched
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
@@ -146,7 +147,7 @@ def test_a_small_hand_brings_its_object_upright() -> None:
 
 
 def test_equal_torques_alone_leave_it_askew() -> None:
-    with Watched({"control": {"law": "blind"}, "simulation": {"object_angle": START}}) as hand:
+    with Watched({"control": EQUAL_TORQUES, "simulation": {"object_angle": START}}) as hand:
         hand.grasp(FORCE)
         hand.run(4.5)
         assert hand.mode == "holding"

@@ -16,6 +16,7 @@ from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.hand.upright import resting_share
+from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
 from softfinger.tools.style import GREY, KINDS, MARKERS
 
@@ -24,7 +25,12 @@ if TYPE_CHECKING:
 
 TILTS = (2.5, 5.0, 10.0, 20.0, 30.0)  # degrees
 STARTS = (-30.0, -20.0, -10.0, -5.0, 0.0, 5.0, 10.0, 20.0, 30.0)
-LAWS = {"blind": "equal torques", "energy": "energy, its angle kept", "upright": "upright"}
+# Settings of `control`, and what the picture calls them.
+LAWS: dict[str, tuple[dict[str, Any], str]] = {
+    "blind": (EQUAL_TORQUES, "equal torques"),
+    "energy": ({}, "energy, its angle kept"),
+    "upright": ({"law": "upright"}, "upright"),
+}
 # What is varied beside the tilt: unit and values.
 ACROSS: dict[str, tuple[str, tuple[float, ...]]] = {
     "offset": ("mm", (-8.0, -4.0, 0.0, 4.0, 8.0)),
@@ -48,7 +54,7 @@ def left(law: str, tilt: float, force: float = _FORCE, **simulation: Any) -> flo
     sections: dict[str, dict[str, Any]] = {
         "loop": {"clock": "virtual"},
         "material": {"law": "constant"},
-        "control": {"law": law},
+        "control": LAWS[law][0],
         "simulation": {"object_angle": float(np.radians(tilt)), **simulation},
     }
     daemon = Daemon(Settings.model_validate(sections), wire=False)
@@ -93,7 +99,8 @@ def _laws(laws: Sheet, *_: Sheet) -> Iterator[DrawnCurve]:
         share = resting_share(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
         line = {"color": GREY, "ls": "--" if spring else ":", "lw": 1.0}
         yield DrawnCurve(starts, share * starts, line, f"closed form: {text}")
-    for (law, text), color, marker in zip(LAWS.items(), KINDS, MARKERS, strict=False):
+    for law, color, marker in zip(LAWS, KINDS, MARKERS, strict=False):
+        text = LAWS[law][1]
         yield DrawnCurve(starts, laws[f"left by {law}"], {"color": color, "marker": marker}, text)
 
 
