@@ -215,7 +215,7 @@ def limits() -> str:
     from softfinger.tools.setup.limits import _values
 
     settings = Settings()
-    taking_turns = sum(bool(row.in_turn or row.check) for row in LIMITS)
+    taking_turns = sum(row.in_turn for row in LIMITS)
     rows = [
         _LIMITS,
         _head("limit", "what is judged", "follows", "noticed", "settings, with their defaults"),
@@ -224,10 +224,10 @@ def limits() -> str:
         tick = 1e3 / settings.loop.rate
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
-        if row.in_turn or row.check:
+        if row.in_turn:
             turns = 2 if lasts else 1  # to see it, and to see that it has lasted
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
-        elif row.holds:
+        elif row.check:
             when = f"{after}a tick ({tick:g} ms)"
         else:
             when = "where it is met"

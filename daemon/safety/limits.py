@@ -4,18 +4,18 @@
 - ``limit``: the goal is changed before it reaches the bus; ``status`` counts the ticks.
 - ``fault``: torque off, latched until ``clear``, which is refused as long as the cause stands.
 
-``softfinger limits`` prints the table with a profile's numbers. A limit's name is the ``kind`` of
-its events and the ``fault_name`` of ``hand/state``. How the table is gone through at each tick
-stands in `safety.safety`.
+A row stands above the function that checks it, and the table has them in the order of this file:
+where several faults stand, the first names the fault. ``softfinger limits`` prints the table with
+a profile's numbers. A limit's name is the ``kind`` of its events and the ``fault_name`` of
+``hand/state``. When a row is checked stands in `safety.safety`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import Any, Literal, cast
+from typing import Literal
 
 import numpy as np
 
@@ -25,18 +25,11 @@ from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
-from softfinger.daemon.types import FINGERS, State
+from softfinger.daemon.types import FINGERS, Contact, State
 
-_PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
-_FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
-_ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
-_SLOW = 0.05  # rad/s below which a joint stands
-_OFF = 0.05  # rad off its goal from which on a joint must be pulled there …
-_PULL = 2.0  # … with so much current [A/rad]: less than any model's own loop gives
-_FELT = 0.04  # A that must be expected for that to be judged
-_PULLED = 0.25  # of what is expected
-_SURE = 4.0  # standard deviations of both tips' tilts that they must be apart
 _NEAR = 0.9  # of a fault's bound: warned from there on
+_PULL = 2.0  # A/rad with which a joint off its goal must be pulled: less than any model's own loop
+_SLOW = 0.05  # rad/s below which a joint stands
 
 
 class View:
@@ -65,102 +58,95 @@ class View:
             high = high or model.voltage_max * VOLTAGE_UNIT
         self.voltage = (low, high)
 
+    def follow(self, state: State) -> None:
+        """Remember of this tick's state what checks compare later ones with."""
+        self.motion.follow(state.t, state.reading)
+        if not self.holds(state):
+            self.grip_width = math.nan
+        elif math.isnan(self.grip_width):
+            self.grip_width = state.object.width
+
     def touched(self, state: State) -> bool:
         """Both tips soundly touch an object of known angle and width."""
         left, right = state.contacts
-        touch = left.valid and left.contact and right.valid and right.contact
-        return state.object.valid and touch
+        return state.object.valid and _touches(left) and _touches(right)
 
     def holds(self, state: State) -> bool:
         """They do so in a grip that has settled."""
         return state.mode in HELD and self.touched(state)
 
 
-Check = Callable[[View, State, float], str]  # the share of the bound; what stands, or an empty text
-Text = Callable[[View, State, int, float], str]  # the finger, 0 if of the hand; and the share
+def _touches(contact: Contact) -> bool:
+    return contact.valid and contact.contact
+
+
+# From the share of the bound to judge by to what is wrong, or an empty text. A check changes
+# nothing; NaN is past any bound.
+Check = Callable[[View, State, float], str]
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One row. Without ``holds`` and ``check`` it is met elsewhere: in `Safety.write`, on the bus.
+    """A row of the table, entered with the check that it decorates.
 
-    ``holds`` is an expression of `checking`'s names, with numbers of the settings filled in:
-    `safety.safety` joins those of every tick to one check. What takes more to compute is a
-    ``check``.
+    A row without a check is entered by hand, and met elsewhere: in `Safety.write`, on the bus.
     """
 
     name: str
     judged: str
     level: Literal["warn", "limit", "fault"]
-    keys: tuple[str, ...] = ()
+    keys: tuple[str, ...] = ()  # the settings that it depends on
     needs: Literal["", "servos", "sensors"] = ""
-    holds: str = ""  # while it is kept; with {i} it is one of each finger
-    text: Text | None = None  # what is reported where it is not
     check: Check | None = None
-    remember: Callable[[View, State], None] | None = None  # what the check compares with
     lasts: float | str = 0.0  # s that it must stand, or the setting that says so
     share: float = 1.0  # of the bound
-    in_turn: bool = False  # one such ``holds`` or ``check`` is judged a tick; the others at each
+    in_turn: bool = False  # one such row is checked a tick; the others at each
     gripping: bool = False  # stands only while the hand grips
 
-    def terms(self, view: View, share: str) -> dict[str, int]:
-        """``holds`` of each finger it is about, in Python, with ``share`` of the bound."""
-        settings = view.settings
-        fingers = view.fingers if "{i}" in self.holds else [0] * bool(self.holds)
-        sections = {name: getattr(settings, name) for name in type(settings).model_fields}
-        return {
-            self.holds.format(
-                **sections,
-                i=i,
-                share=share,
-                low=settings.hand.q_min[i] - _PAST_STOP,
-                high=settings.hand.q_max[i] + _PAST_STOP,
-                all=_ALL,
-                friction=_usable(settings),
-                frame_age=settings.safety.frame_age_fault / settings.tactile.rate,
-            ): i
-            for i in fingers
-        }
+    def __call__(self, check: Check) -> Check:
+        """Enter the row with its check. Several rows may decorate one, the lowest comes first."""
+        LIMITS.append(replace(self, check=check))
+        return check
 
 
-def _usable(settings: Settings) -> float:
-    """Share of the grip's force that shear may reach."""
-    return settings.control.tip_friction * (1.0 - settings.control.slip_margin)
+LIMITS: list[Limit] = []
 
 
-def checking(terms: Mapping[str, int], text: Text | None) -> Check:
-    """A check by expressions of ``state, reading, contacts, view, share``, each of a finger.
+# --- servos ---------------------------------------------------------------------------------------
 
-    It reports the first that does not hold.
-    """
-    source = [
-        "def check(view, state, share):",
-        " reading, contacts = state.reading, state.contacts",
-    ]
-    source += [
-        f" if not ({term}): return text(view, state, {i}, share)" for term, i in terms.items()
-    ]
-    return _compiled("\n".join([*source, ' return ""']), text)
+LIMITS.append(Limit("servos.bus", "the port is there, the servos obey and were not stopped by "
+    "their watchdog", "fault", ("servos.watchdog",)))  # fmt: skip
 
 
-@cache
-def _compiled(source: str, text: Text | None) -> Check:
-    names: dict[str, Any] = {"sin": math.sin, "GRIPPING": GRIPPING, "text": text}
-    exec(source, names)
-    return cast(Check, names["check"])
-
-
-# --- texts of the limits that are judged at every tick --------------------------------------------
-
-
-def _servos_silent(_: View, state: State, *__: float) -> str:
+@Limit("servos.silent", "age of the last good servo reading; an error reply is not one", "fault",
+    ("servos.fault_after",), "servos")  # fmt: skip
+def _servos_silent(view: View, state: State, _: float) -> str:
     age = state.t - state.reading.t
+    if age <= view.settings.servos.fault_after:
+        return ""
     lasted = "yet" if age == math.inf else f"for {age:.3f} s"
     return f"servos: no good reading {lasted}"
 
 
-def _servo_alert(view: View, state: State, *_: float) -> str:
-    reading, parts = state.reading, []
+@Limit("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",
+    "fault", needs="servos")  # fmt: skip
+def _servos_frozen(view: View, state: State, _: float) -> str:
+    frozen = state.reading.frozen
+    if not frozen:
+        return ""
+    return f"servos: old readings from {_named(view, frozen)}: its own clock stands still"
+
+
+def _named(view: View, bits: int) -> str:
+    return " and ".join(FINGERS[i] for i in view.fingers if bits >> i & 1)
+
+
+@Limit("servos.alert", "hardware error that a servo reports", "fault", needs="servos")
+def _servos_alert(view: View, state: State, _: float) -> str:
+    reading = state.reading
+    if not reading.alert:
+        return ""
+    parts = []
     for i in view.fingers:
         if reading.alert >> i & 1:
             what = hardware_error_names(reading.hardware[i]) if reading.hardware[i] else ""
@@ -168,43 +154,84 @@ def _servo_alert(view: View, state: State, *_: float) -> str:
     return f"servos: hardware error reported by {' and '.join(parts)}"
 
 
-def _named(view: View, bits: int) -> str:
-    return " and ".join(FINGERS[i] for i in view.fingers if bits >> i & 1)
+@Limit("servos.temperature", "temperature of a servo", "warn", ("safety.temperature_warn",),
+    "servos", in_turn=True)  # fmt: skip
+def _servos_warm(view: View, state: State, share: float) -> str:
+    return _hotter(view, state, share * view.limits.temperature_warn)
 
 
-def _joint_jump(view: View, *_: object) -> str:
+@Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",),
+    "servos", in_turn=True)  # fmt: skip
+def _servos_hot(view: View, state: State, share: float) -> str:
+    return _hotter(view, state, share * view.limits.temperature_max)
+
+
+def _hotter(view: View, state: State, bound: float) -> str:
+    for i in view.fingers:
+        temperature = state.reading.temperature[i]
+        if not temperature < bound:
+            return f"{FINGERS[i]} servo at {temperature:.0f} °C"
+    return ""
+
+
+@Limit("servos.voltage", "supply of a servo", "fault", ("safety.voltage_min", "safety.voltage_max"),
+    "servos", in_turn=True, lasts=0.1)  # fmt: skip
+def _servos_voltage(view: View, state: State, _: float) -> str:
+    low, high = view.voltage
+    for i in view.fingers:
+        voltage = state.reading.voltage[i]
+        if voltage and not low <= voltage <= high:
+            return (
+                f"{FINGERS[i]} servo's supply at {voltage:.1f} V, outside {low:.1f} to {high:.1f} V"
+            )
+    return ""
+
+
+# --- joints ---------------------------------------------------------------------------------------
+
+_PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
+
+
+@Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault", ("hand.q_min", "hand.q_max"),
+    "servos")  # fmt: skip
+def _joint_angle(view: View, state: State, _: float) -> str:
+    hand = view.settings.hand
+    for i in view.fingers:
+        q = state.reading.q[i]
+        if not hand.q_min[i] - _PAST_STOP <= q <= hand.q_max[i] + _PAST_STOP:
+            return f"{FINGERS[i]} joint at {q:.3f} rad, outside its limits"
+    return ""
+
+
+@Limit("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",), "servos")
+def _joint_velocity(view: View, state: State, _: float) -> str:
+    bound = view.limits.velocity_max
+    for i in view.fingers:
+        dq = state.reading.dq[i]
+        if not -bound <= dq <= bound:
+            return f"{FINGERS[i]} joint at {dq:.2f} rad/s, too fast"
+    return ""
+
+
+@Limit("joint.jump",
+    "joint angle against its velocity, 0.1 rad within 0.1 s, and against the greatest velocity",
+    "fault", ("safety.velocity_max",), "servos")  # fmt: skip
+def _joint_jump(view: View, _: State, __: float) -> str:
+    if not view.motion.jumped:
+        return ""
     return (
         f"{_named(view, view.motion.jumped)} joint's angle went where its velocity did not: its "
         "encoder, or what turns it, has slipped"
     )
 
 
-def _hot(_: View, state: State, i: int, __: float) -> str:
-    return f"{FINGERS[i]} servo at {state.reading.temperature[i]:.0f} °C"
+_OFF = 0.05  # rad off its goal from which on a joint must be pulled there
+_FELT = 0.04  # A that must be expected for that to be judged
+_PULLED = 0.25  # of what is expected
 
 
-def _tip_tilt(view: View, state: State, i: int, share: float) -> str:
-    contact, radius = state.contacts[i], view.settings.tip.radius
-    if not contact.inside and view.settings.tip.physics != "springs":
-        tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
-        return f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°: its law ends before"
-    reach = math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0))
-    limit = share * (reach - view.limits.theta_margin)
-    return (
-        f"{FINGERS[i]} tip at {math.degrees(contact.theta):.1f}°, "
-        f"past {math.degrees(limit):.1f}° at this depth"
-    )
-
-
-def _tactile_silent(_: View, state: State, i: int, __: float) -> str:
-    contact = state.contacts[i]
-    what = "frame" if contact.t_arrival == contact.t_sound else "sound estimate"
-    return f"tactile: no {what} for {state.t - contact.t_sound:.3f} s"
-
-
-# --- checks of the limits that take turns ---------------------------------------------------------
-
-
+@Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s", "fault",
+    needs="servos", in_turn=True, lasts=0.05)  # fmt: skip
 def _joint_dead(view: View, state: State, _: float) -> str:
     """Off its goal it stands, and no current pulls it there. A joint that is held back takes some.
 
@@ -228,6 +255,22 @@ def _joint_dead(view: View, state: State, _: float) -> str:
     return ""
 
 
+@Limit("joint.current", "measured current", "fault", ("safety.current_fault",), "servos", lasts=0.1)
+def _joint_current(view: View, state: State, _: float) -> str:
+    bound = view.limits.current_fault
+    for i in view.fingers:
+        current = state.reading.current[i]
+        if not -bound <= current <= bound:
+            return f"{FINGERS[i]} joint takes {current:.2f} A, above {bound:g} A"
+    return ""
+
+
+_FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
+
+
+@Limit("joint.stall", "current at its bound, off the goal, and standing", "fault",
+    ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
+    lasts="stall_time")  # fmt: skip
 def _joint_stall(view: View, state: State, _: float) -> str:
     if not state.torque or not state.goal.valid or state.mode in GRIPPING:
         return ""
@@ -248,6 +291,174 @@ def _joint_stall(view: View, state: State, _: float) -> str:
     return ""
 
 
+_ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
+
+
+@Limit("joint.strained", "grip that takes all the current there may be", "warn",
+    ("safety.current_max",), "servos", in_turn=True, lasts=1.0)  # fmt: skip
+def _joint_strained(view: View, state: State, share: float) -> str:
+    if not state.torque or state.mode not in GRIPPING:
+        return ""
+    most = view.limits.current_max
+    for i in view.fingers:
+        if not abs(state.reading.current[i]) < _ALL * share * most:
+            return f"{FINGERS[i]} joint grips with all of its {most:g} A"
+    return ""
+
+
+LIMITS.append(Limit("torque.off", "torque off not confirmed within half the watchdog's time: the "
+    "bus is kept silent until the watchdog stops the servos", "fault",
+    ("servos.watchdog",)))  # fmt: skip
+
+
+# --- goals ----------------------------------------------------------------------------------------
+
+
+@Limit("goal.lost", "servo that for 0.05 s holds none of the goals sent to it", "fault", (),
+    "servos")  # fmt: skip
+def _goal_lost(view: View, state: State, _: float) -> str:
+    lost = state.reading.lost
+    if not lost:
+        return ""
+    return f"servos: none of the goals sent lately reached {_named(view, lost)}: check the cable"
+
+
+@Limit("goal.number", "non-finite goal: it is not sent", "fault", needs="servos")
+def _goal_number(view: View, _: State, __: float) -> str:
+    return "control: a non-finite goal" if view.bad_goal else ""
+
+
+LIMITS += [
+    Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
+    Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
+    Limit("goal.step", "goal angle's step in a tick, where it is far from the joint", "limit",
+        ("safety.goal_reach", "safety.goal_speed")),
+    Limit("goal.slew", "goal current's rise in a tick", "limit", ("safety.current_rate",)),
+]  # fmt: skip
+
+
+# --- tips -----------------------------------------------------------------------------------------
+
+
+@Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors")
+@Limit("tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors", share=_NEAR)
+def _tip_force(view: View, state: State, share: float) -> str:
+    bound = share * view.limits.force_max
+    for i in view.fingers:
+        contact = state.contacts[i]
+        if _touches(contact) and not contact.force <= bound:
+            return f"{FINGERS[i]} tip at {contact.force:.1f} N, above {bound:g} N"
+    return ""
+
+
+@Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors")
+@Limit("tip.displacement", "displacement of a tip", "warn", ("safety.d_max",), "sensors",
+    share=_NEAR)  # fmt: skip
+def _tip_displacement(view: View, state: State, share: float) -> str:
+    bound = share * view.limits.d_max
+    for i in view.fingers:
+        contact = state.contacts[i]
+        if _touches(contact) and not contact.d <= bound:
+            return f"{FINGERS[i]} tip at {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
+    return ""
+
+
+_TILT = "|θ| against asin(1 − d/a) less a margin"
+
+
+@Limit("tip.tilt", _TILT, "fault", ("safety.theta_margin",), "sensors")
+@Limit("tip.tilt", _TILT, "warn", ("safety.theta_margin",), "sensors", share=_NEAR)
+def _tip_tilt(view: View, state: State, share: float) -> str:
+    """|θ| ≤ share·(asin(1 − d/a) − margin).
+
+    At asin(1 − d/a) the object's plane reaches the rim of the tip's backing plate. Checked with
+    sin, which is defined for every finite angle.
+    """
+    radius, margin = view.settings.tip.radius, view.limits.theta_margin
+    for i in view.fingers:
+        contact = state.contacts[i]
+        if not _touches(contact):
+            continue
+        lean = abs(contact.theta) / share + margin
+        if contact.inside and lean <= 1.57 and math.sin(lean) <= 1.0 - contact.d / radius:
+            continue
+        if not contact.inside and view.settings.tip.physics != "springs":
+            tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
+            deep = f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
+            return f"{deep}: its law ends before"
+        limit = share * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
+        return (
+            f"{FINGERS[i]} tip at {math.degrees(contact.theta):.1f}°, "
+            f"past {math.degrees(limit):.1f}° at this depth"
+        )
+    return ""
+
+
+# --- sensors --------------------------------------------------------------------------------------
+
+LIMITS.append(Limit("tactile.late", "age of the last sound frame: nothing is moved on", "limit",
+    ("safety.frame_age_hold",), "sensors", gripping=True))  # fmt: skip
+
+
+@Limit("tactile.silent", "age of the last sound frame", "fault",
+    ("safety.frame_age_fault", "safety.frame_age_action"), "sensors", gripping=True)  # fmt: skip
+def _tactile_silent(view: View, state: State, _: float) -> str:
+    bound = view.limits.frame_age_fault / view.settings.tactile.rate
+    for i in view.fingers:
+        contact = state.contacts[i]
+        age = state.t - contact.t_sound
+        if not age <= bound:
+            what = "frame" if contact.t_arrival == contact.t_sound else "sound estimate"
+            return f"tactile: no {what} for {age:.3f} s"
+    return ""
+
+
+@Limit("tactile.frozen", "frames that are the same again and again while something touches",
+    "fault", ("safety.frozen_after",), "sensors", in_turn=True)  # fmt: skip
+def _tactile_frozen(view: View, state: State, _: float) -> str:
+    for sensor in view.sensors:
+        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed
+        if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
+            side = FINGERS[sensor.finger]
+            return f"tactile: {side} sensor frozen, the same frame for {same:.2f} s"
+    return ""
+
+
+@Limit("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), "sensors",
+    in_turn=True, lasts=0.1)  # fmt: skip
+def _tactile_saturated(view: View, _: State, share: float) -> str:
+    full, most = view.settings.tactile.full_count, share * view.limits.saturated
+    for sensor in view.sensors:
+        if sensor.frame is None:
+            continue
+        data = sensor.frame.data
+        part = np.count_nonzero(data >= full) / data.size
+        if part > most:
+            return f"tactile: {part:.0%} of the {FINGERS[sensor.finger]} sensor's cells are full"
+    return ""
+
+
+@Limit("tactile.misfit", "frames that fit no contact of the model", "warn", ("tactile.noise",),
+    "sensors", in_turn=True, lasts=0.5)  # fmt: skip
+def _tactile_misfit(view: View, state: State, _: float) -> str:
+    for i in view.fingers:
+        if state.contacts[i].misfit:
+            return (
+                f"tactile: what the {FINGERS[i]} tip feels fits no contact of the model; d and "
+                "theta may be biased (another material, unequal cells, more noise than set)"
+            )
+    return ""
+
+
+# --- the hand and its grip ------------------------------------------------------------------------
+
+_SURE = 4.0  # standard deviations of both tips' tilts that they must be apart
+_ANGLE = "object's angle by one finger against the other's"
+_ANGLE_KEYS = ("safety.residual_angle", "object.taper")
+
+
+@Limit("hand.angle", _ANGLE, "fault", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2)
+@Limit("hand.angle", _ANGLE, "warn", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2, share=0.5)
 def _hand_angle(view: View, state: State, share: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
@@ -267,13 +478,9 @@ def _hand_angle(view: View, state: State, share: float) -> str:
     )
 
 
-def _remember_width(view: View, state: State) -> None:
-    if not view.holds(state):
-        view.grip_width = math.nan
-    elif math.isnan(view.grip_width):
-        view.grip_width = state.object.width
-
-
+@Limit("hand.width", "held object's width by joints and sensors, since it was gripped", "fault",
+    ("safety.residual_width",), "sensors", in_turn=True,
+    lasts=0.2)  # fmt: skip
 def _hand_width(view: View, state: State, share: float) -> str:
     changed = state.object.width - view.grip_width
     if not (view.holds(state) and abs(changed) > share * view.limits.residual_width):
@@ -284,6 +491,18 @@ def _hand_width(view: View, state: State, share: float) -> str:
     )
 
 
+@Limit("hand.force", "one tip's force against the other's", "warn", ("safety.residual_force",),
+    "sensors", in_turn=True, lasts=0.3)  # fmt: skip
+def _hand_force(view: View, state: State, share: float) -> str:
+    left, right = (contact.force for contact in state.contacts)
+    bound = share * view.limits.residual_force * max(left, right)
+    if not view.holds(state) or abs(left - right) <= bound:
+        return ""
+    return f"the tips feel {left:.1f} N and {right:.1f} N of one grip"
+
+
+@Limit("hand.torque", "joint torque against what the tip feels", "warn",
+    ("safety.residual_torque",), "sensors", in_turn=True, lasts=0.3)  # fmt: skip
 def _hand_torque(view: View, state: State, share: float) -> str:
     if not view.holds(state):
         return ""
@@ -300,150 +519,24 @@ def _hand_torque(view: View, state: State, share: float) -> str:
     return ""
 
 
-def _frozen(view: View, state: State, _: float) -> str:
-    for sensor in view.sensors:
-        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed
-        if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
-            side = FINGERS[sensor.finger]
-            return f"tactile: {side} sensor frozen, the same frame for {same:.2f} s"
-    return ""
+@Limit("grip.slip", "shear against friction less a margin", "warn",
+    ("control.tip_friction", "control.slip_margin"), "sensors", in_turn=True,
+    lasts=0.1)  # fmt: skip
+def _grip_slip(view: View, state: State, share: float) -> str:
+    control, shear = view.settings.control, view.grasp.shear
+    usable = control.tip_friction * (1.0 - control.slip_margin)
+    if not view.holds(state) or shear <= share * usable:
+        return ""
+    return f"shear is {shear:.2f} of the grip's force, above {usable:.2f}: may slip"
 
 
-def _saturated(view: View, _: State, share: float) -> str:
-    full, most = view.settings.tactile.full_count, share * view.limits.saturated
-    for sensor in view.sensors:
-        if sensor.frame is None:
-            continue
-        data = sensor.frame.data
-        part = np.count_nonzero(data >= full) / data.size
-        if part > most:
-            return f"tactile: {part:.0%} of the {FINGERS[sensor.finger]} sensor's cells are full"
-    return ""
+# --- commands and the loop ------------------------------------------------------------------------
+
+LIMITS.append(Limit("commands.pace", "a client's commands a second; a stop counts, and is always "
+    "heard", "limit", ("commands.per_second",)))  # fmt: skip
 
 
-# --- the table ------------------------------------------------------------------------------------
-
-_S: Literal["servos"] = "servos"
-_T: Literal["sensors"] = "sensors"
-_FREE = "not (contacts[{i}].valid and contacts[{i}].contact) or "
-_LEAN = "(abs(contacts[{i}].theta) / {share} + {safety.theta_margin})"
-
-
-def _warn_and_fault(
-    name: str, judged: str, key: str, holds: str, text: Text
-) -> tuple[Limit, Limit]:
-    """A limit of each tip, after the warning near it."""
-    fault = Limit(name, judged, "fault", (key,), _T, _FREE + holds, text)
-    return replace(fault, level="warn", share=_NEAR), fault
-
-
-LIMITS: tuple[Limit, ...] = (
-    Limit("servos.bus", "the port is there, the servos obey and were not stopped by their watchdog",
-        "fault", ("servos.watchdog",)),
-    Limit("servos.silent", "age of the last good servo reading; an error reply is not one",
-        "fault", ("servos.fault_after",), _S,
-        "state.t - reading.t <= {servos.fault_after}", _servos_silent),
-    Limit("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",
-        "fault", (), _S, "not reading.frozen", lambda view, state, *_:
-        f"servos: old readings from {_named(view, state.reading.frozen)}: "
-        "its own clock stands still"),
-    Limit("servos.alert", "hardware error that a servo reports", "fault", (), _S,
-        "not reading.alert", _servo_alert),
-    Limit("servos.temperature", "temperature of a servo", "warn", ("safety.temperature_warn",), _S,
-        "reading.temperature[{i}] < {share} * {safety.temperature_warn}", _hot, in_turn=True),
-    Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",), _S,
-        "reading.temperature[{i}] < {share} * {safety.temperature_max}", _hot, in_turn=True),
-    Limit("servos.voltage", "supply of a servo", "fault",
-        ("safety.voltage_min", "safety.voltage_max"), _S,
-        "not reading.voltage[{i}] or view.voltage[0] <= reading.voltage[{i}] <= view.voltage[1]",
-        lambda view, state, i, _:
-        f"{FINGERS[i]} servo's supply at {state.reading.voltage[i]:.1f} V, "
-        f"outside {view.voltage[0]:.1f} to {view.voltage[1]:.1f} V", in_turn=True, lasts=0.1),
-    Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault",
-        ("hand.q_min", "hand.q_max"), _S, "{low} <= reading.q[{i}] <= {high}",
-        lambda _, state, i, __:
-        f"{FINGERS[i]} joint at {state.reading.q[i]:.3f} rad, outside its limits"),
-    Limit("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",), _S,
-        "-{safety.velocity_max} <= reading.dq[{i}] <= {safety.velocity_max}",
-        lambda _, state, i, __: f"{FINGERS[i]} joint at {state.reading.dq[i]:.2f} rad/s, too fast"),
-    Limit("joint.jump", "joint angle against its velocity, 0.1 rad within 0.1 s, and against the "
-        "greatest velocity", "fault", ("safety.velocity_max",), _S,
-        "not view.motion.jumped", _joint_jump),
-    Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s",
-        "fault", (), _S, check=_joint_dead, lasts=0.05),
-    Limit("joint.current", "measured current", "fault", ("safety.current_fault",), _S,
-        "-{safety.current_fault} <= reading.current[{i}] <= {safety.current_fault}",
-        lambda view, state, i, share: f"{FINGERS[i]} joint takes {state.reading.current[i]:.2f} A, "
-        f"above {view.limits.current_fault:g} A", lasts=0.1),
-    Limit("joint.stall", "current at its bound, off the goal, and standing", "fault",
-        ("safety.stall_error", "safety.stall_time"), _S, check=_joint_stall, lasts="stall_time"),
-    Limit("joint.strained", "grip that takes all the current there may be", "warn",
-        ("safety.current_max",), _S, "not state.torque or state.mode not in GRIPPING or "
-        "abs(reading.current[{i}]) < {all} * {share} * {safety.current_max}",
-        lambda view, _, i, __:
-        f"{FINGERS[i]} joint grips with all of its {view.limits.current_max:g} A",
-        in_turn=True, lasts=1.0),
-    Limit("torque.off", "torque off not confirmed within half the watchdog's time: the bus is kept "
-        "silent until the watchdog stops the servos", "fault", ("servos.watchdog",)),
-    Limit("goal.lost", "servo that for 0.05 s holds none of the goals sent to it", "fault", (), _S,
-        "not reading.lost", lambda view, state, *_: "servos: none of the goals sent lately reached "
-        f"{_named(view, state.reading.lost)}: check the cable"),
-    Limit("goal.number", "non-finite goal: it is not sent", "fault", (), _S, "not view.bad_goal",
-        lambda *_: "control: a non-finite goal"),
-    Limit("goal.angle", "goal angle", "limit", ("hand.q_min", "hand.q_max")),
-    Limit("goal.current", "goal current", "limit", ("safety.current_max",)),
-    Limit("goal.step", "goal angle's step in a tick, where it is far from the joint", "limit",
-        ("safety.goal_reach", "safety.goal_speed")),
-    Limit("goal.slew", "goal current's rise in a tick", "limit", ("safety.current_rate",)),
-    *_warn_and_fault("tip.force", "normal force of a tip", "safety.force_max",
-        "contacts[{i}].force <= {share} * {safety.force_max}",
-        lambda view, state, i, share: f"{FINGERS[i]} tip at {state.contacts[i].force:.1f} N, "
-        f"above {share * view.limits.force_max:g} N"),
-    *_warn_and_fault("tip.displacement", "displacement of a tip", "safety.d_max",
-        "contacts[{i}].d <= {share} * {safety.d_max}",
-        lambda view, state, i, share: f"{FINGERS[i]} tip at {state.contacts[i].d * 1e3:.2f} mm, "
-        f"above {share * view.limits.d_max * 1e3:g} mm"),
-    # |θ| ≤ share·(asin(1 − d/a) − margin): there the object's plane reaches the rim of the tip's
-    # backing plate. Written with sin, which is defined for every finite angle.
-    *_warn_and_fault("tip.tilt", "|θ| against asin(1 − d/a) less a margin", "safety.theta_margin",
-        "contacts[{i}].inside and " + _LEAN + " <= 1.57 and "
-        "sin(" + _LEAN + ") <= 1.0 - contacts[{i}].d / {tip.radius}",
-        _tip_tilt),
-    Limit("tactile.late", "age of the last sound frame: nothing is moved on", "limit",
-        ("safety.frame_age_hold",), needs=_T, gripping=True),
-    Limit("tactile.silent", "age of the last sound frame", "fault",
-        ("safety.frame_age_fault", "safety.frame_age_action"), _T,
-        "state.t - contacts[{i}].t_sound <= {frame_age}", _tactile_silent, gripping=True),
-    Limit("tactile.frozen", "frames that are the same again and again while something touches",
-        "fault", ("safety.frozen_after",), _T, check=_frozen),
-    Limit("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), _T,
-        check=_saturated, lasts=0.1),
-    Limit("tactile.misfit", "frames that fit no contact of the model", "warn", ("tactile.noise",),
-        _T, "not contacts[{i}].misfit", lambda _, __, i, ___:
-        f"tactile: what the {FINGERS[i]} tip feels fits no contact of the model; d and theta may "
-        "be biased (another material, unequal cells, more noise than set)",
-        in_turn=True, lasts=0.5),
-    Limit("hand.angle", "object's angle by one finger against the other's", "warn",
-        ("safety.residual_angle", "object.taper"), _T, check=_hand_angle, lasts=0.2, share=0.5),
-    Limit("hand.angle", "object's angle by one finger against the other's", "fault",
-        ("safety.residual_angle", "object.taper"), _T, check=_hand_angle, lasts=0.2),
-    Limit("hand.width", "held object's width by joints and sensors, since it was gripped", "fault",
-        ("safety.residual_width",), _T, check=_hand_width, remember=_remember_width, lasts=0.2),
-    Limit("hand.force", "one tip's force against the other's", "warn", ("safety.residual_force",),
-        _T, "not view.holds(state) or abs(contacts[0].force - contacts[1].force) <= "
-        "{share} * {safety.residual_force} * max(contacts[0].force, contacts[1].force)",
-        lambda _, state, *__: f"the tips feel {state.contacts[0].force:.1f} N and "
-        f"{state.contacts[1].force:.1f} N of one grip", in_turn=True, lasts=0.3),
-    Limit("hand.torque", "joint torque against what the tip feels", "warn",
-        ("safety.residual_torque",), _T, check=_hand_torque, lasts=0.3),
-    Limit("grip.slip", "shear against friction less a margin", "warn",
-        ("control.tip_friction", "control.slip_margin"), _T,
-        "not view.holds(state) or view.grasp.shear <= {share} * {friction}",
-        lambda view, *_: f"shear is {view.grasp.shear:.2f} of the grip's force, above "
-        f"{_usable(view.settings):.2f}: may slip", in_turn=True, lasts=0.1),
-    Limit("commands.pace", "a client's commands a second; a stop counts, and is always heard",
-        "limit", ("commands.per_second",)),
-    Limit("loop.overruns", "late ticks in a row", "fault", ("safety.overruns_fault",),
-        holds="state.timing.late_in_row < {safety.overruns_fault}",
-        text=lambda _, state, *__: f"loop: {state.timing.late_in_row} overruns in a row"),
-)  # fmt: skip
+@Limit("loop.overruns", "late ticks in a row", "fault", ("safety.overruns_fault",))
+def _loop_overruns(view: View, state: State, _: float) -> str:
+    late = state.timing.late_in_row
+    return "" if late < view.limits.overruns_fault else f"loop: {late} overruns in a row"

@@ -16,7 +16,7 @@ from softfinger.daemon.control.modes import GRIPPING, Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.limits import LIMITS, Limit, View, checking
+from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
@@ -34,16 +34,12 @@ class Breach(NamedTuple):
     text: str
 
 
-def _one_of_them(*_: object) -> str:
-    return "one of them"
-
-
 class _Watch:
     """One limit of a scene, and since when it is broken."""
 
-    def __init__(self, limit: Limit, view: View) -> None:
+    def __init__(self, limit: Limit, check: Check, view: View) -> None:
         self.limit = limit
-        self.check = limit.check or checking(limit.terms(view, "share"), limit.text)
+        self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
         self.since = math.inf  # broken since then, inf: it is not
@@ -55,8 +51,6 @@ class _Watch:
     ) -> None:
         """Enter what stands at this tick and has for long enough; keeps count of how long."""
         limit = self.limit
-        if limit.remember is not None:
-            limit.remember(view, state)
         found = self.check(view, state, limit.share * (_EASE if self.reported else 1.0))
         if not found:
             if self.since < math.inf:
@@ -91,26 +85,18 @@ class Safety:
         view = self._view = View(settings, grasp, sensors)
         limits, hand = settings.safety, settings.hand
         self._limits = limits
-        self._has_servos, self._has_sensors = has_servos, has_sensors
+        self._has_sensors = has_sensors
         there = {"": True, "servos": has_servos, "sensors": has_sensors}
-        rows = [limit for limit in LIMITS if limit.holds or limit.check is not None]
-        watches = [_Watch(limit, view) for limit in rows if there[limit.needs]]
-        self._each_tick = [each for each in watches if each.limit.holds and not each.limit.in_turn]
-        self._in_turn = [each for each in watches if each not in self._each_tick]
+        watches = [
+            _Watch(limit, limit.check, view)
+            for limit in LIMITS
+            if limit.check is not None and there[limit.needs]
+        ]
+        self._each_tick = [watch for watch in watches if not watch.limit.in_turn]
+        self._in_turn = [watch for watch in watches if watch.limit.in_turn]
         # In the table's order: the first one that stands is the fault's name.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
-        # While this one check finds nothing, none of each tick's limits is broken. A fault whose
-        # warning comes before it is broken only where that is.
-        share = {watch.limit.holds: watch.limit.share for watch in reversed(self._each_tick)}
-        terms = {
-            term: 0
-            for watch in self._each_tick
-            if watch.limit.share == share[watch.limit.holds]
-            for term in watch.limit.terms(view, str(watch.limit.share))
-        }
-        self._any = checking(terms, _one_of_them)
         self._turn = 0
-        self._busy = False  # a limit of each tick is broken, or was a moment ago
         self._found: dict[_Watch, str] = {}  # faults that stand
         self.must_hold = False  # frames are late in a grip: nothing is moved on
         self.warnings: list[Breach] = []  # to be reported; the loop empties it
@@ -134,14 +120,10 @@ class Safety:
         Warnings that are new are added to ``warnings``.
         """
         view, found = self._view, self._found
-        if self._has_servos:
-            view.motion.follow(state.t, state.reading)
-        if self._busy or self._any(view, state, 1.0):
-            self._busy = False
-            for watch in self._each_tick:
-                watch.look(view, state, found, self.warnings)
-                self._busy = self._busy or watch.reported or watch.since < math.inf
-            view.bad_goal = False
+        view.follow(state)
+        for watch in self._each_tick:
+            watch.look(view, state, found, self.warnings)
+        view.bad_goal = False
         if self._in_turn:
             self._turn = (self._turn + 1) % len(self._in_turn)
             self._in_turn[self._turn].look(view, state, found, self.warnings)
@@ -167,9 +149,8 @@ class Safety:
         """
         gripping = gripping or state.mode in GRIPPING
         view = self._view
-        kept = not self._any(view, state, 1.0)
         for watch in self._faults:
-            if (kept and watch in self._each_tick) or (watch.limit.gripping and not gripping):
+            if watch.limit.gripping and not gripping:
                 continue
             lasted = state.t - min(watch.since, state.t) >= watch.lasts
             if lasted and (found := watch.check(view, state, watch.limit.share)):
