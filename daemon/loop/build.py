@@ -18,7 +18,6 @@ from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.loop import EventSink, Loop
-from softfinger.daemon.loop.rehearsal import Rehearsal
 from softfinger.daemon.loop.warm_up import WantedScene, warm_up
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
@@ -125,10 +124,6 @@ class Daemon:
             if sensor is not None:
                 made[finger] = sensor
         return made
-
-    def rehearse(self, lead: float) -> None:
-        """Spend the last ``lead`` s before each deadline on rehearsing the tick."""
-        self.loop.rehearsal = Rehearsal(self.loop, self.settings, self.models, self.clock, lead)
 
     @property
     def tables(self) -> tuple[ContactTable, ContactTable]:

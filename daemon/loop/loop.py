@@ -89,7 +89,6 @@ class Loop:
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)
         self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
-        self.rehearsal: Callable[[float], None] | None = None  # before each sleep, with its end
         self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
         self._ending = False
         self._stopping = False
@@ -104,17 +103,6 @@ class Loop:
     @servos.setter
     def servos(self, servos: Servos | None) -> None:
         self._torque.servos = servos
-
-    @property
-    def stages(self) -> tuple[object, ...]:
-        """What remembers anything from tick to tick."""
-        parts = self.state, self.perception, self._control, self._safety, self._torque
-        return *parts, self._publishing
-
-    @property
-    def wanted(self) -> int:
-        """The topics that somebody subscribes to, as bits."""
-        return 0 if self._publisher is None else self._publisher.wanted
 
     # From outside the tick, a signal handler included
 
@@ -169,8 +157,6 @@ class Loop:
         if duration is not None:
             finish = deadline + clock.behind + duration - 0.5 * self.period
         while not self._ending and deadline + clock.behind < finish:
-            if self.rehearsal is not None:
-                self.rehearsal(deadline + clock.behind)
             timing.wake_late_s = clock.sleep_until(deadline)
             timing.behind_s = clock.behind - before
             began = clock.host()

@@ -2,8 +2,7 @@
 
 The measures of the section ``[realtime]`` are taken once, after warm-up. None is needed: one that
 the system refuses is reported, with what is lost and the command that grants it. The spin before a
-deadline is `daemon.clock`'s, the rehearsal before one `loop.rehearsal`'s. systemd is told
-(sd_notify) that the daemon is ready, alive, stopping.
+deadline is `daemon.clock`'s. systemd is told (sd_notify) that the daemon is ready, alive, stopping.
 """
 
 from __future__ import annotations
@@ -78,18 +77,17 @@ class RealTime:
 
     def __init__(self, settings: Settings) -> None:
         self.outcomes: list[Measure] = []
-        self.rehearsal = (
-            0.0  # s before a tick, for `loop.rehearsal`; it needs a processor of its own
-        )
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
         if settings.loop.clock == "virtual":
             return
-        own = bool(wanted.priority) and self._schedule(wanted.priority)
+        if wanted.priority:
+            self._schedule(wanted.priority)
         if wanted.slice:
             self._shorten_slice(min(max(round(wanted.slice * 1e9), _SHORTEST), _LONGEST))
-        own = bool(wanted.cpus) and self._keep_to_processors(wanted.cpus) and own
+        if wanted.cpus:
+            self._keep_to_processors(wanted.cpus)
         if wanted.lock_memory:
             self._lock_memory()
         if wanted.hold_latency:
@@ -98,9 +96,6 @@ class RealTime:
             self._sharpen_timer(max(round(wanted.timer_slack * 1e9), 1))
         if wanted.spin:
             self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
-        if wanted.rehearsal and own:
-            self.rehearsal = wanted.rehearsal
-            self._granted(f"rehearsal for up to {wanted.rehearsal * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
         """For the loop's events: one with all that was granted, one for each refusal."""
@@ -143,7 +138,7 @@ class RealTime:
         gc.enable()
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
-    def _schedule(self, priority: int) -> bool:
+    def _schedule(self, priority: int) -> None:
         """SCHED_FIFO for the loop, one step below it for the threads that share its interpreter.
 
         A reader thread that is preempted while it has the interpreter would hold up the loop for as
@@ -166,9 +161,8 @@ class RealTime:
                 "other processes can hold up a tick",
                 GRANT_PRIORITY,
             )
-            return False
-        self._granted(f"SCHED_FIFO {priority}", *undo)
-        return True
+        else:
+            self._granted(f"SCHED_FIFO {priority}", *undo)
 
     def _shorten_slice(self, nanoseconds: int) -> None:
         """Without SCHED_FIFO, a short slice for the loop and the threads of its interpreter.
@@ -185,7 +179,7 @@ class RealTime:
             undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
             self._granted(f"slices of {nanoseconds * 1e-6:g} ms", *undo)
 
-    def _keep_to_processors(self, cpus: tuple[int, ...]) -> bool:
+    def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
         """The loop's thread alone: others may run beside it."""
         names = ", ".join(map(str, cpus))
         before = os.sched_getaffinity(0)
@@ -197,9 +191,8 @@ class RealTime:
                 f"processor {names} refused ({error.strerror}; there are {there}): "
                 "the loop may move between processors"
             )
-            return False
-        self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
-        return True
+        else:
+            self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
 
     def _lock_memory(self) -> None:
         """Lock pages in memory once they have been touched, as after warm-up they are.

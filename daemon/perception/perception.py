@@ -18,7 +18,7 @@ from softfinger.daemon.perception.finger_model import FingerModel, make_estimato
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
-from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16
 _STEPS = 65535  # of a published pressure
@@ -44,11 +44,6 @@ class Perception:
             (models[0].table, models[1].table),
             (models[0].material, models[1].material),
         )
-
-    def share_scratch(self, other: Perception) -> None:
-        """Estimate in the memory of ``other``, of the same scene, which one thread uses in turn."""
-        for mine, its in zip(self.fingers, other.fingers, strict=True):
-            mine.share_scratch(its)
 
     def update(self, state: State) -> None:
         """Take in new frames; write the contacts and the object's pose of this tick."""
@@ -100,12 +95,6 @@ class FingerPerception:
         """Take the mean of the next frames as zero, cell by cell."""
         self._tare_sum = 0
         self._tare_left = _TARE_FRAMES
-
-    def share_scratch(self, other: FingerPerception) -> None:
-        """As `Perception.share_scratch`."""
-        mine, its = self._estimator, other._estimator
-        if isinstance(mine, ContactEstimator) and isinstance(its, ContactEstimator):
-            mine.share_scratch(its)
 
     def update(self) -> Frame | None:
         """The newest frame, estimated, where it is a new one; None where it is not."""

@@ -215,8 +215,6 @@ class RealtimeSettings(Section):
     timer_slack: Annotated[float, Field(ge=0, le=1e-3)] = 1e-9  # s; 0: the system's, 50 µs
     freeze_collector: bool = True  # a full collection would take tens of milliseconds
     spin: Annotated[float, Field(ge=0, le=1e-3)] = 5e-5  # s before a tick that are waited awake
-    # s before a tick in which it is rehearsed, with a priority and cpus alone; 0: none
-    rehearsal: Annotated[float, Field(ge=0, le=5e-3)] = 1e-3
 
 
 class StreamSettings(Section):

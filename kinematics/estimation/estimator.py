@@ -298,14 +298,6 @@ class ContactEstimator:
         self._seq = seq
         return result
 
-    def share_scratch(self, other: ContactEstimator) -> None:
-        """Work in the arena of ``other``, an equal one, when the same thread calls both.
-
-        It holds constants and scratch: what a frame leaves for the next is in :attr:`state`.
-        """
-        self.arena = other.arena[0], *self.arena[1:]
-        self._frame = other._frame
-
     def reset(self) -> None:
         """Forget the last estimate: the next frame starts cold."""
         self.state.estimate.warm = False

@@ -160,15 +160,3 @@ def test_the_terminal_goes_and_comes_back_and_the_servos_go_on(wires: list[Wire]
     assert wire.port.bus.servos[0].read(reg.REALTIME_TICK, 2, 2.0) == b"\xd0\x07"
     wire.port.plug()
     assert Path(wire.port.path).is_char_device()
-
-
-def test_it_tells_when_the_next_request_of_an_even_client_is_due(wires: list[Wire]) -> None:
-    wires.append(wire := Wire(make_bus(), 0))
-    for _ in range(3):
-        wire.t += 0.002
-        wire.send(PING)
-    begin, end = wire.port.rush
-    assert wire.t < begin < wire.t + 0.002 < end < wire.t + 0.003
-    wire.t += 0.0002  # one that never pauses leaves time for nothing else, so none is set aside
-    wire.send(PING)
-    assert wire.port.rush[1] < wire.t

@@ -92,7 +92,6 @@ def test_what_is_allowed_is_held_and_given_back() -> None:
     if "SCHED_FIFO 7" in had[2]:
         assert (during["policy"], during["priority"], during["reader"]) == (os.SCHED_FIFO, 7, 6)
         assert "SCHED_FIFO" not in answer["child"], "child processes inherited the priority"
-        assert "rehearsal for up to 1000 µs" in had[2]
     else:
         assert during["priority"] == 0
         assert any("SCHED_FIFO" in event[2] for event in answer["events"][1:])
@@ -108,7 +107,6 @@ def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it() -> None:
     events = run(REFUSED)
     assert events[0][:2] == ["info", "realtime"]
     assert "timer slack 1 ns" in events[0][2]
-    assert "rehearsal" not in events[0][2], "it would take a processor that others need"
     assert "memory" not in events[0][2]
     refused = [text for level, kind, text in events[1:] if (level, kind) == ("warning", "realtime")]
     assert len(refused) == len(events) - 1

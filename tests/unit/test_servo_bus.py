@@ -293,25 +293,6 @@ def test_a_reading_may_lag_behind_the_plant_but_neither_writes_nor_watchdogs_do(
     assert bus.servos[0].report(bus.now)["stopped_by_watchdog"]
 
 
-def test_a_rehearsal_is_heard_by_nobody_and_changes_no_reply() -> None:
-    c, rehearsed = client(prepared=True), client(prepared=True)
-    ask = framing.frame(
-        BROADCAST, framing.FAST_SYNC_READ, struct.pack("<HHBB", reg.PRESENT_CURRENT, 10, 1, 2)
-    )
-    for each in (c, rehearsed):
-        each.write(reg.TORQUE_ENABLE, 1, 1)
-        each.write(reg.BUS_WATCHDOG, 1, 1)
-        assert each.bus.feed(ask, each.t)
-    packets = rehearsed.bus.packets
-    for part in (ask, ask[:9], ask[9:], framing.frame(1, framing.REBOOT)):
-        rehearsed.bus.rehearse(part, rehearsed.t + 0.01)
-    assert rehearsed.bus.packets == packets
-    for each in (c, rehearsed):
-        each.bus.advance(each.t + 0.021)
-        assert each.bus.servos[0].report(each.bus.now)["stopped_by_watchdog"]
-    assert c.bus.feed(ask, c.t + 0.022) == rehearsed.bus.feed(ask, c.t + 0.022) != b""
-
-
 # --- anything at all -------------------------------------------------------------------------
 
 

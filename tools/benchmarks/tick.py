@@ -54,7 +54,7 @@ def measure(brief: bool = False) -> list[Report]:
 def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) -> list[Row]:
     """The pipeline alone: back to back with and without subscribers, in place at ``rates``.
 
-    In place also with the rehearsal before each tick. SCHED_FIFO and one processor where allowed.
+    SCHED_FIFO and one processor where allowed.
     """
     samples: dict[str, list[float]] = {}
     used: dict[str, float] = {}  # s of the processor, of all seconds
@@ -63,16 +63,12 @@ def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) ->
         for daemon in (quiet, heard):
             hold(daemon)
             can(daemon)
-        quiet.rehearse(Settings().realtime.rehearsal)
-        rehearse = quiet.loop.rehearsal
         turns: dict[str, Callable[[], list[float]]] = {
             "back to back": partial(ticks, quiet, 200),
             "back to back, state and frames subscribed": partial(ticks, heard, 200),
         }
         for rate in rates:
-            name = f"in place at {rate:g} Hz"
-            turns[name] = partial(in_place, quiet, rate)
-            turns[f"{name}, rehearsed"] = partial(in_place, quiet, rate, before=rehearse)
+            turns[f"in place at {rate:g} Hz"] = partial(in_place, quiet, rate)
         with RealTime(_own_processor()):
             for _ in range(rounds):
                 for name, turn in turns.items():
@@ -112,19 +108,12 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
     return samples
 
 
-def in_place(
-    daemon: Daemon, rate: float, count: int = 0, before: Callable[[float], None] | None = None
-) -> list[float]:
-    """Times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s.
-
-    ``before`` is called before each sleep with its end.
-    """
+def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
+    """Times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(count or round(0.15 * rate)):
         deadline += 1.0 / rate
-        if before is not None:
-            before(deadline)
         machine.sleep_until(deadline)
         samples += ticks(daemon, 1)
     return samples

@@ -97,8 +97,6 @@ def _serve(
         return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
-        if measures.rehearsal:
-            daemon.rehearse(measures.rehearsal)
         signals.hand_over(loop)
         signal.signal(signal.SIGUSR1, lambda *_: loop.stop())
         for event in measures.events():

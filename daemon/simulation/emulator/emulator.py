@@ -227,20 +227,11 @@ class Emulator:
     # --- the event loop --------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most.
-
-        Shortly before a request is expected the hand is brought up to date and the reply rehearsed,
-        and nothing slow is begun until it has come: its reply waits for no physics.
-        """
+        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
         start = self.clock.now()
         if servos is not None:
-            begin, end = servos.rush
-            if start < begin:
-                due = min(due, begin)
-            elif start < end:
-                due = max(due, end)
             due = min(due, servos.next_event())
         if self._watched is None:
             self._watched = self._watch()
@@ -254,11 +245,6 @@ class Emulator:
             elif isinstance(each, socket.socket):
                 self._control.serve([each])
                 self._watched = None
-        if servos is not None and servos.rush[0] <= t < servos.rush[1]:
-            if start < servos.rush[0]:
-                self._advance(t)
-                servos.rehearse(t)
-            return
         late = [board for board in boards if board.next_event() <= t]
         if late:
             self._advance(t)

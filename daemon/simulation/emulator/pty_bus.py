@@ -32,10 +32,6 @@ PASSAGE = 15e-6
 # s by which what a reading shows may be older than its reply, as in a servo, which measures at
 # intervals of its own: so that the physics is computed beside the exchange, not within it.
 _LAG = 0.0005
-# A client that asks at even intervals, no shorter than _SELDOM, finds the servos waiting from _SOON
-# before each request is expected until _LATE after it [s].
-_SELDOM, _SOON, _LATE = 0.0009, 0.0002, 0.0002
-_NEVER = -math.inf, -math.inf
 _SCHEDSTAT = "/proc/thread-self/schedstat"  # ns run, ns waited for a processor, times run
 
 
@@ -85,10 +81,6 @@ class PtyServoBus:
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
-        self._asked, self._request = -math.inf, b""  # when the last request came, and which
-        # When the next request is likely, by the interval of the last two: from then until then no
-        # longer work ought to be begun.
-        self.rush = _NEVER
         self.plug()
 
     def fileno(self) -> int:
@@ -127,10 +119,6 @@ class PtyServoBus:
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
-    def rehearse(self, t: float) -> None:
-        """Get ready at time t [s] for a request like the last."""
-        self.bus.rehearse(self._request, t)
-
     def service(self, t: float, since: float | None = None) -> None:
         """Take what has arrived by time t [s], let the servos act, send what is due.
 
@@ -144,9 +132,6 @@ class PtyServoBus:
                 except OSError:  # nothing there
                     break
                 if self._receive(data, t, arrived):
-                    expected, often = 2.0 * t - self._asked, t - self._asked < _SELDOM
-                    self.rush = _NEVER if often else (expected - _SOON, expected + _LATE)
-                    self._asked, self._request = t, data
                     break  # the client takes some time for the reply
                 # Its next request often comes while its last write is being done.
                 arrived = t = max(t, self._clock())

@@ -128,10 +128,6 @@ class PacketParser:
             packets.append(packet)
         return packets
 
-    def known(self, data: bytes) -> list[Packet]:
-        """The packet that ``data`` is, if it is a whole reading that was heard before."""
-        return self._known.get(data, [])
-
     def reset(self) -> None:
         """Forget a packet begun."""
         self._buffer.clear()

@@ -170,14 +170,6 @@ class ServoBus:
             for late, spoilt in self.faults.spoil(reply.data)
         ]
 
-    def rehearse(self, reading: bytes, t: float) -> None:
-        """Do what answering ``reading`` takes, unheard by the servos, if they were asked it before.
-
-        Soon afterwards it takes half the time: after a sleep little of it is in caches.
-        """
-        for packet in self.parser.known(reading):
-            self._answers(packet, self.servos, t)
-
     def fault(self, kind: str, value: float, t: float) -> None:
         """Let a fault begin: one of LINE_FAULTS with its probability, or of SERVO_FAULTS with the
         servo's ID."""
