@@ -148,6 +148,15 @@ class Parts(NamedTuple):
     sensors: bool
 
 
+class TimeSpread(NamedTuple):
+    """One of the loop's times: median, tail and largest value since the start [s]."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+
 class SensorFacts(NamedTuple):
     """What subscribers learn of a tactile sensor with each frame; see ``hand/tactile``."""
 

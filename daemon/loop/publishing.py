@@ -115,8 +115,9 @@ class Publishing:
         if seq % self._stats_every == self._stats_phase:
             rates = self._rates(state)
             if wanted & _STATS:
-                told = state, self._period, rates, self._statistics, self._stats_every
-                publisher.send(schema.STATS, *told)
+                statistics = self._statistics
+                told = state, self._period, rates, statistics.ticks, statistics.spreads()
+                publisher.send(schema.STATS, *told, self._stats_every)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:
         frame = self._seen[perception.finger] = perception.frame

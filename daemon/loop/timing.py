@@ -12,13 +12,12 @@ Meanwhile a hand on real time was left alone; a simulated one on its own time ha
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Timing
+from softfinger.daemon.types import TimeSpread, Timing
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 
 TIMES = ("wake", "compute", "bus", "publish")
@@ -40,15 +39,6 @@ _BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.ove
 Event = tuple[str, str, str]
 Counts = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
-
-
-class TimeSpread(NamedTuple):
-    """One time's median, tail and largest value since the start [s]."""
-
-    p50: float
-    p99: float
-    p999: float
-    max: float
 
 
 @inner_kernel

@@ -1,18 +1,34 @@
 """The stream's schema: every field of every topic, declared once.
 
-A topic is a record. Each of its fields has a unit, a meaning, and the expression that the daemon
-takes it from. From it follow the packers (`wire.packer`), the records that clients read
-(`client.records`), the page ``STREAM.md`` and the JSON schemas of recordings (`wire.schema_docs`).
+A topic is a record. Each of its fields has a unit and a meaning, and is taken from a source: by a
+function, or as the source's attribute of the same name. From it follow the packers (`wire.packer`),
+the records that clients read (`client.records`), the page ``STREAM.md`` and the JSON schemas of
+recordings (`wire.schema_docs`).
 
 Fields are only ever added, none is left out, and a float is always sent as a float. SI units.
 """
 
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.types import FINGERS, Frame
+from softfinger.daemon.types import (
+    FINGERS,
+    Frame,
+    HandFacts,
+    ObjectPose,
+    Parts,
+    Reading,
+    SensorFacts,
+    State,
+    TimeSpread,
+    Truth,
+)
 from softfinger.daemon.wire.fields import TOPICS as TOPICS
-from softfinger.daemon.wire.fields import field, part, record, topic
+from softfinger.daemon.wire.fields import FieldSource, record, topic
 from softfinger.daemon.wire.fields import fields_of as fields_of
 
 SCHEMA = 1
@@ -28,131 +44,165 @@ TRUTH = b"hand/truth"
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
 # What several topics begin with.
-_SCHEMA = "", "number of this schema; changes only when a field's meaning does", "SCHEMA"
-_SEQ = "", "counts up: ticks, frames, events", "seq"
-_STEP = "", "one of so many is sent", "step"
-_UNIX = "s", "Unix time", "wall"
-_MONO = "ns", "the daemon's monotonic clock at the tick", "int(t * 1e9)"
-_TICK = {"seq": "state.seq", "wall": "state.wall", "t": "state.t"}
-_TEMPERATURE = "°C", "of the servo, 0 while not known", "reading.temperature[{i}]"
-_VOLTAGE = "V", "of the servo's supply, 0 while not known", "reading.voltage[{i}]"
+_SCHEMA = "", "number of this schema; changes only when a field's meaning does"
+_SEQ = "", "counts up: ticks, frames, events"
+_STEP = "", "one of so many is sent"
+_UNIX = "s", "Unix time"
+_MONO = "ns", "the daemon's monotonic clock at the tick"
+_TEMPERATURE = "°C", "of the servo, 0 while not known"
+_VOLTAGE = "V", "of the servo's supply, 0 while not known"
+
+
+def _ns(t: float) -> int:
+    return int(t * 1e9)
+
+
+# What several topics' sources have alike is taken as from one of them.
+_tick = FieldSource["StateSource"]()
+_state = _tick.of(lambda m: m.state)
+_timing = _state.of(lambda s: s.timing)
+_news = FieldSource["EventSource"]()
 
 
 @record
 class _TickMessage:
     """What is sent every so many ticks."""
 
-    schema: int = field(*_SCHEMA)
-    seq: int = field(*_SEQ)
-    seq_step: int = field(*_STEP)
-    timestamp: float = field(*_UNIX)
-    mono_ns: int = field(*_MONO)
+    schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
+    seq: int = _state(*_SEQ)
+    seq_step: int = _tick(*_STEP, lambda m: m.step)
+    timestamp: float = _state(*_UNIX, lambda s: s.wall)
+    mono_ns: int = _state(*_MONO, lambda s: _ns(s.t))
 
 
 @record
 class _Announcement:
     """What is sent when it happens."""
 
-    schema: int = field(*_SCHEMA)
-    seq: int = field(*_SEQ)
-    again: bool = field("", "repeated for a late subscriber, with its first seq and times", "False")
-    timestamp: float = field(*_UNIX)
-    mono_ns: int = field("ns", "the daemon's monotonic clock", "int(t * 1e9)")
+    schema: int = _news(*_SCHEMA, lambda _: SCHEMA)
+    seq: int = _news(*_SEQ)
+    again: bool = _news(
+        "", "repeated for a late subscriber, with its first seq and times", lambda _: False
+    )
+    timestamp: float = _news(*_UNIX, lambda m: m.wall)
+    mono_ns: int = _news("ns", "the daemon's monotonic clock", lambda m: _ns(m.t))
+
+
+class StateSource(NamedTuple):
+    """Source of a ``hand/state``."""
+
+    state: State
+    scene: Parts
+    step: int = 1
+
+
+class _Finger(NamedTuple):
+    state: State
+    scene: Parts
+    i: int
+
+
+_finger = FieldSource[_Finger]()
+_contact = _finger.of(lambda f: f.state.contacts[f.i])
+_pose = FieldSource[ObjectPose]()
+_goal = _state.of(lambda s: s.goal)
+
+
+def _valid(f: _Finger) -> bool:
+    scene, state = f.scene, f.state
+    read = state.reading.valid or not scene.servos
+    return scene.fingers[f.i] and read and (state.contacts[f.i].valid or not scene.sensors)
+
+
+def _frame_age(f: _Finger) -> float:
+    contact = f.state.contacts[f.i]
+    return f.state.t - contact.t if contact.seq else 0.0
 
 
 @record
 class FingerState:
     """One finger in ``hand/state``."""
 
-    valid: bool = field(
-        "",
-        "in the scene, with fresh and sound data from its servo and sensor",
-        "scene.fingers[{i}] and read and (contact{i}.valid or not scene.sensors)",
+    valid: bool = _finger(
+        "", "in the scene, with fresh and sound data from its servo and sensor", _valid
     )
-    q: float = field("rad", "joint angle, positive closes", "reading.q[{i}]")
-    dq: float = field("rad/s", "joint velocity", "reading.dq[{i}]")
-    current: float = field("A", "motor current, positive closes", "reading.current[{i}]")
-    temperature: float = field(*_TEMPERATURE)
-    voltage: float = field(*_VOLTAGE)
-    goal_q: float = field("rad", "goal angle", "goal.q[{i}]")
-    goal_current: float = field("A", "bound on the current's magnitude", "goal.current[{i}]")
-    d: float = field("m", "maximum displacement of the tip")
-    theta: float = field("rad", "the object's angle in the tip's frame, in the hand's plane")
-    tilt_y: float = field("rad", "and across the plane")
-    force: float = field(
+    q: float = _finger("rad", "joint angle, positive closes", lambda f: f.state.reading.q[f.i])
+    dq: float = _finger("rad/s", "joint velocity", lambda f: f.state.reading.dq[f.i])
+    current: float = _finger(
+        "A", "motor current, positive closes", lambda f: f.state.reading.current[f.i]
+    )
+    temperature: float = _finger(*_TEMPERATURE, lambda f: f.state.reading.temperature[f.i])
+    voltage: float = _finger(*_VOLTAGE, lambda f: f.state.reading.voltage[f.i])
+    goal_q: float = _finger("rad", "goal angle", lambda f: f.state.goal.q[f.i])
+    goal_current: float = _finger(
+        "A", "bound on the current's magnitude", lambda f: f.state.goal.current[f.i]
+    )
+    d: float = _contact("m", "maximum displacement of the tip")
+    theta: float = _contact("rad", "the object's angle in the tip's frame, in the hand's plane")
+    tilt_y: float = _contact("rad", "and across the plane")
+    force: float = _contact(
         "N", "elastic force, gain · F(d, total tilt of theta and tilt_y) by the contact table"
     )
-    energy: float = field("J", "elastic potential energy, gain · U(d, total tilt) likewise")
-    d_std: float = field("m", "standard deviation of d")
-    theta_std: float = field("rad", "standard deviation of theta")
-    force_std: float = field("N", "standard deviation of force, with that of the tip's law")
-    shear_x: float = field(
+    energy: float = _contact("J", "elastic potential energy, gain · U(d, total tilt) likewise")
+    d_std: float = _contact("m", "standard deviation of d")
+    theta_std: float = _contact("rad", "standard deviation of theta")
+    force_std: float = _contact("N", "standard deviation of force, with that of the tip's law")
+    shear_x: float = _contact(
         "N",
         "force along a solid tip's face, in the hand's plane, by the newest frame; 0 with springs",
     )
-    shear_y: float = field("N", "and across the plane")
-    gain: float = field("", "measured over modelled pressure")
-    misfit: bool = field("", "the frame fits no contact of the model: d, theta may be biased")
-    contact: bool = field("", "something touches the tip")
-    frame_seq: int = field("", "the estimate's tactile frame, 0 before the first", "contact{i}.seq")
-    frame_age_s: float = field(
-        "s", "age of that frame's sample", "t - contact{i}.t if contact{i}.seq else 0.0"
+    shear_y: float = _contact("N", "and across the plane")
+    gain: float = _contact("", "measured over modelled pressure")
+    misfit: bool = _contact("", "the frame fits no contact of the model: d, theta may be biased")
+    contact: bool = _contact("", "something touches the tip")
+    frame_seq: int = _contact(
+        "", "the estimate's tactile frame, 0 before the first", lambda c: c.seq
     )
+    frame_age_s: float = _finger("s", "age of that frame's sample", _frame_age)
 
 
 @record
 class ObjectState:
     """The object in ``hand/state``, from the two contacts."""
 
-    valid: bool = field("", "both contacts give the object's pose")
-    angle: float = field(
+    valid: bool = _pose("", "both contacts give the object's pose")
+    angle: float = _pose(
         "rad",
         "the object's angle in the hand's frame: of its faces' bisector, or of the line between "
         "the contacts of a disc",
     )
-    width: float = field("m", "the object's width between the tips")
+    width: float = _pose("m", "the object's width between the tips")
 
 
 @topic(
     STATE,
     "What the hand is, does and feels, every n-th tick (`stream.state_rate`).",
-    "state, scene, step=1",
-    "state.{name}",
-    **_TICK,
-    timing="state.timing",
-    reading="state.reading",
-    goal="state.goal",
-    pose="state.object",
-    read="reading.valid or not scene.servos",
-    contact0="state.contacts[0]",
-    contact1="state.contacts[1]",
+    StateSource,
 )
 @record
 class HandState(_TickMessage):
     """One ``hand/state``."""
 
-    mode: str = field("", "disarmed, armed, moving, grasping, holding, rotating, releasing, fault")
-    fault: str = field("", "reason of the latched fault, empty when none")
-    fault_name: str = field("", "its name in `softfinger.daemon.safety.limits`, empty when none")
-    torque: bool = field("", "torque is on, or not known to be off")
-    tick_s: float = field("s", "from the last tick's start to this one's", "timing.tick_s")
-    compute_s: float = field("s", "work of the last tick", "timing.compute_s")
-    wake_late_s: float = field("s", "this tick's start after its deadline", "timing.wake_late_s")
-    overruns: int = field("", "ticks whose work outlasted the period", "timing.overruns")
-    behind_s: float = field(
-        "s",
-        "how long a hand simulated in the daemon has waited for a busy machine since the start",
-        "timing.behind_s",
+    mode: str = _state("", "disarmed, armed, moving, grasping, holding, rotating, releasing, fault")
+    fault: str = _state("", "reason of the latched fault, empty when none")
+    fault_name: str = _state("", "its name in `softfinger.daemon.safety.limits`, empty when none")
+    torque: bool = _state("", "torque is on, or not known to be off")
+    tick_s: float = _timing("s", "from the last tick's start to this one's")
+    compute_s: float = _timing("s", "work of the last tick")
+    wake_late_s: float = _timing("s", "this tick's start after its deadline")
+    overruns: int = _timing("", "ticks whose work outlasted the period")
+    behind_s: float = _timing(
+        "s", "how long a hand simulated in the daemon has waited for a busy machine since the start"
     )
-    goal_force: float = field(
+    goal_force: float = _goal(
         "N",
         "mean tip force of the grip: as commanded, or raised against slip; NaN without a grip",
-        "goal.force",
+        lambda g: g.force,
     )
-    goal_angle: float = field("rad", "object angle of the grip; NaN without one", "goal.angle")
-    left: FingerState = part("contact{i}.{name}", "left finger: ", i=0)
-    right: FingerState = part("contact{i}.{name}", "right finger: ", i=1)
-    object: ObjectState = part("pose.{name}")
+    goal_angle: float = _goal("rad", "object angle of the grip; NaN without one", lambda g: g.angle)
+    left: FingerState = _tick.part("left finger: ", lambda m: _Finger(m.state, m.scene, 0))
+    right: FingerState = _tick.part("right finger: ", lambda m: _Finger(m.state, m.scene, 1))
+    object: ObjectState = _state.part("", lambda s: s.object)
 
     def finger(self, name: str) -> FingerState:
         """``left`` or ``right`` by its name. Raises ValueError for another."""
@@ -161,42 +211,60 @@ class HandState(_TickMessage):
         return self.left if name == FINGERS[0] else self.right
 
 
+class TactileSource(NamedTuple):
+    """Source of a ``hand/tactile``."""
+
+    frame: Frame
+    data: NDArray[np.uint16]  # as published [rows, cols]
+    finger: int
+    facts: SensorFacts
+    wall: float
+    step: int = 1
+    number: int = 0
+
+
+_tactile = FieldSource[TactileSource]()
+_frame = _tactile.of(lambda m: m.frame)
+_facts = _tactile.of(lambda m: m.facts)
+
+
 @topic(
     TACTILE,
     "The grids' raw frames (`stream.tactile_rate`), one finger a message.",
-    "frame, data, finger, facts, wall, step=1, number=0",
-    "facts.{name}",
-    seq="frame.seq",
-    t="frame.t_sample",
+    TactileSource,
 )
 @record
 class TactileFrame:
     """One ``hand/tactile``. Raises ValueError when its data isn't a grid of rows × cols."""
 
-    schema: int = field(*_SCHEMA)
-    seq: int = field(*_SEQ)
-    seq_step: int = field(*_STEP)
-    number: int = field("", "counts this sensor's messages: a gap is a loss on the way", "number")
-    timestamp: float = field(*_UNIX)
-    mono_ns: int = field("ns", "the daemon's monotonic clock at the board's scan", "int(t * 1e9)")
-    delay_s: float = field("s", "from the scan until the frame had come", "frame.t_arrival - t")
-    valid: bool = field("", "false: the board is gone, this is its last frame again", "frame.valid")
-    finger: str = field("", "left or right", "FINGERS[finger]")
-    rows: int = field("", "cells along y", "data.shape[0]")
-    cols: int = field("", "cells along x", "data.shape[1]")
-    pitch: float = field("m", "from column to column")
-    pitch_y: float = field("m", "from row to row")
-    centre_x: float = field("m", "the tip's centre off the grid's, along x")
-    centre_y: float = field("m", "and along y")
-    rotation: float = field("rad", "of the sensor's axes against the finger's")
-    unit: str = field("", "`count`: as the board sent it; `Pa`: as it was estimated")
-    scale: float = field("Pa", "one step of the data, exact for linear sensors")
-    calibrated: bool = field("", "data × scale is the pressure by the calibration")
-    calibration: str = field("", "name and date of the estimator's calibration, or empty")
-    data: bytes = field(
+    schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
+    seq: int = _frame(*_SEQ)
+    seq_step: int = _tactile(*_STEP, lambda m: m.step)
+    number: int = _tactile("", "counts this sensor's messages: a gap is a loss on the way")
+    timestamp: float = _tactile(*_UNIX, lambda m: m.wall)
+    mono_ns: int = _frame(
+        "ns", "the daemon's monotonic clock at the board's scan", lambda f: _ns(f.t_sample)
+    )
+    delay_s: float = _frame(
+        "s", "from the scan until the frame had come", lambda f: f.t_arrival - f.t_sample
+    )
+    valid: bool = _frame("", "false: the board is gone, this is its last frame again")
+    finger: str = _tactile("", "left or right", lambda m: FINGERS[m.finger])
+    rows: int = _tactile("", "cells along y", lambda m: m.data.shape[0])
+    cols: int = _tactile("", "cells along x", lambda m: m.data.shape[1])
+    pitch: float = _facts("m", "from column to column")
+    pitch_y: float = _facts("m", "from row to row")
+    centre_x: float = _facts("m", "the tip's centre off the grid's, along x")
+    centre_y: float = _facts("m", "and along y")
+    rotation: float = _facts("rad", "of the sensor's axes against the finger's")
+    unit: str = _facts("", "`count`: as the board sent it; `Pa`: as it was estimated")
+    scale: float = _facts("Pa", "one step of the data, exact for linear sensors")
+    calibrated: bool = _facts("", "data × scale is the pressure by the calibration")
+    calibration: str = _facts("", "name and date of the estimator's calibration, or empty")
+    data: bytes = _tactile(
         "",
         "rows × cols little-endian uint16, row by row",
-        "data.astype('<u2', copy=False).tobytes()",
+        lambda m: m.data.astype("<u2", copy=False).tobytes(),
     )
 
     def __post_init__(self) -> None:
@@ -215,189 +283,275 @@ class TactileFrame:
         return self.counts.astype(np.float64) * self.scale
 
 
+class EventSource(NamedTuple):
+    """Source of a ``hand/event``."""
+
+    seq: int
+    wall: float
+    t: float
+    level: str
+    kind: str
+    text: str
+
+
+_event = FieldSource[EventSource]()
+
+
 @topic(
     EVENT,
     "What happened: modes, faults, warnings; late subscribers get the last 50 again.",
-    "seq, wall, t, level, kind, text",
+    EventSource,
 )
 @record
 class Event(_Announcement):
     """One ``hand/event``."""
 
-    level: str = field("", "info, warning or error")
-    kind: str = field("", "what it is about: mode, fault, servos, …")
-    text: str = field("", "one line for a person")
+    level: str = _event("", "info, warning or error")
+    kind: str = _event("", "what it is about: mode, fault, servos, …")
+    text: str = _event("", "one line for a person")
+
+
+_times = FieldSource[TimeSpread]()
+_rates = FieldSource["Rates"]()
 
 
 @record
 class Spread:
     """One of the loop's times in ``hand/stats``."""
 
-    p50: float = field("s", "median")
-    p99: float = field("s", "99 % are below")
-    p999: float = field("s", "99.9 % are below")
-    max: float = field("s", "longest")
+    p50: float = _times("s", "median")
+    p99: float = _times("s", "99 % are below")
+    p999: float = _times("s", "99.9 % are below")
+    max: float = _times("s", "longest")
 
 
 @record
 class Rates:
     """How often things have happened over the last second, in ``hand/stats``."""
 
-    tick: float = field("Hz", "ticks")
-    left: float = field("Hz", "tactile frames that came from the left sensor")
-    right: float = field("Hz", "tactile frames that came from the right sensor")
-    state: float = field("Hz", "states that went out")
-    tactile: float = field("Hz", "tactile frames that went out")
+    tick: float = _rates("Hz", "ticks")
+    left: float = _rates("Hz", "tactile frames that came from the left sensor")
+    right: float = _rates("Hz", "tactile frames that came from the right sensor")
+    state: float = _rates("Hz", "states that went out")
+    tactile: float = _rates("Hz", "tactile frames that went out")
 
 
-@topic(
-    STATS,
-    "Once a second, how the loop keeps its time.",
-    "state, period, rates, statistics, step=1",
-    "statistics.{name}",
-    **_TICK,
-    spreads="statistics.spreads()",
-)
+class StatsSource(NamedTuple):
+    """Source of a ``hand/stats``."""
+
+    state: State
+    period: float
+    rates: Rates
+    ticks: int
+    spreads: Mapping[str, TimeSpread]
+    step: int = 1
+
+
+_stats = FieldSource[StatsSource]()
+
+
+@topic(STATS, "Once a second, how the loop keeps its time.", StatsSource)
 @record
 class LoopStatistics(_TickMessage):
     """One ``hand/stats``."""
 
-    ticks: int = field("", "since the start, as all of this but the rates")
-    overruns: int = field("", "ticks whose work outlasted the period", "state.timing.overruns")
-    period_s: float = field("s", "the tick's period", "period")
-    wake: Spread = part("spreads['wake'].{name}", "a tick's start after its deadline: ")
-    compute: Spread = part("spreads['compute'].{name}", "all of a tick's work: ")
-    bus: Spread = part("spreads['bus'].{name}", "reading and writing the servos: ")
-    publish: Spread = part("spreads['publish'].{name}", "publishing: ")
-    rates: Rates = part("rates.{name}", "over the last second: ")
+    ticks: int = _stats("", "since the start, as all of this but the rates")
+    overruns: int = _timing("", "ticks whose work outlasted the period")
+    period_s: float = _stats("s", "the tick's period", lambda m: m.period)
+    wake: Spread = _stats.part("a tick's start after its deadline: ", lambda m: m.spreads["wake"])
+    compute: Spread = _stats.part("all of a tick's work: ", lambda m: m.spreads["compute"])
+    bus: Spread = _stats.part("reading and writing the servos: ", lambda m: m.spreads["bus"])
+    publish: Spread = _stats.part("publishing: ", lambda m: m.spreads["publish"])
+    rates: Rates = _stats.part("over the last second: ", lambda m: m.rates)
 
 
-@topic(
-    SETTINGS,
-    "Once, and again for late subscribers: what this hand is.",
-    "seq, wall, t, facts",
-    "facts.{name}",
-)
+class SettingsSource(NamedTuple):
+    """Source of a ``hand/settings``."""
+
+    seq: int
+    wall: float
+    t: float
+    facts: HandFacts
+
+
+_hand_facts = FieldSource[SettingsSource]().of(lambda m: m.facts)
+
+
+@topic(SETTINGS, "Once, and again for late subscribers: what this hand is.", SettingsSource)
 @record
 class HandSettings(_Announcement):
     """One ``hand/settings``."""
 
-    version: str = field("", "of softfinger")
-    settings: str = field("", "all settings, as JSON")
-    calibration_left: str = field("", "the left sensor's calibration as JSON, or empty")
-    calibration_right: str = field("", "the right sensor's")
-    table_left: str = field(
+    version: str = _hand_facts("", "of softfinger")
+    settings: str = _hand_facts("", "all settings, as JSON")
+    calibration_left: str = _hand_facts("", "the left sensor's calibration as JSON, or empty")
+    calibration_right: str = _hand_facts("", "the right sensor's")
+    table_left: str = _hand_facts(
         "", "the left tip's contact table: form, tolerance, certificate (bound of its error)"
     )
-    table_right: str = field("", "the right tip's")
+    table_right: str = _hand_facts("", "the right tip's")
 
 
-@topic(
-    COMMAND,
-    "Each command that was answered, by whomever; `status` is left out.",
-    "seq, wall, t, tick, request, error",
-)
+class CommandSource(NamedTuple):
+    """Source of a ``hand/command``."""
+
+    seq: int
+    wall: float
+    t: float
+    tick: int
+    request: Mapping[str, Any]
+    error: str
+
+
+_command = FieldSource[CommandSource]()
+
+
+@topic(COMMAND, "Each command that was answered, by whomever; `status` is left out.", CommandSource)
 @record
 class AnsweredCommand(_Announcement):
     """One ``hand/command``."""
 
-    tick: int = field("", "seq of the tick at which it was answered")
-    command: str = field("", "its name", "str(request.get('command', ''))")
-    client: str = field(
-        "", "who sent it, empty for all who give no name", "str(request.get('client', ''))"
+    tick: int = _command("", "seq of the tick at which it was answered")
+    command: str = _command("", "its name", lambda m: str(m.request.get("command", "")))
+    client: str = _command(
+        "",
+        "who sent it, empty for all who give no name",
+        lambda m: str(m.request.get("client", "")),
     )
-    request: str = field("", "all of it, as JSON", "json.dumps(request, default=str)")
-    ok: bool = field("", "carried out", "not error")
-    error: str = field("", "why it was refused, empty when it was carried out")
+    request: str = _command("", "all of it, as JSON", lambda m: json.dumps(m.request, default=str))
+    ok: bool = _command("", "carried out", lambda m: not m.error)
+    error: str = _command("", "why it was refused, empty when it was carried out")
+
+
+class InputSource(NamedTuple):
+    """Source of a ``hand/input``."""
+
+    state: State
+    frames: Sequence[Frame | None]
+
+
+class _InputFinger(NamedTuple):
+    reading: Reading
+    i: int
+    frame: Frame
+
+
+_input = FieldSource[InputSource]()
+_read = FieldSource[State]()
+_reading = _read.of(lambda s: s.reading)
+_taken = FieldSource[_InputFinger]()
+_newest = _taken.of(lambda f: f.frame)
+
+
+def _input_finger(m: InputSource, i: int) -> _InputFinger:
+    return _InputFinger(m.state.reading, i, m.frames[i] or NO_FRAME)
 
 
 @record
 class InputReading:
     """The servos' reading in ``hand/input``."""
 
-    seq: int = field("", "readings of the servos")
-    t: float = field("s", "when the last good one was taken; −∞ before it")
-    valid: bool = field("", "this tick's is good")
-    alert: int = field("", "bit i: servo of finger i reports a hardware error")
-    error: str = field("", "what the bus failed with, or empty", "state.read_error")
-    lost: int = field("", "bit i: servo of finger i holds none of the last goals")
-    frozen: int = field("", "bit i: servo of finger i measures nothing new")
+    seq: int = _reading("", "readings of the servos")
+    t: float = _reading("s", "when the last good one was taken; −∞ before it")
+    valid: bool = _reading("", "this tick's is good")
+    alert: int = _reading("", "bit i: servo of finger i reports a hardware error")
+    error: str = _read("", "what the bus failed with, or empty", lambda s: s.read_error)
+    lost: int = _reading("", "bit i: servo of finger i holds none of the last goals")
+    frozen: int = _reading("", "bit i: servo of finger i measures nothing new")
 
 
 @record
 class InputFinger:
     """One finger in ``hand/input``."""
 
-    q: float = field("rad", "joint angle")
-    dq: float = field("rad/s", "joint velocity")
-    current: float = field("A", "motor current")
-    hardware: int = field("", "the servo's hardware error bits, 0 if not known")
-    temperature: float = field(*_TEMPERATURE)
-    voltage: float = field(*_VOLTAGE)
-    frame_seq: int = field("", "newest tactile frame, 0 before the first", "frame{i}.seq")
-    frame_t: float = field("s", "when it was scanned, by the daemon's clock", "frame{i}.t_sample")
-    frame_arrival: float = field("s", "when it was complete here", "frame{i}.t_arrival")
-    frame_valid: bool = field("", "false: the board is gone", "frame{i}.valid")
+    q: float = _taken("rad", "joint angle", lambda f: f.reading.q[f.i])
+    dq: float = _taken("rad/s", "joint velocity", lambda f: f.reading.dq[f.i])
+    current: float = _taken("A", "motor current", lambda f: f.reading.current[f.i])
+    hardware: int = _taken(
+        "", "the servo's hardware error bits, 0 if not known", lambda f: f.reading.hardware[f.i]
+    )
+    temperature: float = _taken(*_TEMPERATURE, lambda f: f.reading.temperature[f.i])
+    voltage: float = _taken(*_VOLTAGE, lambda f: f.reading.voltage[f.i])
+    frame_seq: int = _newest("", "newest tactile frame, 0 before the first", lambda f: f.seq)
+    frame_t: float = _newest(
+        "s", "when it was scanned, by the daemon's clock", lambda f: f.t_sample
+    )
+    frame_arrival: float = _newest("s", "when it was complete here", lambda f: f.t_arrival)
+    frame_valid: bool = _newest("", "false: the board is gone", lambda f: f.valid)
 
 
 @topic(
     INPUT,
     "All that a tick took in, every tick: what `replay --recompute` starts from.",
-    "state, frames",
-    "state.{name}",
-    **_TICK,
-    reading="state.reading",
-    timing="state.timing",
-    frame0="frames[0] or NO_FRAME",
-    frame1="frames[1] or NO_FRAME",
+    InputSource,
 )
 @record
 class TickInput:
     """One ``hand/input``."""
 
-    schema: int = field(*_SCHEMA)
-    seq: int = field(*_SEQ)
-    timestamp: float = field(*_UNIX)
-    mono_ns: int = field(*_MONO)
-    t: float = field("s", "the same, with all its digits", "t")
-    late_in_row: int = field("", "consecutive overruns", "timing.late_in_row")
-    busy_s: float = field("s", "how long a busy machine has just held up the loop", "timing.busy_s")
-    reading: InputReading = part("reading.{name}")
-    left: InputFinger = part("reading.{name}[{i}]", "left finger: ", i=0)
-    right: InputFinger = part("reading.{name}[{i}]", "right finger: ", i=1)
-    write_error: str = field("", "what the bus failed with when written to, or empty")
-    torque_off: bool = field("", "the servos confirmed at this tick that torque is off")
+    schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
+    seq: int = _state(*_SEQ)
+    timestamp: float = _state(*_UNIX, lambda s: s.wall)
+    mono_ns: int = _state(*_MONO, lambda s: _ns(s.t))
+    t: float = _state("s", "the same, with all its digits")
+    late_in_row: int = _timing("", "consecutive overruns")
+    busy_s: float = _timing("s", "how long a busy machine has just held up the loop")
+    reading: InputReading = _input.part("", lambda m: m.state)
+    left: InputFinger = _input.part("left finger: ", lambda m: _input_finger(m, 0))
+    right: InputFinger = _input.part("right finger: ", lambda m: _input_finger(m, 1))
+    write_error: str = _state("", "what the bus failed with when written to, or empty")
+    torque_off: bool = _state("", "the servos confirmed at this tick that torque is off")
+
+
+class TruthSource(NamedTuple):
+    """Source of a ``hand/truth``."""
+
+    state: State
+    truth: Truth
+    step: int = 1
+
+
+class _TruthOf(NamedTuple):
+    truth: Truth
+    i: int
+
+
+_truth = FieldSource[TruthSource]()
+_true_finger = FieldSource[_TruthOf]()
+_true_pose = FieldSource[NDArray[np.float64]]()
 
 
 @record
 class TrueFinger:
     """One finger in ``hand/truth``."""
 
-    d: float = field("m", "maximum displacement, negative: a gap", "float(truth.d[{i}])")
-    theta: float = field("rad", "the object's angle in the tip's frame", "float(truth.theta[{i}])")
-    force: float = field("N", "on the tip's base", "float(truth.force[{i}])")
+    d: float = _true_finger(
+        "m", "maximum displacement, negative: a gap", lambda f: float(f.truth.d[f.i])
+    )
+    theta: float = _true_finger(
+        "rad", "the object's angle in the tip's frame", lambda f: float(f.truth.theta[f.i])
+    )
+    force: float = _true_finger("N", "on the tip's base", lambda f: float(f.truth.force[f.i]))
 
 
 @record
 class TrueObject:
     """The object in ``hand/truth``."""
 
-    x: float = field("m", "the object's centre in the hand's frame", "float(pose[0])")
-    y: float = field("m", "and along y", "float(pose[1])")
-    angle: float = field("rad", "the object's angle in the hand's frame", "float(pose[2])")
+    x: float = _true_pose("m", "the object's centre in the hand's frame", lambda p: float(p[0]))
+    y: float = _true_pose("m", "and along y", lambda p: float(p[1]))
+    angle: float = _true_pose(
+        "rad", "the object's angle in the hand's frame", lambda p: float(p[2])
+    )
 
 
 @topic(
-    TRUTH,
-    "A simulated hand's own knowledge, with each state. No real hand has it.",
-    "state, truth, step=1",
-    **_TICK,
-    pose="truth.object_pose",
+    TRUTH, "A simulated hand's own knowledge, with each state. No real hand has it.", TruthSource
 )
 @record
 class TrueState(_TickMessage):
     """One ``hand/truth``, by names of its own: a plot of all topics keeps them apart."""
 
-    true_left: TrueFinger = part("", "left finger: ", i=0)
-    true_right: TrueFinger = part("", "right finger: ", i=1)
-    true_object: TrueObject = part("")
+    true_left: TrueFinger = _truth.part("left finger: ", lambda m: _TruthOf(m.truth, 0))
+    true_right: TrueFinger = _truth.part("right finger: ", lambda m: _TruthOf(m.truth, 1))
+    true_object: TrueObject = _truth.part("", lambda m: m.truth.object_pose)

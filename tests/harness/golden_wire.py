@@ -79,7 +79,8 @@ def arguments(topic: bytes) -> tuple[Any, ...]:
         for k in range(1, 100):
             times = (1e-6 * k, 10e-6 * k, 3e-6 * k, 2e-6 * k)
             record(statistics.counts, statistics.largest, times)
-        return state, 0.002, schema.Rates(500.0, 100.0, 99.5, 50.0, 25.0), statistics, 500
+        rates = schema.Rates(500.0, 100.0, 99.5, 50.0, 25.0)
+        return state, 0.002, rates, statistics.ticks, statistics.spreads(), 500
     if topic == schema.TRUTH:
         return state, SampleTruth(), 5
     if topic == schema.INPUT:

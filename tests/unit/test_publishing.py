@@ -122,7 +122,8 @@ def test_the_statistics_message_has_every_field_as_documented(
     statistics = Statistics()
     record(statistics.counts, statistics.largest, (1e-6, 2e-5, 1e-5, 2e-6))
     rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
-    publisher.send(STATS, State(seq=503, t=1.5, wall=9.0), 0.002, rates, statistics, 500)
+    state, spreads = State(seq=503, t=1.5, wall=9.0), statistics.spreads()
+    publisher.send(STATS, state, 0.002, rates, statistics.ticks, spreads, 500)
     until(lambda: [served.settle(), socket.poll(0)][1])
     topic, payload = socket.recv_multipart()
     assert topic == b"hand/stats"
@@ -144,7 +145,9 @@ def test_the_statistics_message_has_every_field_as_documented(
 
 
 def test_statistics_that_are_zero_are_still_floats() -> None:
-    message = stats_message(State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), Statistics(), 1)
+    message = stats_message(
+        State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), 0, Statistics().spreads()
+    )
     for name in ("wake", "compute", "bus", "publish"):
         assert [type(message[name][key]) for key in ("p50", "p99", "p999", "max")] == [float] * 4
     assert all(isinstance(rate, float) for rate in message["rates"].values())
