@@ -1,13 +1,14 @@
 """How Numba compiles kernels and keeps them; this module alone uses its private parts.
 
-`pyproject.toml` bounds Numba's version for that. `KernelCompiler` has the passes that kernels need,
+It is imported with versions of Numba that it was tested with; with others `plain` has its place.
+`KernelCompiler` has the passes that kernels need,
 and doesn't ask the same thing twice: left out are the passes for closures, `with`, parallel loops,
 branches on constants (LLVM's part) and the listing of types, which filled the cache. What an
 operation makes of its arguments' types, and the size of LLVM's types, are remembered: at each place
 in the source Numba looks through dozens of candidates for the one, and has LLVM parse a module for
 the other.
 
-`InnerKernel`s, which only kernels call, are compiled to LLVM's bitcode alone, never to machine
+`BitcodeKernel`s, which only kernels call, are compiled to LLVM's bitcode alone, never to machine
 code. Numba compiles every function that a kernel calls as if Python might call it, too: optimised
 with all it calls, made into machine code, wrapped twice, kept in the cache. Their callers take the
 bitcode and do all that again. Here the bitcode is all there is, which takes a third off the time of
@@ -54,6 +55,7 @@ from numba.core.untyped_passes import (
     TranslateByteCode,
 )
 
+from softfinger.kinematics.compiled import plain
 from softfinger.kinematics.compiled.kernel_folder import ROOT, kernel_folder, text
 
 _operation: Any = types.Function
@@ -139,28 +141,27 @@ _njit: Any = numba.njit
 _make_function: Any = numba._dynfunc.make_function  # type: ignore[attr-defined]
 
 
-class InnerKernel:
-    """What stands for an inner kernel in Python: Numba sees the kernel, a call is refused."""
+class BitcodeKernel(plain.InnerKernel):
+    """An inner kernel that is compiled to bitcode alone."""
 
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
-        self.py_func = function
-        self.__name__ = function.__name__
-        self.__doc__ = function.__doc__
-        self.__module__ = function.__module__
-        self.dispatcher: Any = _njit(
+    dispatcher: Any
+
+    def _register(self, options: dict[str, Any]) -> None:
+        self.dispatcher = _njit(
             pipeline_class=_InnerCompiler,
             no_cpython_wrapper=True,
             no_cfunc_wrapper=True,
             **options,
-        )(function)
+        )(self.py_func)
         # Numba would compile it anew for each literal among the arguments; LLVM folds them anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
         )
 
-    def also(self, other: InnerKernel, takes: Callable[[Any], bool]) -> None:
+    def also(self, other: plain.InnerKernel, takes: Callable[[Any], bool]) -> None:
         """Let ``other`` be compiled instead where ``takes`` the type of the first argument."""
+        assert isinstance(other, BitcodeKernel)
         mine, others = self.dispatcher, other.dispatcher
         template, overload = mine.get_call_template, mine.get_overload
         mine.get_call_template = lambda args, kws: (
@@ -172,13 +173,6 @@ class InnerKernel:
     def _numba_type_(self) -> Any:
         """By this Numba knows what a compiled caller means."""
         return self.dispatcher._numba_type_
-
-    def __call__(self, *values: Any) -> Any:
-        """Refused: there is no machine code for Python to call."""
-        raise TypeError(
-            f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
-            "what Python calls is marked @kernel"
-        )
 
 
 class _Bitcode(JITCodeLibrary):
@@ -294,3 +288,19 @@ def _add_symbols() -> None:
     """Tell LLVM of Numba's memory functions, which machine code calls."""
     for name, address in nrt._nrt.c_helpers.items():  # type: ignore[attr-defined]
         _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
+inner = BitcodeKernel
+
+
+def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Return ``function`` as one that Numba compiles and keeps, where there is a folder."""
+    dispatcher = _njit(no_cfunc_wrapper=True, pipeline_class=KernelCompiler, **options)(function)
+    try:
+        dispatcher._cache = KernelCache(function)
+    except RuntimeError:
+        pass  # no folder: `kernel_folder` has warned
+    called = inner(function, options).dispatcher  # by kernels: what is kept has no bitcode
+    dispatcher.get_call_template = called.get_call_template
+    dispatcher.get_overload = called.get_overload
+    return dispatcher

@@ -1,4 +1,4 @@
-"""The decorators behind every compiled kernel, and nothing else.
+"""The decorators behind every compiled kernel, and which way they are compiled.
 
 A kernel takes arrays, records and scalars and is pure. One that Python calls is a ``kernel``:
 compiled by Numba at its first call, with all it calls, and kept in the folder of
@@ -9,16 +9,34 @@ compiled by Numba at its first call, with all it calls, and kept in the folder o
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
 
-from softfinger.kinematics.compiled.compiler import InnerKernel, KernelCache, KernelCompiler
+from softfinger.kinematics.compiled import plain
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+# Minor versions of Numba with whose private parts `compiler` was tested.
+TESTED = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 _SUMS = {"reassoc", "contract", "nsz", "arcp"}
-_njit: Any = numba.njit
+
+
+def _chosen() -> tuple[ModuleType, str]:
+    """Return what compiles, and why it is Numba alone, else an empty text."""
+    if ".".join(numba.__version__.split(".")[:2]) not in TESTED:
+        return plain, f"Numba {numba.__version__} is not one of {', '.join(TESTED)}"
+    try:
+        from softfinger.kinematics.compiled import compiler
+    except (ImportError, AttributeError) as error:
+        return plain, f"Numba {numba.__version__}: {error}"
+    return compiler, ""
+
+
+_compiler, why_plain = _chosen()
 
 
 def kernel(function: Function) -> Function:
@@ -26,22 +44,12 @@ def kernel(function: Function) -> Function:
 
     The GIL is kept because reacquiring it in the loop can cost a whole switch interval.
     """
-    dispatcher = _njit(error_model="numpy", no_cfunc_wrapper=True, pipeline_class=KernelCompiler)(
-        function
-    )
-    try:
-        dispatcher._cache = KernelCache(function)
-    except RuntimeError:
-        pass  # no folder: `kernel_folder` has warned
-    inner = _inner(function).dispatcher  # for kernels that call it: what is kept has no bitcode
-    dispatcher.get_call_template = inner.get_call_template
-    dispatcher.get_overload = inner.get_overload
-    return cast(Function, dispatcher)
+    return cast(Function, _compiler.compiled(function, _OPTIONS))
 
 
 def inner_kernel(function: Function) -> Function:
     """As :func:`kernel`, for what only kernels call. A call from Python raises TypeError."""
-    return cast(Function, _inner(function))
+    return _inner(function)
 
 
 def fast_inner_kernel(function: Function) -> Function:
@@ -49,7 +57,7 @@ def fast_inner_kernel(function: Function) -> Function:
 
     For finite numbers only: NaN and infinity have no defined result there.
     """
-    return cast(Function, _inner(function, fastmath=_SUMS))
+    return _inner(function, fastmath=_SUMS)
 
 
 def inlined_kernel(function: Function) -> Function:
@@ -58,8 +66,8 @@ def inlined_kernel(function: Function) -> Function:
     For the innermost functions of a hot path, where a call costs as much as the work. Its code is
     there again in each caller, so it should be short.
     """
-    return cast(Function, _inner(function, fastmath={"contract"}, forceinline=True))
+    return _inner(function, fastmath={"contract"}, forceinline=True)
 
 
-def _inner(function: Callable[..., Any], **options: Any) -> InnerKernel:
-    return InnerKernel(function, {"error_model": "numpy", **options})
+def _inner(function: Function, **options: Any) -> Function:
+    return cast(Function, _compiler.inner(function, {**_OPTIONS, **options}))

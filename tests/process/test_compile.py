@@ -107,6 +107,17 @@ def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch: pytest.Monkey
         kernel_build.build_kernels(Settings(), lambda *_: None, bar=False)
 
 
+def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_build, "is_built", lambda *_: False)
+    monkeypatch.setattr(kernel_build, "why_plain", "Numba 99.0 is new")
+    monkeypatch.setattr(kernel_build._Build, "run", lambda _: None)
+    told: list[str] = []
+    kernel_build.build_kernels(Settings(), lambda *event: told.append(event[2]), bar=False)
+    assert [text for text in told if "99.0" in text] == [
+        "compiled by Numba alone, in twice the time: Numba 99.0 is new"
+    ]
+
+
 def test_ctrl_c_ends_every_process(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*SOFTFINGER, "compile"], env=environment(tmp_path), stderr=subprocess.PIPE, text=True

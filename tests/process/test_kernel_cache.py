@@ -68,6 +68,7 @@ class Package:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.first = ""  # of each script
         self.cache = folder / "cache"
         for name, text in FILES.items():
             self.write(name, text)
@@ -86,7 +87,7 @@ class Package:
         environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
         environment.pop("NUMBA_CACHE_DIR", None)
         done = subprocess.run(
-            [sys.executable, "-c", script],
+            [sys.executable, "-c", self.first + script],
             env=environment,
             cwd=self.folder,
             capture_output=True,
@@ -101,7 +102,9 @@ def package(tmp_path: Path) -> Package:
     return Package(tmp_path)
 
 
-def test_a_changed_callee_or_constant_is_compiled_anew(package: Package) -> None:
+@pytest.mark.parametrize("first", ["", "import numba\nnumba.__version__ = '99.0'\n"])
+def test_a_changed_callee_or_constant_is_compiled_anew(package: Package, first: str) -> None:
+    package.first = first
     assert package.run() == (["3.0", "0"], "")
     package.write(
         "softfinger/kinematics/callee.py",

@@ -5,16 +5,20 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
+import sys
 import types
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numba
 import pytest
 
 from softfinger import daemon, kinematics
-from softfinger.kinematics.compiled import compiler
-from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics import compiled
+from softfinger.kinematics.compiled import kernel as decorators
+from softfinger.kinematics.compiled import plain
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.kernel_folder import kernel_sources
 from softfinger.kinematics.contact.closed_form import theta_limit
 
@@ -31,6 +35,44 @@ def test_an_inner_kernel_works_in_kernels_and_refuses_python() -> None:
         theta_limit(0.02, 0.0)
 
 
+@inner_kernel
+def _half(x: Any) -> Any:
+    return 0.5 * x
+
+
+@inner_kernel
+def _half_of_none(_: Any) -> float:
+    return -1.0
+
+
+cast(Any, _half).also(_half_of_none, lambda kind: isinstance(kind, numba.types.NoneType))
+
+
+@kernel
+def half(x: Any) -> Any:
+    return _half(x)
+
+
+def test_which_inner_kernel_is_compiled_depends_on_the_first_arguments_type() -> None:
+    assert half(3.0) == 1.5
+    assert half(None) == -1.0
+
+
+@pytest.mark.parametrize("why", ["99.0", "compiler"])
+def test_numba_alone_compiles_where_its_private_parts_are_not_known(
+    why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if why == "compiler":
+        monkeypatch.setattr(numba, "__version__", "0.68.0")
+        monkeypatch.delattr(compiled, "compiler", raising=False)
+        monkeypatch.setitem(sys.modules, "softfinger.kinematics.compiled.compiler", None)
+    else:
+        monkeypatch.setattr(numba, "__version__", why)
+    chosen, text = decorators._chosen()
+    assert chosen is plain
+    assert why in text
+
+
 def kernels() -> Iterator[Any]:
     """Every kernel of the program, as Python's function."""
     for package in (kinematics, daemon):
@@ -44,7 +86,9 @@ def kernels() -> Iterator[Any]:
 
 def test_the_caches_name_covers_all_that_kernels_are_made_of() -> None:
     sources = set(kernel_sources())
-    assert Path(compiler.__file__).resolve() in sources
+    assert {
+        Path(plain.__file__).with_name(f"{each}.py").resolve() for each in ("compiler", "plain")
+    } <= sources
     count = 0
     for function in kernels():
         count += 1

@@ -19,6 +19,7 @@ from typing import IO, Any, NamedTuple
 
 from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.compiled.kernel import why_plain
 from softfinger.kinematics.compiled.kernel_folder import kernel_folder, user_cache
 from softfinger.tools.terminal.progress import Progress
 
@@ -64,6 +65,8 @@ def build_kernels(
     if kernel_folder() is None:
         tell("warning", "compile", "kernels are compiled in this process, for half a minute")
         return Built(0, False)
+    if why_plain:
+        tell("info", "compile", f"compiled by Numba alone, in twice the time: {why_plain}")
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels, on the first start only: {names}")
     started = time.monotonic()
