@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, cast
 
 import numba
 import numpy as np
-from numba.core.extending import intrinsic
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from softfinger import SoftfingerError

@@ -13,8 +13,8 @@ from typing import Annotated, Any, TypeAlias, cast
 
 import numba
 import numpy as np
-from numba.core import types
-from numba.core.extending import intrinsic
+from numba import types
+from numba.extending import intrinsic
 
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
-from numba.core import types
+from numba import types
 
 from softfinger.kinematics.compiled.kernel import Function, fast_inner_kernel, inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
