@@ -110,10 +110,12 @@ def _comments(lines: list[str], node: ast.ClassDef) -> dict[str, str]:
 
 def _allowed(settings: Any, section: str, key: str, schema: dict[str, Any]) -> str:
     """The values that a key takes, in words."""
+    from softfinger.daemon.backends import BUILT_IN
+
     names = {
-        "servos.backend": settings.SERVOS,
-        "tactile.backend": settings.TACTILE,
-        "simulation.object_shape": settings.SHAPES,
+        "servos.backend": BUILT_IN["servos"],
+        "tactile.backend": BUILT_IN["tactile"],
+        "simulation.object_shape": BUILT_IN["shapes"],
     }.get(f"{section}.{key}")
     if names is not None:
         return ", ".join(f"`{name}`" for name in names) + ", or a [plugin](plugins.md)'s"

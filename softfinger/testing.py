@@ -11,14 +11,13 @@ import time
 
 import numpy as np
 
-from softfinger.daemon.backends import make_sensor, make_servos
 from softfinger.daemon.clock import make_clock
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.simulation.physics.plant_state import DISC
 from softfinger.daemon.simulation.physics.shapes import Shape, polygon, shape_of
-from softfinger.daemon.tactile.base import TactileSensor
+from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading
 
 __all__ = ["check_servos", "check_shape", "check_tactile", "load"]

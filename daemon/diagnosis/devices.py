@@ -10,7 +10,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.diagnosis.ports import check_latency_timer
 from softfinger.daemon.errors import ServoError, TactileError
@@ -29,6 +28,7 @@ from softfinger.daemon.servos.provisioning import (
     provision,
     search,
 )
+from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS
 
 _PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts anew

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from softfinger import __version__
-from softfinger.daemon.backends import SERVOS, TACTILE, make_sensor, make_servos
+from softfinger.daemon.backends import needs_hand
 from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -23,7 +23,8 @@ from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.tactile.base import TactileSensor
+from softfinger.daemon.servos.base import make_servos
+from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.types import FINGERS, HandFacts
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
@@ -108,7 +109,7 @@ class Daemon:
         Its tips are of the settings' material, whatever a calibration says of them.
         """
         settings = self.settings
-        if not (SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand):
+        if not needs_hand(settings.servos.backend, settings.tactile.backend):
             return None
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softfinger.daemon.backends import SERVOS, TACTILE
+from softfinger.daemon.backends import needs_hand
 from softfinger.daemon.perception.calibration_file import Converter, calibration_for
 from softfinger.daemon.perception.finger_model import FingerModel, make_estimator, make_models
 from softfinger.daemon.profile.factory import make_material
@@ -71,7 +71,7 @@ def parts(settings: Settings) -> list[Part]:
     then; the other the contact table, then the simulated hand and the filter, which look up in it;
     the shorter ones even out what is left.
     """
-    simulated = SERVOS[settings.servos.backend].hand or TACTILE[settings.tactile.backend].hand
+    simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"
     wanted = {
         _TABLE: True,

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 import softfinger
-from softfinger.daemon.backends import KINDS, used
+from softfinger.daemon.backends import BUILT_IN, backend, known
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
@@ -58,7 +58,7 @@ def checked(
         found = [_line(details) for details in error.errors()]
     if directory is not None:
         settings = _with_directory(settings, directory)
-    found += [*problems(settings, wrong), *_plugin_problems(settings, wrong)]
+    found += [*problems(settings, wrong), *_plugin_problems(settings)]
     if found:
         raise SettingsError(
             "\n".join(
@@ -148,29 +148,23 @@ def _sound_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
     return Settings(**sound), wrong
 
 
-def _plugin_problems(settings: Settings, wrong: Collection[str]) -> Iterator[str]:
-    """What is wrong with the tables of plugins, and with a plugin's shape as it is set."""
-    tables = dict(settings.plugins.model_extra or {})
-    for key, backend in used(settings).items():
-        if not backend.source or key.partition(".")[0] in wrong:
-            continue
-        name = backend.name
-        table = tables.pop(name, None)
-        if table is not None and backend.section is None:
-            yield f"plugins.{name}: found settings, but {backend.source} has none"
+def _plugin_problems(settings: Settings) -> Iterator[str]:
+    """What is wrong with the tables of plugins."""
+    tables = settings.plugins.tables
+    for each in (
+        backend("servos", settings.servos.backend),
+        backend("tactile", settings.tactile.backend),
+        backend("shapes", settings.simulation.object_shape),
+    ):
         try:
-            options = backend.options(settings)
+            each.options(tables)
         except ValidationError as error:
-            section = backend.section
-            yield from (_line(each, ["plugins", name], section) for each in error.errors())
-            continue
-        if backend.shape:
-            try:
-                backend.load()(settings.simulation, *options)
-            except Exception as error:  # whatever a stranger's function does
-                yield f"{key}: {backend.source}: {type(error).__name__}: {error}"
+            above = ["plugins", each.name]
+            yield from (_line(every, above, each.section) for every in error.errors())
+        if each.name in tables and each.section is None:
+            yield f"plugins.{each.name}: found settings, but {each.source} has none"
     for name in tables:
-        if not any(name in kind for kind in KINDS):
+        if not any(name in known(kind) for kind in BUILT_IN):
             yield f"plugins.{name}: found settings of a plugin that is not installed"
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from softfinger.daemon.backends import SERVOS, SHAPES, TACTILE, Backends, known_servo_models
+from softfinger.daemon.backends import Kind, backend, known, known_servo_models
 from softfinger.daemon.errors import PluginError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
@@ -41,27 +41,27 @@ LawName = Literal["energy", "upright"]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
-def _one_of(names: Backends) -> AfterValidator:
-    """A text that names one of these, in pydantic's words for a Literal."""
+def _backend(kind: Kind) -> AfterValidator:
+    """A text that names a backend, in pydantic's words for a Literal."""
 
     def check(name: str) -> str:
         try:
-            known = name in names
+            backend(kind, name)
         except PluginError as error:
             why = {"why": str(error)}
             raise PydanticCustomError("plugin", "a plugin that works: {why}", why) from None
-        if not known:
-            *most, last = map(repr, names)
+        except KeyError:
+            *most, last = map(repr, known(kind))
             listed = {"known": f"{', '.join(most)} or {last}"}
-            raise PydanticCustomError("one_of", "Input should be {known}", listed)
+            raise PydanticCustomError("one_of", "Input should be {known}", listed) from None
         return name
 
     return AfterValidator(check)
 
 
 def _servo_model(name: str) -> str:
-    if known := known_servo_models(name):
-        raise PydanticCustomError("servo_model", "one of {known}", {"known": known})
+    if models := known_servo_models(name):
+        raise PydanticCustomError("servo_model", "one of {known}", {"known": models})
     return name
 
 
@@ -129,7 +129,7 @@ class TableSettings(Section):
 class ServoSettings(Section):
     """The joints."""
 
-    backend: Annotated[str, _one_of(SERVOS)] = "simulated"  # what drives the joints
+    backend: Annotated[str, _backend("servos")] = "simulated"  # what drives the joints
     port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
     baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000  # bit/s
     model: Model = "XM430-W350"  # of both servos
@@ -150,7 +150,7 @@ class ServoSettings(Section):
 class TactileSettings(Section):
     """The pressure grids under the tips."""
 
-    backend: Annotated[str, _one_of(TACTILE)] = "simulated"  # where frames come from
+    backend: Annotated[str, _backend("tactile")] = "simulated"  # where frames come from
     port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")  # "{dir}" as for the servos
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000  # bit/s
     rows: Annotated[int, Field(ge=4, le=256)] = 44  # cells along y
@@ -320,7 +320,7 @@ class SimulationSettings(Section):
 
     seed: Annotated[int, Field(ge=0)] = 1  # of noise and faults
     object_mass: Factor = 0.10  # kg
-    object_shape: Annotated[str, _one_of(SHAPES)] = "rectangle"  # seen from the side
+    object_shape: Annotated[str, _backend("shapes")] = "rectangle"  # seen from the side
     object_width: Length = 0.040  # m; of a wedge: at half its height
     object_height: Length = 0.060  # m, away from the palm
     object_radius: Length = 0.020  # m, of a disc
@@ -373,9 +373,10 @@ class PluginSettings(Section):
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
 
-    def of(self, name: str) -> Any:
-        """The plugin's table, as it stands in the profile."""
-        return (self.model_extra or {}).get(name, {})
+    @property
+    def tables(self) -> dict[str, Any]:
+        """The tables by the plugins' names, as they stand in the profile."""
+        return self.model_extra or {}
 
 
 class Settings(Section):
@@ -404,4 +405,5 @@ class Settings(Section):
     @property
     def simulated(self) -> bool:
         """Neither real servos nor real sensors take part."""
-        return not (SERVOS[self.servos.backend].metal or TACTILE[self.tactile.backend].metal)
+        servos, tactile = self.servos.backend, self.tactile.backend
+        return not (backend("servos", servos).metal or backend("tactile", tactile).metal)

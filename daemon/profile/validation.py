@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
-from softfinger.daemon.backends import SERVOS, TACTILE
+from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_SHARE
 
@@ -57,7 +57,8 @@ def _backends(settings: Settings) -> Iterator[str]:
     both = f"servos.backend, tactile.backend: found {servos} and {tactile}"
     if servos == tactile == "none":
         yield f"{both}, expected at least one"
-    elif "none" not in (servos, tactile) and SERVOS[servos].metal != TACTILE[tactile].metal:
+    metal = {backend("servos", servos).metal, backend("tactile", tactile).metal}
+    if "none" not in (servos, tactile) and len(metal) > 1:
         yield f"{both}, expected both real or both simulated (none takes one out)"
 
 
@@ -279,9 +280,9 @@ def _addresses(settings: Settings) -> Iterator[str]:
 
 def _folder(settings: Settings) -> Iterator[str]:
     ports = []
-    if SERVOS[settings.servos.backend].metal:
+    if backend("servos", settings.servos.backend).metal:
         ports.append(("servos.port", settings.servos.port))
-    if TACTILE[settings.tactile.backend].metal:
+    if backend("tactile", settings.tactile.backend).metal:
         ports += [("tactile.port", port) for port in settings.tactile.port]
     for key, port in ports:
         if "{dir}" in port:

@@ -1,4 +1,4 @@
-"""What every servo backend offers the loop, and what it reports."""
+"""What every servo backend offers the loop and reports, and the one that settings name."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.backends import backend
+from softfinger.daemon.clock import Clock
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Goal, Reading
 
 FloatArray = NDArray[np.float64]
@@ -115,3 +118,16 @@ class JointPlant(Protocol):
         ``mode`` is 5 (current-based position: ``goal_current`` bounds the magnitude), 3 (position:
         likewise, with the model's own limit) or 0 (current: ``goal_current`` is signed).
         """
+
+
+def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None:
+    """Make the settings' servo backend, not yet connected; None in a scene without servos.
+
+    ``hand``: the simulated hand, for backends that need it. Raises as the backend does.
+    """
+    found = backend("servos", settings.servos.backend)
+    if settings.servos.backend == "none":
+        return None
+    scene = (settings, hand) if found.hand else (settings,)
+    servos: Servos = found.load()(*scene, clock, *found.options(settings.plugins.tables))
+    return servos

@@ -1,9 +1,12 @@
-"""The interface of every tactile backend, and its errors."""
+"""The interface of every tactile backend, and the one that settings name."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
+from softfinger.daemon.backends import backend
+from softfinger.daemon.clock import Clock
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
 
 
@@ -21,3 +24,19 @@ class TactileSensor(Protocol):
 
     def close(self) -> None:
         """Stop reading and close. Never raises."""
+
+
+def make_sensor(
+    settings: Settings, clock: Clock, hand: object, finger: int
+) -> TactileSensor | None:
+    """Make the settings' backend for one finger, not yet open; None in a scene without sensors.
+
+    ``hand``: the simulated hand, for backends that need it. Raises as the backend does.
+    """
+    found = backend("tactile", settings.tactile.backend)
+    if settings.tactile.backend == "none":
+        return None
+    scene = (settings, hand) if found.hand else (settings.tactile,)
+    options = found.options(settings.plugins.tables)
+    sensor: TactileSensor = found.load()(*scene, clock, finger, *options)
+    return sensor

@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import Clock, RealClock, VirtualClock
 from softfinger.daemon.errors import TactileError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.tactile.base import TactileSensor
+from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.types import Frame
 from tests.conftest import until
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.emulator.folder import LINKS
+from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.tactile.flexitac import FlexiTac
 from tests.conftest import until
 from tests.harness.emulated import SdkServos, board, emulated, send

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softfinger.daemon.backends import make_servos
 from softfinger.daemon.clock import RealClock, VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import dynamixel
-from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.servos.control_table import AMBIENT, THERMAL_TIME, by_name
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.types import Reading

@@ -147,6 +147,18 @@ def test_too_much_force_latches_a_fault_that_waits_for_clear(make: Make) -> None
     command(daemon, "arm")
 
 
+def test_an_error_of_a_backend_ends_the_loop_with_torque_off(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = grasped(make(), 8.0)
+    assert all(torque_of(daemon))
+    sensor = daemon.loop.perception.fingers[0].sensor
+    monkeypatch.setattr(sensor, "latest", lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        daemon.loop.run(0.1)
+    assert not any(torque_of(daemon))
+
+
 def test_frames_that_stop_coming_latch_a_fault(make: Make) -> None:
     daemon = grasped(make(), 5.0)
     perception = daemon.loop.perception.fingers[1]

@@ -11,14 +11,13 @@ from typing import Any, Protocol
 
 import pytest
 
-from softfinger.daemon.backends import make_servos
 from softfinger.daemon.clock import Clock, VirtualClock
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import dynamixel
-from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.joint import current_toward
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand

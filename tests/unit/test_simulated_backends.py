@@ -7,15 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.backends import make_sensor, make_servos
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.base import make_servos
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
+from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import Goal, Reading
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material

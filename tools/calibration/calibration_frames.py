@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.backends import make_sensor
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.tactile.base import TactileSensor
+from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.tactile.replay import TRUTHS, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.kinematics.calibration.calibration import CalibrationError

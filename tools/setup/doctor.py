@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 
-from softfinger.daemon.backends import KINDS, SERVOS, TACTILE, installed, source
+from softfinger.daemon.backends import BUILT_IN, backend, plugins, source
 from softfinger.daemon.diagnosis.devices import (
     check_board,
     check_servos,
@@ -63,9 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
 def results(settings: Settings, fix: bool) -> Iterator[Finding]:
     """All checks in the order of what needs what, with what was repaired before them."""
     ports = _ports(settings)
-    for kind in KINDS:
-        for entries in installed(kind.group).values():
-            yield from (Finding("note", kind.group, source(entry)) for entry in entries)
+    for kind in BUILT_IN:
+        yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
     yield note_ports()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
     free = {}
@@ -77,7 +76,7 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
             yield from _latency(settings, path, fix)
     yield from _servos(settings, free, fix)
     tactile = settings.tactile
-    if not TACTILE[tactile.backend].metal:
+    if not backend("tactile", tactile.backend).metal:
         yield Finding("note", "tactile", f"{tactile.backend}: no board to ask")
     else:
         for name in settings.scene.fingers:
@@ -94,7 +93,8 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
 def _ports(settings: Settings) -> list[tuple[str, str]]:
     """(key, path) of every port that the scene needs; what a plugin opens is not known."""
     ports = []
-    servos, tactile = SERVOS[settings.servos.backend], TACTILE[settings.tactile.backend]
+    servos = backend("servos", settings.servos.backend)
+    tactile = backend("tactile", settings.tactile.backend)
     if servos.metal and not servos.source:
         ports.append(("servos.port", settings.servos.port))
     if tactile.metal and not tactile.source:
@@ -117,10 +117,11 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
 
 def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Finding]:
     servos = settings.servos
-    if not SERVOS[servos.backend].metal:
+    found = backend("servos", servos.backend)
+    if not found.metal:
         yield Finding("note", "servos", f"{servos.backend}: no servo to ask")
         return
-    if SERVOS[servos.backend].source:
+    if found.source:
         text = f"{servos.backend}: a plugin's, which softfinger.testing.check_servos tries"
         yield Finding("note", "servos", text)
         return

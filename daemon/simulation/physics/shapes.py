@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.daemon.backends import SHAPES
+from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings, SimulationSettings
 from softfinger.daemon.simulation.physics.plant_state import (
     CORNERS,
@@ -58,8 +58,8 @@ class Shape:
 def shape_of(settings: Settings) -> Shape:
     """The object of the settings, made by the function that `daemon.backends` names for it."""
     simulation = settings.simulation
-    backend = SHAPES[simulation.object_shape]
-    shape: Shape = backend.load()(simulation, *backend.options(settings))
+    found = backend("shapes", simulation.object_shape)
+    shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
     return shape
 
 
