@@ -71,9 +71,15 @@ class Contact:
     d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
     theta_std: float = 0.0
     gain: float = 1.0  # measured pressure over modelled pressure
+    modulus_scale: float = 1.0  # of the tip's modulus over the settings' …
+    modulus_scale_std: float = 0.0
+    sensor_gain: float = 1.0  # … and of the sensor, whose product is `gain`, …
+    sensor_gain_std: float = 0.0
+    torque_scale: float = 1.0  # … and of the joint's torque constant over the settings'
+    torque_scale_std: float = 0.0
     misfit: bool = False  # the frame fits no contact of the model: d and theta may be biased
-    force: float = 0.0  # gain · F(d, total tilt of theta and tilt_y) by the contact table [N]
-    energy: float = 0.0  # gain · U(d, total tilt) [J]
+    force: float = 0.0  # modulus_scale · F(d, total tilt of theta and tilt_y) by the table [N]
+    energy: float = 0.0  # modulus_scale · U(d, total tilt) [J]
     force_std: float = 0.0  # standard deviation of force [N], with the table's and the law's error
     shear_x: float = 0.0  # force on the tip's face [N] along x and y, of a solid tip's newest frame
     shear_y: float = 0.0

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import checked
+from softfinger.daemon.types import Event
 
 
 @dataclass(frozen=True)
@@ -37,12 +38,18 @@ class Watched:
 
     def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
         settings = checked(sections | {"loop": {"clock": "virtual"}})
-        self._daemon = Daemon(settings, wire=False)
+        self.events: list[Event] = []
+        self._daemon = Daemon(settings, on_event=self._note, wire=False)
         self.control = self._daemon.loop._control
         assert self._daemon.hand is not None
         self.plant = self._daemon.hand
         self.contact_filter = self._daemon.loop.perception.filter
+        self.contacts = self._daemon.loop.state.contacts
         self.settings = settings
+
+    def _note(self, *event: str) -> None:
+        level, kind, text = event
+        self.events.append((level, kind, text))
 
     def __enter__(self) -> Watched:
         return self

@@ -60,6 +60,7 @@ class Grip:
         law.rotate_speed = control.rotate_speed
         law.damping = 2.0 * control.damping_ratio * math.sqrt(control.joint_inertia)
         law.friction = control.joint_friction
+        law.torque_error = control.torque_error
         law.friction_speed = control.friction_speed
         law.torque_max = settings.safety.current_max * control.torque_constant
         law.rest = math.exp(-2.0 * dt / control.smooth_time)

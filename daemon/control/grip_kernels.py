@@ -21,6 +21,8 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
+_SURE = 2.0  # standard deviations of the torque constants that a grip may need
+_ARM_MIN = 0.1  # of the finger's length
 _INTEGRAL_SHARE = 0.3  # the integral's bound, as a share of the force wanted
 _SHARE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
 _SHARE_ANGLE = 3e-3  # rad that the object may turn by that
@@ -42,6 +44,7 @@ class GripLaw(Record):
     friction: float  # of a joint [N·m]
     friction_speed: float  # from which on all of it is given [rad/s]
     torque_max: float  # [N·m]
+    torque_error: float  # relative, of the joints' torque constants
     rest: float  # what is left of a turning a tick later without frames
     upright: bool  # the fingers' shaking brings the object upright, its angle is not looked at
     half_separation: float  # of the hand, in m as its other lengths
@@ -116,11 +119,14 @@ def squeeze(
     """
     g = grips[0]
     grasp = grasps[0]
-    g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction)
+    speed = 0.5 * (dq[0] + dq[1])
+    g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction, speed)
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
-    g.push = wanted + _correction(g, wanted, mean(grasp.force))
+    push = wanted + _correction(g, wanted, mean(grasp.force))
+    load = grasp.load_lever * g.slip.load
+    g.push = min(push, _most(g, load, mean(grasp.arm)))
     if g.law.upright and not g.steering:
         torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
         return torque1, torque2, g.force.target, g.slip.turned
@@ -158,7 +164,8 @@ def press(
     """Torque [N·m] of one ``finger`` on an object that stands by itself."""
     g = grips[0]
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
-    g.push = wanted + _correction(g, wanted, grasps[0].force[finger])
+    push = wanted + _correction(g, wanted, grasps[0].force[finger])
+    g.push = min(push, _most(g, 0.0, grasps[0].arm[finger]))
     return _torque_alone(g, grasps[0], finger, g.force.speed, dq)
 
 
@@ -194,6 +201,18 @@ def _correction(g: GripState, wanted: float, felt: float) -> float:
         bound = _INTEGRAL_SHARE * g.force.target
         g.integral = min(max(integral, -bound), bound)
     return law.force_gain * error + g.integral
+
+
+@inner_kernel
+def _most(g: GripState, load: float, arm: float) -> float:
+    """The push [N] that the target force may take, whatever the sensors feel.
+
+    Beside what the torque constants may be off, friction and the torque [N·m] of the ``load`` that
+    is believed may take some; ``arm`` [m]: the force's lever.
+    """
+    law = g.law
+    force: float = g.force.target * (1.0 + _SURE * law.torque_error)
+    return force + (law.friction + load) / max(arm, _ARM_MIN * law.length)
 
 
 @inner_kernel

@@ -4,13 +4,14 @@ What these sensors show, and what they don't:
 
 - A pressure grid feels normal pressure only; shear does not change it.
 - The joints' currents show a load along the faces: what pressure does not explain of a torque is
-  shear (`hand.grasp_state`). A joint's friction hides a load of its torque over W turn, 1.7 N a
-  tip at the default hand. Up to that, what is seen when holding begins, and what changes slower
-  than in a second, is taken as friction. Less than half of it is no sign of a load; a load that is
-  seen is taken for more by what friction may hide. So a grip whose tips' friction bears less than
-  about twice that is not guarded well, at the default hand below 7 N, and below 2.8 N not at all.
-- A torque constant that is wrong by a share looks like a load in proportion to the grip: up to 10 %
-  of the torque are taken out when holding begins.
+  shear (`hand.grasp_state`), where both joints show it alike; what frames that drift explain is
+  taken off before (`perception.witnesses`), and a wrong torque constant is no load
+  (`perception.scales`). A joint's friction hides a load of its torque over W turn, 1.7 N a tip at
+  the default hand. Up to that, what is seen when holding begins, and what changes slower than in a
+  second, is taken as friction. Less than half of it is no sign of a load; a load that is seen is
+  taken for more by what friction may hide. So a grip whose tips' friction bears less than about
+  twice that is not guarded well, at the default hand below 7 N, and below 2.8 N not at all.
+- A solid tip's frames show the shear on its face, to 0.1 N.
 - A load towards the palm wedges the object between the tips: it shows less, and needs more to slip.
 - The object's angle is known twice, from frames and from the joints by rolling. What frames correct
   and no joint explains is shear of the tips up to μ (d1 + d2)/2W, and slip well beyond.
@@ -19,13 +20,13 @@ What these sensors show, and what they don't:
   ``control.tip_friction`` must not be more than the real friction.
 - While the grip is built up or the object turns, currents also move the joints: the last load is
   kept. A load that grows by more than about 10 N a second is too fast for that.
-- One that comes at once moves the joints, and their damping shows it before the sensors do: where
-  both joints' torques are off by more than twice their friction, or by what makes a load of that,
-  and three standard deviations of what they flicker by, it is believed at the same tick. How much
-  is to come is not known: the grip is raised by all of ``control.grip_raise_max``, as fast as
-  ``safety.current_rate`` lets it. Of a load towards the palm the torques show less the greater it
-  is, never more than lever²/4 bow, or 0.07 N·m at 10 N, of which friction hides most: a sudden one
-  is seen in a grip of 20 N, in one of 18 N it is not.
+- One that comes at once makes the joints give way, and their damping shows it before the sensors
+  do: where both joints' torques jump by more than they flicker while the encoders say that the
+  joints give way, and what stands and comes leaves too little of the friction, it is believed at
+  the same tick. A sliding tip shows no more than friction bears, so how much is to come is not
+  known: the grip is raised by all it may, as fast as ``safety.current_rate`` lets it. Of a load
+  towards the palm the torques show less the greater it is, never more than lever²/4 bow, or
+  0.07 N·m at 10 N: a sudden one is hardly seen.
 """
 
 from __future__ import annotations
@@ -40,15 +41,18 @@ from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import load_of
 
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
-_SUDDEN = 0.5  # of what friction bears with its margin: a load that comes at once, and may go on
+_SUDDEN = 0.7  # of what friction bears with its margin: a load that comes at once, and may go on
 _LEARN = 1.0  # s in which the friction at rest is learnt
-_SCALE_ERROR = 0.1  # share by which the torque constant may be off
 _KEPT = 1.0  # s that a raised grip is kept after the need for it has gone
 _BACK = 2.0  # s in which it then comes back by all of `grip_raise_max`
 _TURNED_MORE = 0.5  # share that the grip is raised by when the object turns in it
 _WELL = 1.5  # times what the tips' shear explains: the object turns in the grip
 _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth, creep
-_SIGNS = 3.0  # standard deviations, of the angle and of the torques, more than that
+_LEAST_JUMP = 0.01  # N·m of a jump, besides
+_SHEAR_JUMP = 0.6  # N: frames scatter by 0.1
+_YIELDS = 0.01  # rad/s that both joints give way faster than just before: half a count of one
+_FAST = 0.1  # rad/s, likewise
+_SIGNS = 4.0  # standard deviations, of the angle and of the torques, more than that
 _BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a sudden load
 _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
 _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
@@ -65,6 +69,7 @@ class SlipLaw(Record):
     joint_friction: float  # [N·m]
     object_load: float  # [N]
     raise_max: float  # [N]
+    raise_share: float  # of the force asked for
 
 
 class SlipState(Record):
@@ -75,11 +80,11 @@ class SlipState(Record):
     turned: bool  # the object has turned in the grip, at this tick
     reflex: bool  # it has, or a load came at once: the grip is to be raised at once
     known: bool  # what stood of the joints' torques when holding began:
-    still: float  # what of it does not grow with the grip [N·m]
-    share: float  # and what does, over the normal force [m]
+    still: float  # friction, as a rule [N·m]
     smooth: Pair  # what nothing else explains of them, averaged [N·m]
-    last: Pair  # it at the last tick [N·m]
-    variance: float  # of it from tick to tick [N²·m²]
+    variance: float  # of both joints' mean about that [N²·m²]
+    speed: float  # of the joints' closing, averaged [rad/s]
+    felt: float  # the load that solid tips feel, averaged [N]
     age: float  # since holding began, up to `_LEARN` [s]
     stray: float  # sum of unexplained turning that has been looked at [rad]
     away: float  # unexplained turning that is not forgotten yet [rad]
@@ -96,15 +101,16 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
     law.force_max = GRIP_SHARE * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
-    law.object_load, law.raise_max = control.object_load, control.grip_raise_max
+    law.object_load = control.object_load
+    law.raise_max, law.raise_share = control.grip_raise_max, control.grip_raise_share
 
 
 @inner_kernel
 def forget(s: SlipState) -> None:
     """Nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
-    s.load = s.still = s.share = s.variance = s.age = 0.0
-    s.smooth[0] = s.smooth[1] = s.last[0] = s.last[1] = 0.0
+    s.load = s.felt = s.still = s.variance = s.age = 0.0
+    s.smooth[0] = s.smooth[1] = s.speed = 0.0
     s.stray = s.away = s.needed = s.most = s.idle = 0.0
 
 
@@ -114,51 +120,48 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.known = grasp.load_lever > 0.0
     if not s.known:
         return
-    normal = mean(grasp.normal)
-    friction, scale = s.law.joint_friction, _SCALE_ERROR * normal * mean(grasp.arm)
-    before = s.share * normal
-    found = mean(s.smooth) + before
-    s.still = min(max(found, -friction), friction)
-    taken = min(max(found - s.still, -scale), scale)
-    s.share = taken / normal if normal > 0.0 else 0.0
-    s.smooth[0] += before - taken
-    s.smooth[1] += before - taken
+    friction = s.law.joint_friction
+    s.still = min(max(mean(s.smooth), -friction), friction)
     s.stray = grasp.stray
     s.away = 0.0
     s.age = _SMOOTH
 
 
 @inner_kernel
-def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: float) -> float:
+def look(
+    s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: float, speed: float
+) -> float:
     """The grip force [N] to go to: ``asked``, or more where the margin needs it.
 
     ``holding``: nothing but loads moves the joints. ``closing``, -1 to 1: how much of the joints'
-    friction is given at present for closing.
+    friction is given at present for closing. ``speed`` [rad/s]: of the joints' closing.
     """
     law = s.law
     s.turned = False
-    s.most = max(min(asked + law.raise_max, law.force_max), asked)
+    raised = min(law.raise_max, law.raise_share * asked)
+    s.most = max(min(asked + raised, law.force_max), asked)
     judged = holding and s.known and grasp.load_lever > 0.0
-    sudden = _average(s, grasp, closing, judged)
+    # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
+    spare = law.friction * (1.0 - law.margin) - grasp.shear
+    sudden = _average(s, grasp, closing, speed, judged, spare)
     if judged:
         _weigh(s, grasp)
         _watch_turning(s, grasp)
     else:
         s.stray = grasp.stray
-    # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
-    spare = law.friction * (1.0 - law.margin) - grasp.shear
     # A grip that bears less than the joints' friction hides is not judged by their torques.
     seen = s.load if law.friction * asked * grasp.load_lever > law.joint_friction else 0.0
-    load = max(seen, 0.5 * law.object_load)
+    felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
+    sudden = _shear_jumps(s, felt, spare * mean(grasp.normal), judged) or sudden
+    load = max(seen, felt, 0.5 * law.object_load)
     needed = 0.0
     if load > 0.0:
         needed = load / max(spare, _LEAST_SPARE * law.friction)
     if s.turned:
         needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, s.needed))
-    s.reflex = s.turned
-    if sudden and load > _SUDDEN * max(spare, 0.0) * mean(grasp.normal):
+    s.reflex = s.turned or sudden
+    if sudden:
         needed = s.most  # how much more is to come is not known
-        s.reflex = True
     if needed >= s.needed:
         s.needed = min(needed, s.most)
         s.idle = 0.0
@@ -170,14 +173,16 @@ def look(s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: 
 
 
 @inner_kernel
-def _average(s: SlipState, grasp: GraspState, closing: float, judged: bool) -> bool:
-    """Take in both joints' torques; whether a load has come at once.
+def _average(
+    s: SlipState, grasp: GraspState, closing: float, speed: float, judged: bool, spare: float
+) -> bool:
+    """Take in both joints' torques; whether a load has come at once that needs a firmer grip.
 
-    So much more, in both joints, is no flicker, no friction that turns round, no current that was
-    read wrongly, and no joint that is dead.
+    A jump of both that is no flicker, while the joints give way, is a load: no frame's error, which
+    moves no joint, and no current that was read wrongly.
     """
     friction = s.law.joint_friction
-    known = closing * friction + s.share * mean(grasp.normal)
+    known = closing * friction
     found1 = grasp.unexplained[0] - known
     found2 = grasp.unexplained[1] - known
     off1 = found1 - s.smooth[0]
@@ -185,27 +190,41 @@ def _average(s: SlipState, grasp: GraspState, closing: float, judged: bool) -> b
     off = 0.5 * (off1 + off2)
     before = mean(s.smooth) - s.still
     sudden = False
-    if judged and min(off1 * off, off2 * off) > _BOTH * off * off:
-        more = min(abs(off), abs(before + off) - abs(before))
-        shown = max(more - _SIGNS * math.sqrt(s.variance), 0.0)
-        load, _ = load_of(math.copysign(shown, off), grasp.load_lever, grasp.load_bow)
-        sudden = max(shown, grasp.load_lever * abs(load)) > 2.0 * friction
-    # Half of the mean square of a difference, of two joints.
-    change = 0.25 * ((found1 - s.last[0]) ** 2 + (found2 - s.last[1]) ** 2)
-    s.variance += (change - s.variance) * s.law.dt / _LEARN
-    s.last[0] = found1
-    s.last[1] = found2
-    weight = 1.0 if sudden else s.law.dt / _SMOOTH
-    s.smooth[0] += off1 * weight
-    s.smooth[1] += off2 * weight
+    alike = min(off1 * off, off2 * off) > _BOTH * off * off
+    flicker = _SIGNS * math.sqrt(s.variance) + _LEAST_JUMP
+    flicker += friction * max(1.0 - s.age / _LEARN, 0.0)  # joints may still come to rest
+    yields = (s.speed - speed) * math.copysign(1.0, off) > _YIELDS
+    s.speed += (speed - s.speed) * s.law.dt / _SMOOTH
+    if judged and alike and yields and abs(off) > flicker and abs(before + off) > abs(before):
+        load, slope = load_of(before + off, grasp.load_lever, grasp.load_bow)
+        hidden = friction / max(slope, _LEAST_LEVER * s.law.width)
+        sudden = abs(load) + 0.5 * hidden > _SUDDEN * max(spare, 0.0) * mean(grasp.normal)
+    if sudden:
+        s.smooth[0] += off1
+        s.smooth[1] += off2
+    elif abs(speed) < _FAST:  # beyond, torques also move the joints
+        s.variance += (off * off - s.variance) * s.law.dt / _LEARN
+        s.smooth[0] += off1 * s.law.dt / _SMOOTH
+        s.smooth[1] += off2 * s.law.dt / _SMOOTH
     return sudden
+
+
+@inner_kernel
+def _shear_jumps(s: SlipState, felt: float, bears: float, judged: bool) -> bool:
+    """Take in the load that solid tips feel [N]; whether one has come at once, as with torques.
+
+    ``bears`` [N]: what friction does with its margin.
+    """
+    jump = felt - s.felt
+    s.felt += jump * s.law.dt / _SMOOTH
+    return judged and jump > _SHEAR_JUMP and felt > _SUDDEN * bears
 
 
 @inner_kernel
 def _weigh(s: SlipState, grasp: GraspState) -> None:
     """Tell the load from the joints' friction."""
     law = s.law
-    off = mean(s.smooth) - s.still
+    off = _alike(s) - s.still
     load, slope = load_of(off, grasp.load_lever, grasp.load_bow)
     load = abs(load)
     friction = law.joint_friction / grasp.load_lever
@@ -219,6 +238,17 @@ def _weigh(s: SlipState, grasp: GraspState) -> None:
     sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
     hidden = law.joint_friction / max(slope, _LEAST_LEVER * law.width)
     s.load = min(max(4.0 * sure, 0.0), load + hidden)
+
+
+@inner_kernel
+def _alike(s: SlipState) -> float:
+    """The torque [N·m] that both joints show of a load: one alone doesn't speak for both."""
+    both = mean(s.smooth)
+    least = 0.0
+    if s.smooth[0] * s.smooth[1] > 0.0:
+        least = min(abs(s.smooth[0]), abs(s.smooth[1]))
+    most = least / _BOTH + s.law.joint_friction
+    return min(max(both, -most), most)
 
 
 @inner_kernel

@@ -223,7 +223,8 @@ class Loop:
             state.read_error = str(error)
             self._fail(str(error))
         if reading.valid and self.perception.fingers:
-            self.perception.filter.advance(reading)
+            gripping = state.mode in GRIPPING and state.goal.valid
+            self.perception.filter.advance(reading, state.goal if gripping else None)
 
     def _decide(self) -> None:
         state, control = self.state, self._control

@@ -31,9 +31,18 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.perception import contact_filter_kernels as kernels
 from softfinger.daemon.perception.contact_filter_kernels import FilterState, Past
+from softfinger.daemon.perception.scales import (
+    GAIN,
+    MODULUS,
+    MODULUS_ERROR,
+    TORQUE,
+    Prior,
+    Scales,
+    set_prior,
+)
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
-from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
+from softfinger.daemon.types import FINGERS, Contact, Frame, Goal, ObjectPose, Reading
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -41,6 +50,9 @@ from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
+
+_PHASES = {"grasping": kernels.RAMPING, "holding": kernels.HOLDING}
+_FAR = 0.25  # rad off its goal, a grip's joint takes all the current that it may
 
 
 class ContactFilter:
@@ -51,8 +63,10 @@ class ContactFilter:
         settings: Settings,
         tables: tuple[ContactTable, ContactTable],
         materials: tuple[Material, Material] | None = None,
+        modulus_errors: tuple[float, float] = (MODULUS_ERROR, MODULUS_ERROR),
     ) -> None:
-        """``tables``: each tip's; ``materials``: theirs, whose laws may be off their points."""
+        """Take each tip's table, its material, whose law may be off its points, and how well its
+        modulus is known (relative standard deviation)."""
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._with_object = settings.scene.object_model
@@ -73,6 +87,19 @@ class ContactFilter:
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(shares)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
+        control = settings.control
+        gain = settings.tactile.gain_error
+        set_prior(
+            state.grasp.scales,
+            Prior(
+                modulus_errors,
+                gain,
+                control.torque_error,
+                control.joint_friction,
+                control.joint_inertia,
+            ),
+        )
+        self._priors = [(error, gain) for error in modulus_errors]
         self._history: Any = np.zeros(
             round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
         )
@@ -81,10 +108,14 @@ class ContactFilter:
         self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
         self._read = False  # the joints are known
         self._live = [False, False]  # tips that touch and are carried on by the joints
+        self._news = True  # the scales may have changed
         self._sound = [False, False]  # the newest frame's estimate can be used
 
-    def advance(self, reading: Reading) -> None:
-        """Carry the estimates on to the instant of a good reading."""
+    def advance(self, reading: Reading, goal: Goal | None = None) -> None:
+        """Carry the estimates on to the instant of a good reading.
+
+        ``goal``: what it was to be, where a grip set its currents.
+        """
         self._read = True
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
@@ -96,6 +127,7 @@ class ContactFilter:
             (q1, q2),
             (dq1, dq2),
             (current1, current2),
+            (0.0, 0.0) if goal is None else (_pull(goal, 0, q1), _pull(goal, 1, q2)),
         )
 
     def correct(
@@ -106,38 +138,64 @@ class ContactFilter:
         sound = self._sound[finger] = frame.valid and estimate.valid
         if not sound:
             return  # nothing is learnt: the contact is carried on, and grows older
-        contact.t_sound = frame.t_arrival
-        contact.contact, contact.gain = estimate.contact, estimate.gain
-        contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
-        contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
         # Before a first reading nothing is known of the joints: the frame stands for itself.
-        live = self._live[finger] = estimate.contact and self._read
-        if not live:
-            tip = self._state.tip[finger]
-            tip.live, tip.d.mean = False, 0.0
-            law = self._state.tip[finger].law
-            _fill_from_frame(contact, estimate, self._tables[finger], law, self._state.radius)
-            return
-        kernels.correct(
+        live = estimate.contact and self._read
+        if live and not kernels.correct(
             self._state.array,
             self._history,
             finger,
             frame.t_sample,
-            (estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain),
+            (
+                estimate.d,
+                estimate.tilt_x,
+                estimate.tilt_y,
+                estimate.gain,
+                estimate.shear_x,
+            ),
             estimate.covariance,
             estimate.systematic,
-        )
+        ):
+            self._sound[finger] = False
+            return
+        self._live[finger] = live
+        self._news = True
+        contact.t_sound = frame.t_arrival
+        contact.contact, contact.gain = estimate.contact, estimate.gain
+        contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
+        contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
+        if not live:
+            tip = self._state.tip[finger]
+            tip.live, tip.d.mean = False, 0.0
+            _fill_from_frame(
+                contact,
+                estimate,
+                self._tables[finger],
+                tip.law,
+                self._priors[finger],
+                self._state.radius,
+            )
 
-    def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
-        """Write the estimates of time ``t`` into contacts and pose."""
+    def write_contacts(
+        self, t: float, contacts: list[Contact], pose: ObjectPose, mode: str = ""
+    ) -> None:
+        """Write the estimates of time ``t`` into contacts and pose.
+
+        ``mode``: the hand's, by which torques are taken for what they tell.
+        """
         live = self._live
         pose.valid = live[0] and live[1] and self._with_object
         pose.angle = pose.width = 0.0
         if live[0] or live[1]:
-            left, right, angle, width = kernels.write_grasp(self._state.array, *self._tables)
+            left, right, angle, width = kernels.write_grasp(
+                self._state.array, *self._tables, _PHASES.get(mode, kernels.OTHER)
+            )
             tips = left, right
             if pose.valid:
                 pose.angle, pose.width = angle, width
+        if self._news:
+            self._news = False
+            for finger in self._fingers:
+                _write_scales(contacts[finger], self.grasp.scales, finger)
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
@@ -157,6 +215,24 @@ class ContactFilter:
                 contact.valid = pose.valid = False
 
 
+def _pull(goal: Goal, finger: int, q: float) -> float:
+    """The current [A] of a goal that is so far from ``q`` that nothing but its bound counts."""
+    return goal.current[finger] if goal.q[finger] - q > _FAR else 0.0
+
+
+def _write_scales(contact: Contact, scales: Scales, finger: int) -> None:
+    mean, covariance = scales.mean, scales.covariance
+    at = MODULUS + finger
+    contact.modulus_scale = modulus = math.exp(mean.item(at))
+    contact.modulus_scale_std = modulus * math.sqrt(covariance.item(at, at))
+    at = GAIN + finger
+    contact.sensor_gain = gain = math.exp(mean.item(at))
+    contact.sensor_gain_std = gain * math.sqrt(covariance.item(at, at))
+    at = TORQUE + finger
+    contact.torque_scale = 1.0 + mean.item(at)
+    contact.torque_scale_std = math.sqrt(covariance.item(at, at))
+
+
 def _turning(table: ContactTable, radius: float) -> float:
     """∂U/∂θ over F θ d of a tip that is about upright: 2/3 of springs, about 0 of solid rubber."""
     d, theta = 0.15 * radius, 0.05
@@ -165,9 +241,18 @@ def _turning(table: ContactTable, radius: float) -> float:
 
 
 def _fill_from_frame(
-    contact: Contact, estimate: ContactEstimate, table: FloatArray, law: FloatArray, radius: float
+    contact: Contact,
+    estimate: ContactEstimate,
+    table: FloatArray,
+    law: FloatArray,
+    prior: tuple[float, float],
+    radius: float,
 ) -> None:
-    """Fill ``contact`` from one frame's estimate alone; ``table`` and ``law``: its tip's."""
+    """Fill ``contact`` from one frame's estimate alone; ``table`` and ``law``: its tip's.
+
+    ``prior``: standard deviations of modulus and gain, which share out what the frame is higher
+    than the model.
+    """
     contact.d, contact.theta = estimate.d, estimate.tilt_x  # and without a contact 0, as all else
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
     contact.force = contact.energy = contact.force_std = 0.0
@@ -175,12 +260,13 @@ def _fill_from_frame(
     if estimate.contact:
         tilt = total_tilt(contact.theta, contact.tilt_y)
         force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
-        # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
-        contact.force, contact.energy = contact.gain * force, contact.gain * energy
+        stiff, gain = prior[0] ** 2, prior[1] ** 2
+        modulus = contact.gain ** (stiff / (stiff + gain))
+        contact.force, contact.energy = modulus * force, modulus * energy
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
-        by_tilt *= contact.gain
-        slopes = np.array([contact.gain * by_d, by_tilt * along, by_tilt * across, force])
+        slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
         share = np.interp(contact.d / radius, np.linspace(0.0, 1.0, kernels.LAW_POINTS), law)
-        variance = slopes @ estimate.covariance @ slopes + (share * contact.force) ** 2
+        relative = share**2 + stiff * gain / (stiff + gain)
+        variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
         contact.force_std = math.sqrt(variance)

@@ -11,6 +11,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.perception import scales, witnesses
+from softfinger.daemon.perception.scales import Scales
+from softfinger.daemon.perception.witnesses import WitnessState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.contact.lookup import lookup
@@ -25,15 +28,19 @@ from softfinger.kinematics.hand.grasp_state import (
 
 FloatArray = NDArray[np.float64]
 Tip = tuple[float, float, float, float, float, float, float, bool]  # of `write_grasp`
+Noise = tuple[float, float, float]  # of a frame: variance of d, covariance, variance of the gain
 
+OTHER, RAMPING, HOLDING = 0, 1, 2  # phases of a grip: its force is on its way, nothing moves it
 HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
+_DRIFT_GAIN = 0.1  # 1/√s, what the frames' height over the model's does
 _DRIFT_ANGLE = 4e-3  # rad/√s, likewise
 _DRIFT_TAPER = 1e-3  # rad/√s, what the taper does: tips come to other parts of the faces
 _TAPER_ERROR = 0.1  # rad that `object.taper` may be off
 _SHARE = 0.05  # error of a predicted motion, as a share of it
 _OUTLIER = 9.0  # variances off: the prediction was wrong, not the frame
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
+_FIRM = 1.0  # N of both tips, from which on an object does not rock between them
 _STEP_VARIANCE = 1.0 / 12.0  # of a count
 LAW_POINTS = 17  # over d from 0 to the radius
 
@@ -51,14 +58,18 @@ class TrackedTip(Record):
     """What the filter keeps of one tip and its joint."""
 
     d: Quantity
-    gain: float
+    gain: float  # measured over modelled pressure: the frames' height
+    gain_variance: float
+    d_gain: float  # covariance of d and gain [m]
+    free: bool  # frames tell the gain
+    fresh: bool  # a frame has come that the scales have not taken in yet
     tilt_y: float
+    shear: float  # along the face in the hand's plane, by a solid tip's newest frame [N]
     q: float  # tracked joint [rad]
     unseen: float  # joint motion since the last frame that the velocity can't show [rad]
     torque: float  # of the joint [N·m]
-    covariance: Annotated[FloatArray, 3, 3]  # of (d, θ, gain) at the last frame
-    shared: Pair  # the variances of d and θ in it that all frames share
-    began: Pair  # the other ones, as the filter had them then
+    speed: float  # of the joint [rad/s]
+    shared: Pair  # the variances of d and θ that all frames share
     law: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
     live: bool  # touches, and is carried on
 
@@ -68,7 +79,7 @@ class GraspState(Record):
 
     t: float  # when the joints were read [s]
     d: Pair  # displacements [m]
-    force: Pair  # of the tips, gain times their tables' [N]
+    force: Pair  # of the tips, their moduli's scale times their tables' [N]
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # α between the object's faces, as both tips feel them [rad]
     stray: float  # turning of the object that no joint explains, summed [rad]
@@ -81,9 +92,12 @@ class GraspState(Record):
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
     shear: float  # shear over normal force, by the object's balance, unloaded
-    unexplained: Pair  # of the joints' torques, without a load along the faces [N·m]
+    sheared: float  # along the faces, as solid tips' newest frames show it [N]
+    unexplained: Pair  # what only a load along the faces explains of the joints' torques [N·m]
     load_lever: float  # a load L makes them lever L + bow L²; 0: it shows nothing [m]
     load_bow: float  # [m/N]
+    scales: Scales  # of what feels the tips' forces
+    witnesses: WitnessState  # and what speaks against it
 
 
 class Past(Record):
@@ -108,7 +122,9 @@ class FilterState(Record):
     assumed_taper: float  # `object.taper` [rad]
     alone: bool  # one finger
     t: float  # of the last reading [s]
+    weighed: float  # when witnesses were weighed last [s]
     newest: int  # row of the history
+    phase: int  # of the grip at the last tick
     tip: Annotated[Records[TrackedTip], 2]
     angle: Quantity
     taper: float  # α as found [rad]
@@ -170,17 +186,29 @@ def _move(quantity: Quantity, way: float) -> None:
 
 @kernel
 def advance(
-    filters: Records[FilterState], history: Records[Past], t: float, q: Two, dq: Two, current: Two
+    filters: Records[FilterState],
+    history: Records[Past],
+    t: float,
+    q: Two,
+    dq: Two,
+    current: Two,
+    goal: Two,
 ) -> None:
-    """Carry the estimates on to time ``t`` by the joints' reading [rad, rad/s, A]."""
+    """Carry the estimates on to time ``t`` by the joints' reading [rad, rad/s, A].
+
+    ``goal`` [A]: what a grip has the currents be, 0 without one.
+    """
     f = filters[0]
     left = f.tip[0]
     right = f.tip[1]
-    left.torque = f.torque_constant * current[0]
-    right.torque = f.torque_constant * current[1]
+    left.speed = dq[0]
+    right.speed = dq[1]
     dt = t - f.t
     if dt <= 0.0:
         return
+    for k in range(2):
+        trusted = witnesses.trusted_current(f.grasp.witnesses, k, current[k], goal[k], dt)
+        f.tip[k].torque = f.torque_constant * trusted
     f.t = t
     if dt > HISTORY:
         dt = 0.0
@@ -208,6 +236,9 @@ def advance(
     right.q += way2
     left.d.variance += _DRIFT_D * _DRIFT_D * dt
     right.d.variance += _DRIFT_D * _DRIFT_D * dt
+    left.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
+    right.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
+    scales.drift(f.grasp.scales, dt)
     f.angle.variance += _DRIFT_ANGLE * _DRIFT_ANGLE * dt
     f.taper_variance += _DRIFT_TAPER * _DRIFT_TAPER * dt
     f.newest = (f.newest + 1) % len(history)
@@ -245,17 +276,39 @@ def _rows_at(history: Records[Past], newest: int, t: float) -> tuple[int, int, f
 
 
 @inner_kernel
-def _weigh(quantity: Quantity, step: float, moved: float, found: float, variance: float) -> float:
-    """Correct d by what a frame ``found``, ``moved`` ago by the joints; the frame's weight."""
-    own = _variance(quantity, step)
-    miss = found - (quantity.mean - moved)
-    if miss * miss > _OUTLIER * (own + variance):
+def _update_tip(
+    tip: TrackedTip, step: float, moved: float, d: float, gain: float, noise: Noise
+) -> None:
+    """Correct d and gain by a frame's, which came ``moved`` ago by the joints.
+
+    Its errors in both make up for each other, so the gain, which is slow, makes d the better.
+    """
+    own = _variance(tip.d, step)
+    slow = tip.gain_variance
+    joint = tip.d_gain
+    by_d, by_both, by_gain = noise
+    miss = d - (tip.d.mean - moved)
+    higher = gain - tip.gain
+    if miss * miss > _OUTLIER * (own + by_d):
         own = miss * miss
-    weight = own / (own + variance)
-    quantity.mean += weight * miss
-    quantity.variance = weight * variance
-    quantity.since = abs(moved)
-    return weight
+        joint = 0.0
+    if higher * higher > _OUTLIER * (slow + by_gain):
+        slow = higher * higher
+        joint = 0.0
+    total = own + by_d
+    both = joint + by_both
+    height = slow + by_gain
+    inverse = 1.0 / max(total * height - both * both, 1e-30)
+    d_by_d = (own * height - joint * both) * inverse
+    d_by_gain = (joint * total - own * both) * inverse
+    gain_by_d = (joint * height - slow * both) * inverse
+    gain_by_gain = (slow * total - joint * both) * inverse
+    tip.d.mean += d_by_d * miss + d_by_gain * higher
+    tip.gain += gain_by_d * miss + gain_by_gain * higher
+    tip.d.variance = (1.0 - d_by_d) * own - d_by_gain * joint
+    tip.d_gain = (1.0 - d_by_d) * joint - d_by_gain * slow
+    tip.gain_variance = (1.0 - gain_by_gain) * slow - gain_by_d * joint
+    tip.d.since = abs(moved)
 
 
 @inner_kernel
@@ -287,21 +340,25 @@ def correct(
     history: Records[Past],
     finger: int,
     t: float,
-    found: tuple[float, float, float, float],
+    found: tuple[float, float, float, float, float],
     covariance: FloatArray,
     systematic: FloatArray,
-) -> None:
-    """Take in one finger's frame of time ``t``: d, θ, tilt_y and gain, and their covariance.
+) -> bool:
+    """Take in one finger's frame of time ``t``: d, θ, tilt_y, gain, shear and their covariance.
 
     ``systematic`` is the part of it that all frames share: it is no reason to wait for more.
+    Returns False for a frame that is refused, since what it shows can't be.
     """
     f = filters[0]
     tip = f.tip[finger]
     other = f.tip[1 - finger]
-    d, theta, tilt_y, gain = found
-    d_std = math.sqrt(covariance[0, 0] - systematic[0, 0])
-    theta_std = math.sqrt(covariance[1, 1] - systematic[1, 1])
-    d_variance = d_std * d_std
+    d, theta, tilt_y, gain, shear = found
+    theta_variance = covariance[1, 1] - systematic[1, 1]
+    noise = (
+        covariance[0, 0] - systematic[0, 0],
+        covariance[0, 3] - systematic[0, 3],
+        covariance[3, 3] - systematic[3, 3],
+    )
     row, later, share = _rows_at(history, f.newest, t)
     before = history[row]
     after = history[later]
@@ -310,15 +367,31 @@ def correct(
     q = _between(before.q[finger], after.q[finger], share)
     angle = theta - q if finger == 0 else theta + q
     sense = -1.0 if finger == 0 else 1.0
-    angle_variance = theta_std * theta_std + _STEP_VARIANCE * f.count * f.count
+    angle_variance = theta_variance + _STEP_VARIANCE * f.count * f.count
+    firm = min(f.grasp.normal[0], f.grasp.normal[1]) > _FIRM
+    if tip.live and other.live and firm:
+        miss = angle - (f.angle.mean + 0.5 * sense * f.taper - turned)
+        unsure = _face_variance(f, sense) + angle_variance
+        speed = abs(tip.speed) + abs(other.speed)
+        if witnesses.refuses(f.grasp.witnesses, finger, miss, unsure, speed):
+            return False
+    if f.grasp.witnesses.drifted[finger] > witnesses.DRIFT_TIME:
+        return False
     tip.unseen = min(tip.unseen, f.slow * max(f.t - t, 0.0))
     tip.tilt_y = tilt_y
+    tip.shear = shear
+    tip.shared[0] = systematic[0, 0]
+    tip.shared[1] = systematic[1, 1]
+    tip.free = covariance[3, 3] > 0.0
+    tip.fresh = True
     if not tip.live:
         tip.live = True
         tip.d.mean = d + moved
-        tip.d.variance = d_variance
+        tip.d.variance, tip.d_gain, tip.gain_variance = noise
         tip.d.since = abs(moved)
         tip.gain = gain
+        f.grasp.scales.gripping = False
+        witnesses.forget(f.grasp.witnesses)
         if not other.live:
             _assume_taper(f, sense, angle + turned, angle_variance)
             f.angle.since = abs(turned)
@@ -326,53 +399,23 @@ def correct(
             face = f.angle.mean - 0.5 * sense * f.taper
             _assume_taper(f, -sense, face, _face_variance(f, -sense))
             _weigh_angle(f, sense, turned, angle, angle_variance)
-        _keep_covariance(f, finger, 1.0, covariance, systematic)
-        return
-    # The errors of d and gain in a frame make up for each other: both get the same weight.
-    weight = _weigh(tip.d, f.count * f.length, moved, d, d_variance)
-    tip.gain += weight * (gain - tip.gain)
+        return True
+    before_it = tip.d.mean
+    _update_tip(tip, f.count * f.length, moved, d, gain, noise)
+    f.grasp.witnesses.corrected[finger] += tip.d.mean - before_it
     predicted = f.angle.mean
     _weigh_angle(f, sense, turned, angle, angle_variance)
     f.stray += f.angle.mean - predicted
-    _keep_covariance(f, finger, weight, covariance, systematic)
+    return True
 
 
 @inner_kernel
-def _keep_covariance(
-    f: FilterState, finger: int, weight: float, covariance: FloatArray, systematic: FloatArray
-) -> None:
-    """What a frame of this ``weight`` leaves of the covariance of (d, θ, gain)."""
-    tip = f.tip[finger]
-    for i in range(3):
-        row = i if i < 2 else 3
-        for j in range(3):
-            column = j if j < 2 else 3
-            shared = systematic[row, column]
-            tip.covariance[i, j] = weight * (covariance[row, column] - shared) + shared
-    tip.shared[0] = systematic[0, 0]
-    tip.shared[1] = systematic[1, 1]
-    tip.began[0] = tip.d.variance
-    tip.began[1] = _face_variance(f, -1.0 if finger == 0 else 1.0)
-
-
-@inner_kernel
-def _force_variance(
-    tip: TrackedTip, slopes: tuple[float, float, float], grown: Two, share: float
-) -> float:
-    """Variance of F by its ``slopes`` in (d, θ, gain), ``grown`` that of d and θ since the frame.
-
-    F is the third slope times the gain; ``share`` is d over the tip's radius.
-    """
-    total: float = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += slopes[i] * tip.covariance[i, j] * slopes[j]
-    for i in range(2):
-        total += slopes[i] * slopes[i] * max(grown[i] - tip.began[i], 0.0)
+def _law_error(tip: TrackedTip, share: float) -> float:
+    """Relative error of F by table and law; ``share`` is d over the tip's radius."""
     t = min(max(share, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
-    law: float = tip.law[k] + (t - k) * (tip.law[k + 1] - tip.law[k])
-    return total + (law * tip.gain * slopes[2]) ** 2
+    error: float = tip.law[k] + (t - k) * (tip.law[k + 1] - tip.law[k])
+    return error
 
 
 @inner_kernel
@@ -388,35 +431,65 @@ def _write_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -> 
     force, energy, stiffness, by_tilt, _, _, inside = lookup(table, tip.d.mean, tilt)
     grasp.q[finger] = tip.q
     grasp.d[finger] = max(tip.d.mean, 0.0)
-    # A softer or stiffer tip than the table's shows as the gain of its whole pressure map.
-    grasp.force[finger] = tip.gain * force
-    grasp.stiffness[finger] = tip.gain * stiffness
-    d_variance = _variance(tip.d, f.count * f.length)
-    theta_variance = _face_variance(f, -1.0 if finger == 0 else 1.0)
+    modulus = f.grasp.scales.modulus[finger]
+    grasp.force[finger] = modulus * force
+    grasp.stiffness[finger] = modulus * stiffness
+    d_variance = _variance(tip.d, f.count * f.length) + tip.shared[0]
+    theta_variance = _face_variance(f, -1.0 if finger == 0 else 1.0) + tip.shared[1]
     along = theta / tilt if tilt > 0.0 else 0.0
-    force_variance = _force_variance(
-        tip,
-        (tip.gain * stiffness, tip.gain * by_tilt * along, force),
-        (d_variance, theta_variance),
-        tip.d.mean / f.radius,
+    law = _law_error(tip, tip.d.mean / f.radius)
+    at = scales.MODULUS + finger
+    relative = grasp.scales.covariance[at, at] + law * law
+    force_variance = (
+        (modulus * stiffness) ** 2 * d_variance
+        + (modulus * by_tilt * along) ** 2 * theta_variance
+        + relative * grasp.force[finger] ** 2
     )
     return (
         grasp.d[finger],
         theta,
         grasp.force[finger],
-        tip.gain * energy,
-        math.sqrt(d_variance + tip.shared[0]),
-        math.sqrt(theta_variance + tip.shared[1]),
+        modulus * energy,
+        math.sqrt(d_variance),
+        math.sqrt(theta_variance),
         math.sqrt(force_variance),
         inside,
     )
 
 
+@inner_kernel
+def _learn_scales(f: FilterState, ramping: bool) -> None:
+    """Take in what this tick's frames and joints say of the scales."""
+    s = f.grasp.scales
+    grasp = f.grasp
+    both = f.tip[0].live and f.tip[1].live
+    if both and not s.gripping:
+        scales.begin_grip(s)
+    news = False
+    for k in range(2):
+        tip = f.tip[k]
+        if not (tip.fresh and tip.live):
+            continue
+        tip.fresh = False
+        news = True
+        if tip.free:
+            scales.take_height(s, k, tip.gain, tip.gain_variance / (tip.gain * tip.gain))
+    if not news:
+        return
+    if both and ramping and grasp.load_lever > 0.0:
+        for k in range(2):
+            s.torque[k] = f.tip[k].torque
+            s.moment[k] = s.torque[k] / (1.0 + s.mean[scales.TORQUE + k]) - grasp.unexplained[k]
+        scales.take_torque(s, s.torque, s.moment, 0.5 * (f.tip[0].speed + f.tip[1].speed), f.t)
+        scales.take_balance(s, grasp.normal[0], grasp.normal[1])
+    scales.settle(s)
+
+
 @kernel
 def write_grasp(
-    filters: Records[FilterState], table1: FloatArray, table2: FloatArray
+    filters: Records[FilterState], table1: FloatArray, table2: FloatArray, phase: int
 ) -> tuple[Tip, Tip, float, float]:
-    """Write what the estimates mean into ``grasp``.
+    """Write what the estimates mean into ``grasp``; ``phase``: of the grip, as below `HISTORY`.
 
     Returns d, θ, force, energy, the standard deviations of d, θ and the force, and whether they are
     inside the table, for each tip; then the object's angle [rad] and width [m].
@@ -452,15 +525,41 @@ def write_grasp(
     grasp.shear = 0.0
     if normal1 + normal2 > 0.0:
         grasp.shear = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
-    grasp.normal[0] = left.gain * normal1
-    grasp.normal[1] = right.gain * normal2
-    if left.gain > 0.0 and right.gain > 0.0:
-        rolled = (shear - out_of_grip, shear + out_of_grip)
-        torques = left.torque / left.gain, right.torque / right.gain
-        left1, left2, grasp.load_lever, bow = load_torques(
-            table1, table2, d, theta, taper, motion, rolled, torques
-        )
-        grasp.unexplained[0] = left.gain * left1
-        grasp.unexplained[1] = right.gain * left2
-        grasp.load_bow = 2.0 * bow / (left.gain + right.gain)
+    modulus1 = f.grasp.scales.modulus[0]
+    modulus2 = f.grasp.scales.modulus[1]
+    grasp.normal[0] = modulus1 * normal1
+    grasp.normal[1] = modulus2 * normal2
+    rolled = (shear - out_of_grip, shear + out_of_grip)
+    means = grasp.scales.mean
+    torque1 = left.torque / (1.0 + means[scales.TORQUE])
+    torque2 = right.torque / (1.0 + means[scales.TORQUE + 1])
+    torques = torque1 / modulus1, torque2 / modulus2
+    left1, left2, grasp.load_lever, bow = load_torques(
+        table1, table2, d, theta, taper, motion, rolled, torques
+    )
+    # Forces on the two faces are opposite; only what both show alike bears a load.
+    grasp.sheared = 0.0
+    if left.shear * right.shear < 0.0:
+        grasp.sheared = math.copysign(min(abs(left.shear), abs(right.shear)), left.shear)
+    grasp.unexplained[0] = modulus1 * left1
+    grasp.unexplained[1] = modulus2 * left2
+    grasp.load_bow = 2.0 * bow / (modulus1 + modulus2)
+    _learn_scales(f, phase == RAMPING)
+    if grasp.load_lever > 0.0:
+        dt = f.t - f.weighed
+        if phase == HOLDING and f.phase != HOLDING:
+            witnesses.begin_holding(grasp.witnesses, grasp.unexplained)
+        for k in range(2):
+            grasp.unexplained[k] = witnesses.weigh_drift(
+                f.grasp.witnesses,
+                k,
+                grasp.unexplained[k],
+                f.tip[k].torque - grasp.unexplained[k],
+                grasp.arm[k] * grasp.stiffness[k],
+                abs(f.tip[k].speed) < witnesses.QUIET,
+                phase == HOLDING,
+                min(dt, HISTORY),
+            )
+    f.phase = phase
+    f.weighed = f.t
     return seen1, seen2, angle, width

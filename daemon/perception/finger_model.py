@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
+from softfinger.daemon.perception.scales import CALIBRATED_ERROR, MODULUS_ERROR
 from softfinger.daemon.profile.factory import (
     law_problem,
     make_grid,
@@ -40,6 +41,7 @@ class FingerModel:
     table: ContactTable
     grid: SensorGrid
     calibration: Calibration | None = None
+    modulus_error: float = MODULUS_ERROR  # relative standard deviation
 
     @property
     def own_material(self) -> bool:
@@ -79,7 +81,12 @@ def make_models(
                 common = law, make_table(settings, law, cache, on_event)
             material, table = common
         grid = calibrated_grid(settings, finger, calibration)
-        made[finger] = FingerModel(finger, material, table, grid, calibration)
+        error = settings.material.modulus_error or MODULUS_ERROR
+        if measured:
+            error = CALIBRATED_ERROR
+        elif calibration is not None and calibration.modulus is not None:
+            error = max(CALIBRATED_ERROR, calibration.modulus.residual)
+        made[finger] = FingerModel(finger, material, table, grid, calibration, error)
         if calibration is not None and on_event is not None:
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:

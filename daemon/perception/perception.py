@@ -6,7 +6,9 @@ to the contacts of every tick.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,9 @@ from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16
 _STEPS = 65535  # of a published pressure
+_REMEMBERED = 2.0  # s of frames that are known again
+_REPEATED = 0.1  # s of frames that come again, from which on that is no chance …
+_DISTINCT = 5  # … and how many they are at least
 
 
 class Perception:
@@ -43,6 +48,7 @@ class Perception:
             settings,
             (models[0].table, models[1].table),
             (models[0].material, models[1].material),
+            (models[0].modulus_error, models[1].modulus_error),
         )
 
     def update(self, state: State) -> None:
@@ -52,8 +58,49 @@ class Perception:
         for each in self.fingers:
             frame = each.update()
             if frame is not None:
+                if each.repeats.long:
+                    frame = replace(frame, valid=False)
                 self.filter.correct(each.finger, frame, each.estimate, state.contacts[each.finger])
-        self.filter.write_contacts(state.t, state.contacts, state.object)
+        self.filter.write_contacts(state.t, state.contacts, state.object, state.mode)
+
+
+class Repeats:
+    """Notices frames that come again in the order in which they came before.
+
+    A sensor with noise never repeats one. One without, at rest, sends the same frame for long: that
+    is no repetition, and judged as a frozen sensor.
+    """
+
+    def __init__(self, rate: float, judged: bool = True) -> None:
+        """``rate``: of the frames [Hz]; ``judged``: to repeat them is wrong."""
+        self._judged = judged
+        self.lag = 0  # frames after which they come again, 0: they don't
+        self._run = 0  # frames in a row that did so
+        self._enough = max(round(_REPEATED * rate), _DISTINCT)
+        self._kept: deque[int] = deque(maxlen=round(_REMEMBERED * rate))
+        self._seen: dict[int, int] = {}  # digest → number of the last such frame
+        self._number = 0
+
+    @property
+    def long(self) -> bool:
+        """They have done so for long enough to be sure."""
+        return self._judged and self._run >= self._enough
+
+    def look(self, data: NDArray[np.uint16]) -> bool:
+        """Take in a frame; whether it differs from the last."""
+        digest = hash(data.tobytes())
+        number, kept = self._number + 1, self._kept
+        before = self._seen.get(digest)
+        if before == self._number and kept:
+            return False
+        if len(kept) == kept.maxlen and self._seen[kept[0]] == number - len(kept):
+            del self._seen[kept[0]]
+        kept.append(digest)
+        self._number = self._seen[digest] = number
+        lag = 0 if before is None else number - before
+        self._run = self._run + 1 if lag and lag == self.lag else min(lag, 1)
+        self.lag = lag
+        return True
 
 
 class FingerPerception:
@@ -69,6 +116,8 @@ class FingerPerception:
         self.frame: Frame | None = None
         self.frames = 0  # that came
         self.changed = 0.0  # when one that differs from the last arrived [s]
+        # A recording that plays from its start again repeats itself.
+        self.repeats = Repeats(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # of the last valid frame
         live = getattr(sensor, "live", None)  # of a recording that lacks cells
         self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
@@ -101,7 +150,7 @@ class FingerPerception:
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
-        if last is None or frame.data.tobytes() != last.data.tobytes():
+        if self.repeats.look(frame.data):
             self.changed = frame.t_arrival
         self.frame = frame
         self.frames += 1

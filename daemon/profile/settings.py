@@ -169,6 +169,7 @@ class TactileSettings(Section):
     baseline_error: NonNegative = 0.0  # Pa, likewise of a shift of all cells since the tare
     centre_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, of the tip's centre, x and y
     pitch_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative
+    gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
@@ -247,6 +248,7 @@ class ControlSettings(Section):
     """Gains and rates of the control law; each default was chosen in simulation."""
 
     torque_constant: Factor = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
+    torque_error: Annotated[float, Field(gt=0, le=1)] = 0.1  # relative, standard deviation
     approach_speed: Positive = 0.3  # rad/s
     approach_current: Positive = 0.15  # A, while closing: a tip that feels nothing presses no more
     move_speed: Positive = 1.0  # rad/s
@@ -270,7 +272,8 @@ class ControlSettings(Section):
     tip_friction: Positive = 0.6  # Coulomb, tip on object, that is counted on
     slip_margin: Fraction = 0.2  # share of that friction which is kept unused
     object_load: NonNegative = 0.0  # N along the tips' faces, the object's weight as a rule
-    grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin
+    grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin …
+    grip_raise_share: NonNegative = 1.0  # … and of the force asked for; the smaller one binds
     envelope: str = ""  # what the hand holds, by `softfinger envelope --keep`; "": the built-in's
 
 
@@ -288,7 +291,7 @@ class SafetySettings(Section):
     frame_age_action: Literal["torque off", "open"] = "torque off"  # open: first, then the fault
     goal_reach: Positive = 0.5  # rad off the present angle within which a goal may jump
     goal_speed: Positive = 3.0  # rad/s of a goal that is further off
-    current_rate: Positive = 30.0  # A/s with which a goal current may rise
+    current_rate: Positive = 60.0  # A/s with which a goal current may rise
     current_fault: Positive = 1.8  # A measured for 0.1 s → fault
     stall_error: Positive = 0.1  # rad off its goal, with all the current it may take …
     stall_time: Seconds = 2.0  # … for so many s: a joint has stalled → fault
@@ -299,7 +302,6 @@ class SafetySettings(Section):
     residual_angle: Positive = 0.2  # rad between the object's angles by the two fingers → fault
     residual_width: Positive = 0.004  # m of the held object's width since the grip → fault
     residual_force: Positive = 0.5  # share by which the two tips' forces differ: warning
-    residual_torque: Positive = 0.5  # share by which a joint's torque misses its tip's force
     saturated: Fraction = 0.05  # share of a sensor's cells that are full: warning
     frozen_after: Delay = 0.5  # s of identical frames while something touches → fault; 0: never
     overruns_fault: Annotated[int, Field(ge=1)] = 100  # ticks late in a row → fault

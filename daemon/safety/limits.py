@@ -20,8 +20,10 @@ from typing import Literal
 import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
+from softfinger.daemon.perception import witnesses
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
+from softfinger.daemon.perception.scales import GAIN, GAIN_DOUBTED
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
@@ -30,6 +32,8 @@ from softfinger.daemon.types import FINGERS, Contact, State
 _NEAR = 0.9  # of a fault's bound: warned from there on
 _PULL = 2.0  # A/rad with which a joint off its goal must be pulled: less than any model's own loop
 _SLOW = 0.05  # rad/s below which a joint stands
+_RISE = 0.2  # share by which the force asked for must rise, and of that the force felt
+_DEAF = 0.3  # s
 
 
 class View:
@@ -51,6 +55,9 @@ class View:
         self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
         self.bad_goal = False  # a goal was not finite since the last judgement
         self.grip_width = math.nan  # of the object when it was gripped [m]
+        self._target = math.nan  # force of the grip at the last tick [N]
+        self.rise_t = math.inf  # when it rose and was not felt to since [s]
+        self.rise_felt = 0.0  # what was felt then [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
             model = by_name(settings.servos.model)
@@ -65,6 +72,18 @@ class View:
             self.grip_width = math.nan
         elif math.isnan(self.grip_width):
             self.grip_width = state.object.width
+        self._follow_force(state)
+
+    def _follow_force(self, state: State) -> None:
+        target, last = state.goal.force, self._target
+        self._target = target
+        felt = 0.5 * (state.contacts[0].force + state.contacts[1].force)
+        if not (state.mode in GRIPPING and self.touched(state) and target > felt):
+            self.rise_t = math.inf
+        elif target > (1.0 + _RISE) * last and self.rise_t == math.inf:
+            self.rise_t, self.rise_felt = state.t, felt
+        elif abs(felt - self.rise_felt) > _RISE * (target - self.rise_felt):
+            self.rise_t = math.inf
 
     def touched(self, state: State) -> bool:
         """Both tips soundly touch an object of known angle and width."""
@@ -409,8 +428,77 @@ def _tactile_silent(view: View, state: State, _: float) -> str:
         age = state.t - contact.t_sound
         if not age <= bound:
             what = "frame" if contact.t_arrival == contact.t_sound else "sound estimate"
-            return f"tactile: no {what} for {age:.3f} s"
+            doubt = _doubt(view, i)
+            return doubt or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s"
     return ""
+
+
+def _doubt(view: View, finger: int) -> str:
+    """Why a sensor's frames are refused, or an empty text."""
+    side, found = FINGERS[finger], view.grasp.witnesses
+    if found.jumps[finger] > witnesses.JUMPS_MAX:
+        jumped = math.degrees(abs(found.miss[finger]))
+        return (
+            f"{side} sensor shows the object turned by {jumped:.0f}° at once, which neither the "
+            "joints nor the other tip explain: its image has moved, or the object ends under it"
+        )
+    if found.drifted[finger] > witnesses.DRIFT_TIME:
+        off = 1e3 * found.corrected[finger]
+        return (
+            f"{side} sensor feels {abs(off):.1f} mm {'less' if off < 0.0 else 'more'} of the tip's "
+            "displacement than its joint's closing and torque say: tare it"
+        )
+    for sensor in view.sensors:
+        if sensor.finger == finger and sensor.repeats.long:
+            return f"{side} sensor sends the same {sensor.repeats.lag} frames again"
+    return ""
+
+
+def _gain_doubt(view: View, finger: int) -> str:
+    """Say what a sensor reads where its gain is off by more than is usual, or an empty text."""
+    scales = view.grasp.scales
+    at = GAIN + finger
+    off, unsure = scales.mean[at], math.sqrt(scales.covariance[at, at])
+    if not abs(off) - unsure > GAIN_DOUBTED * math.sqrt(scales.prior[at]):
+        return ""
+    return (
+        f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of what the joints and the other tip "
+        "say: recalibrate or tare it"
+    )
+
+
+def _enter_witnesses(finger: int, side: str) -> None:
+    @Limit(f"witness.{side}_sensor", "a tip's frames, by the joints and the other tip", "warn",
+        ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
+    def _sensor(view: View, state: State, _: float) -> str:
+        if finger not in view.fingers:
+            return ""
+        return _doubt(view, finger) or _gain_doubt(view, finger)
+
+    @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
+        (), "servos", in_turn=True)  # fmt: skip
+    def _current(view: View, state: State, _: float) -> str:
+        if not view.grasp.witnesses.off_goal[finger] > witnesses.CURRENT_TIME:
+            return ""
+        return (
+            f"{side} joint's current reads {state.reading.current[finger]:.2f} A where its goal is "
+            f"{state.goal.current[finger]:.2f} A: its reading is not used"
+        )
+
+
+for _finger, _side in enumerate(FINGERS):
+    _enter_witnesses(_finger, _side)
+
+
+@Limit("witness.force", "the force felt, for 0.3 s after the one asked for rose", "fault", (),
+    "sensors", in_turn=True)  # fmt: skip
+def _witness_force(view: View, state: State, _: float) -> str:
+    if not state.t - view.rise_t > _DEAF:
+        return ""
+    return (
+        f"the force asked for rose to {state.goal.force:.1f} N and the tips feel "
+        f"{view.rise_felt:.1f} N as before"
+    )
 
 
 @Limit("tactile.frozen", "frames that are the same again and again while something touches",
@@ -499,24 +587,6 @@ def _hand_force(view: View, state: State, share: float) -> str:
     if not view.holds(state) or abs(left - right) <= bound:
         return ""
     return f"the tips feel {left:.1f} N and {right:.1f} N of one grip"
-
-
-@Limit("hand.torque", "joint torque against what the tip feels", "warn",
-    ("safety.residual_torque",), "sensors", in_turn=True, lasts=0.3)  # fmt: skip
-def _hand_torque(view: View, state: State, share: float) -> str:
-    if not view.holds(state):
-        return ""
-    control, grasp = view.settings.control, view.grasp
-    for i in view.fingers:
-        wanted = grasp.lever[i] * 0.5 * (state.contacts[0].force + state.contacts[1].force)
-        found = control.torque_constant * state.reading.current[i]
-        free = share * view.limits.residual_torque * abs(wanted) + 2.0 * control.joint_friction
-        if abs(found - wanted) > free:
-            return (
-                f"{FINGERS[i]} joint gives {found:.2f} N·m, its tip feels what takes "
-                f"{wanted:.2f} N·m"
-            )
-    return ""
 
 
 @Limit("grip.slip", "shear against friction less a margin", "warn",

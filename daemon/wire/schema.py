@@ -141,9 +141,9 @@ class FingerState:
     theta: float = _contact("rad", "the object's angle in the tip's frame, in the hand's plane")
     tilt_y: float = _contact("rad", "and across the plane")
     force: float = _contact(
-        "N", "elastic force, gain · F(d, total tilt of theta and tilt_y) by the contact table"
+        "N", "elastic force, modulus_scale · F(d, total tilt of theta and tilt_y) by the table"
     )
-    energy: float = _contact("J", "elastic potential energy, gain · U(d, total tilt) likewise")
+    energy: float = _contact("J", "elastic potential energy, modulus_scale · U(d, total tilt)")
     d_std: float = _contact("m", "standard deviation of d")
     theta_std: float = _contact("rad", "standard deviation of theta")
     force_std: float = _contact("N", "standard deviation of force, with that of the tip's law")
@@ -153,6 +153,14 @@ class FingerState:
     )
     shear_y: float = _contact("N", "and across the plane")
     gain: float = _contact("", "measured over modelled pressure")
+    modulus_scale: float = _contact(
+        "", "of the tip's modulus over the settings', as grips tell it"
+    )
+    modulus_scale_std: float = _contact("", "its standard deviation")
+    sensor_gain: float = _contact("", "of the sensor: gain over modulus_scale")
+    sensor_gain_std: float = _contact("", "its standard deviation")
+    torque_scale: float = _contact("", "of the joint's torque constant over the settings'")
+    torque_scale_std: float = _contact("", "its standard deviation")
     misfit: bool = _contact("", "the frame fits no contact of the model: d, theta may be biased")
     contact: bool = _contact("", "something touches the tip")
     frame_seq: int = _contact(

@@ -47,6 +47,9 @@ def sample_state() -> State:
         contact.d, contact.theta, contact.tilt_y = 0.004, 0.1 * sign, 0.01 * sign
         contact.d_std, contact.theta_std, contact.gain = 2e-5, 1e-3, 1.01
         contact.force_std = 0.03
+        contact.modulus_scale, contact.modulus_scale_std = 1.125, 0.0625 + finger
+        contact.sensor_gain, contact.sensor_gain_std = 0.875, 0.09375 + finger
+        contact.torque_scale, contact.torque_scale_std = 1.03125, 0.046875 + finger
         contact.shear_x, contact.shear_y = 0.75 * sign, 0.03125 * sign
         contact.force, contact.energy = 10.5 + finger, 0.0125 + finger
     state.goal.force, state.goal.angle = 11.25, 0.0625

@@ -8,6 +8,7 @@ import numpy as np
 
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.perception import Repeats
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS
 from softfinger.daemon.safety.safety import Safety
@@ -26,6 +27,7 @@ class Sensor:
         self.finger = finger
         self.frame: Frame | None = None
         self.changed = 0.0
+        self.repeats = Repeats(100.0)
         self.estimate = ContactEstimate()
 
     def give(self, t: float, data: Any) -> None:

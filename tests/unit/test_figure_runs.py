@@ -78,7 +78,7 @@ def test_the_rotation_is_estimated_by_the_daemon(path: tuple[Sheet, ...]) -> Non
     assert deep.sum() > 50
     off = rotation["theta estimated"][deep] - rotation["theta"][deep]
     assert np.sqrt(np.mean(off**2)) < 0.15
-    np.testing.assert_allclose(rotation["F estimated"][deep], rotation["F"][deep], rtol=0.05)
+    np.testing.assert_allclose(rotation["F estimated"][deep], rotation["F"][deep], rtol=0.06)
 
 
 def test_what_a_solid_tip_explains_of_the_papers_measurements() -> None:

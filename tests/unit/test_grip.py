@@ -72,6 +72,8 @@ class Twin:
             self.integral += 2.0 * math.pi * law.force_bandwidth * error * DT
             self.integral = between(self.integral, 0.3 * self.force.target)
         push = self.force.value + law.force_gain * error + self.integral
+        bound = 1.2 * self.force.target + law.joint_friction / max(arm, 0.008)
+        push = min(push, bound)
         lean = 0.0
         if self.steering:
             self.angle.step(law.rotate_speed)

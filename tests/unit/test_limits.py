@@ -11,6 +11,7 @@ import pytest
 
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.scales import GAIN, Prior, set_prior
 from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS, View
 from softfinger.daemon.types import State
@@ -22,7 +23,6 @@ from tests.harness.safety import (
     goal,
     judged,
     later,
-    levers,
     safety,
     sound,
 )
@@ -130,8 +130,8 @@ FAULTS: list[tuple[Callable[[State], None], str, str]] = [
     (deaf, "goal.lost", "none of the goals sent lately reached left and right"),
     (hot, "servos.temperature", "left servo at 71 °C"),
     (brown_out, "servos.voltage", "right servo's supply at 9.2 V, outside 9.5 to 16.0 V"),
-    (silent_frames, "tactile.silent", "tactile: no frame for 0.1"),
-    (unsound_estimates, "tactile.silent", "tactile: no sound estimate for 0.1"),
+    (silent_frames, "tactile.silent", "tactile: no frame of the left sensor for 0.1"),
+    (unsound_estimates, "tactile.silent", "tactile: no sound estimate of the left sensor for 0.1"),
     (never_read, "servos.silent", "servos: no good reading yet"),
     (too_much_force, "tip.force", "right tip at 31.0 N, above 30 N"),
     (too_deep, "tip.displacement", "right tip at 13.00 mm, above 12"),
@@ -307,15 +307,41 @@ def test_a_warning_at_its_limit_does_not_flicker() -> None:
     assert len(judge.warnings) == 1
 
 
-def test_torque_that_the_tip_does_not_feel_is_told() -> None:
-    judge, state = safety(grasp=levers(0.08)), sound()
-    state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
+def test_each_witness_that_is_doubted_is_named() -> None:
+    grasp = GraspState()
+    set_prior(grasp.scales, Prior((0.2, 0.2), 0.25, 0.1, 0.05, 0.01))
+    judge, state = safety(grasp=grasp), sound()
     judged(judge, state, 0.5)
     assert judge.warnings == []
-    state.reading.current[1] *= 2.5
+    grasp.scales.mean[GAIN + 1] = math.log(0.5)
+    grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.4**2
     judged(judge, state, 0.5)
-    assert [each.name for each in judge.warnings] == ["hand.torque"]
-    assert "right joint gives 1.00 N·m, its tip feels what takes 0.40 N·m" in judge.warnings[0].text
+    assert judge.warnings == [], "that is not known well"
+    grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.1**2
+    grasp.witnesses.jumps[0], grasp.witnesses.miss[0] = 3.0, -0.2
+    grasp.witnesses.off_goal[1] = 0.2
+    state.reading.current[1], state.goal.current[1] = 0.1, 0.2
+    judged(judge, state, 0.5)
+    told = {warning.name: warning.text for warning in judge.warnings}
+    assert set(told) == {"witness.left_sensor", "witness.right_sensor", "witness.right_current"}
+    assert told["witness.left_sensor"].startswith("left sensor shows the object turned by 11° at")
+    assert told["witness.right_sensor"].startswith("right sensor reads 50% of what the joints")
+    assert "reads 0.10 A where its goal is 0.20 A" in told["witness.right_current"]
+
+
+def test_a_force_that_is_not_felt_to_rise_is_a_fault() -> None:
+    judge, state = safety(), sound()
+    state.mode = "grasping"
+    for force, felt, fault in ((5.0, 5.0, False), (10.0, 6.5, False), (20.0, 6.5, True)):
+        state.goal.force = force
+        state.contacts[0].force = state.contacts[1].force = felt
+        judged(judge, state, 0.01)
+        if felt == 6.5 and not fault:
+            state.contacts[0].force = state.contacts[1].force = 10.0
+        found = judged(judge, state, 0.5)
+        assert (found[0] == "witness.force") is fault
+        state.contacts[0].force = state.contacts[1].force = felt
+    assert "rose to 20.0 N and the tips feel 6.5 N as before" in found[1]
 
 
 def test_shear_near_friction_is_told() -> None:

@@ -52,8 +52,9 @@ def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(
         daemon.loop.advance(0.1)
         assert (state.mode, state.fault) == ("holding", "")
         for finger, contact in enumerate(state.contacts):
-            assert daemon.hand.force[finger] == pytest.approx(10.0, rel=0.02)
-            assert contact.force == pytest.approx(daemon.hand.force[finger], rel=0.03)
+            assert daemon.hand.force[finger] == pytest.approx(10.0, rel=0.06)
+            assert contact.force == pytest.approx(10.0, rel=0.03)
+            assert abs(contact.force - daemon.hand.force[finger]) < 2.0 * contact.force_std < 1.5
 
 
 def test_rotate_turns_the_object_to_the_angle_and_keeps_the_grip(make: Make) -> None:
@@ -182,7 +183,7 @@ def test_frames_that_stop_coming_latch_a_fault(make: Make) -> None:
             # The grip damps its joints on: that is less than a count of current.
             assert held == pytest.approx(goal, abs=2.5e-3), "goals moved on without frames"
     assert goal is not None
-    assert daemon.loop.state.fault.startswith("tactile: no frame for 0.1")
+    assert daemon.loop.state.fault.startswith("tactile: no frame of the right sensor for 0.1")
     assert not daemon.loop.state.torque
 
 
@@ -227,7 +228,7 @@ def test_saturated_sensors_latch_a_fault_and_drive_nothing(make: Make) -> None:
     before = list(daemon.loop.state.goal.current)
     blinded(daemon, 30_000)
     advance_to(daemon, "fault", 0.3)
-    assert daemon.loop.state.fault.startswith("tactile: no sound estimate for")
+    assert daemon.loop.state.fault.startswith("tactile: no sound estimate of the left sensor for")
     assert daemon.loop.state.goal.current == pytest.approx(before, rel=0.2)
     with pytest.raises(Refused, match="clear: tactile: no sound estimate"):
         command(daemon, "clear")

@@ -145,7 +145,7 @@ def test_a_small_disc_is_no_other_tip() -> None:
 def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:
     with Rig({"simulation": {"object_shape": "disc"}}) as rig:
         rig.grasp(8.0)
-        assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.04)
+        assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.12)
         assert rig.state.contacts[0].d / rig.plant.d[0] == pytest.approx(0.72, abs=0.03)
         rig.command("rotate", 2.0, angle=0.08)
         assert rig.state.mode == "holding"

@@ -14,7 +14,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import ObjectPose, Reading
 from softfinger.tools.watched import Watched as Hand
 from tests.harness.plant import push_along
-from tests.unit.test_control import PAPER, grasped
+from tests.unit.test_control import KNOWN, PAPER, grasped
 
 FORCE = 10.0
 BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip
@@ -37,7 +37,7 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(
             moved[raised] = math.dist(hand.plant.object_pose[:2], before[:2])
             seen[raised] = hand.mode, hand.plant.force.mean()
     assert seen[10.0][0] == "holding"
-    assert FORCE * 1.3 < seen[10.0][1] < FORCE + 10.0 * 1.05
+    assert FORCE * 1.2 < seen[10.0][1] < (FORCE + 10.0) * (1.0 + KNOWN)
     assert moved[10.0] < 2.5e-3, "the tips' own shear"
     assert moved[0.0] > 10e-3
 
@@ -50,7 +50,7 @@ def test_the_grip_comes_back_when_the_load_has_gone() -> None:
         hand.plant.push(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.02)
+        assert hand.plant.force.mean() == pytest.approx(FORCE, rel=KNOWN)
 
 
 @pytest.mark.parametrize(("force", "sections"), [(10.0, {}), (5.0, PAPER), (2.0, {}), (2.0, PAPER)])
@@ -60,7 +60,7 @@ def test_turning_alone_raises_nothing(force: float, sections: dict[str, dict[str
         for angle in (0.17, -0.17, 0.0):
             hand.command("rotate", angle=angle)
             seen = hand.watch(1.2)
-            assert seen.force.mean(axis=1).max() < 1.1 * force
+            assert seen.force.mean(axis=1).max() < (1.1 + 2.0 * KNOWN) * force
 
 
 def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
@@ -88,12 +88,19 @@ class Watched:
         self.grip = Grip(Settings.model_validate({"control": control}), [0, 1], held)
         self.grip.start(asked, asked)
 
-    def run(self, load: float, ticks: int, holding: bool = True, normal: float = 10.0) -> float:
-        """So many ticks under a load; the force [N] that is gone to."""
+    def run(
+        self,
+        load: float,
+        ticks: int,
+        holding: bool = True,
+        normal: float = 10.0,
+        speed: float = 0.0,
+    ) -> float:
+        """So many ticks under a load, joints closing with ``speed``; the force [N] gone to."""
         self.held.unexplained = [self.held.load_lever * load] * 2
         self.held.normal = [normal, normal]
         for _ in range(ticks):
-            self.grip.torques(Reading(), ObjectPose(), holding)
+            self.grip.torques(Reading(dq=[speed, speed]), ObjectPose(), holding)
         return self.grip.given
 
 
@@ -121,23 +128,51 @@ def at_rest(asked: float = FORCE) -> Watched:
     return watched
 
 
+GIVES_WAY = -0.024  # rad/s, a count
+
+
 def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> None:
     watched = at_rest()
     friction = 0.05 / 0.03
-    # Friction that turns round is none, and neither is a load that goes.
-    assert watched.run(1.95 * friction, 1) == FORCE
-    assert watched.run(0.0, 500) == FORCE
-    assert watched.run(3.0 * friction, 1) == FORCE + 10.0
+    # What moves no joint is a frame's error, and so little that friction holds it is no danger.
+    assert watched.run(3.0 * friction, 1) == FORCE
+    watched = at_rest()
+    assert watched.run(0.8 * friction, 1, speed=GIVES_WAY) == FORCE
+    watched = at_rest()
+    assert watched.run(2.0 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
-    assert state.push == pytest.approx(FORCE + 10.0 + 10.0, rel=0.01), "at the same tick"
+    assert state.push > 1.15 * (FORCE + 10.0), "at the same tick"
+    # As much as the torque constants' error, friction and the load may take, and no more.
+    most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
+    assert state.push <= most + 1e-9
     # The force felt comes up: the controller holds what the reflex gave.
     watched.held.force = [FORCE + 10.0] * 2
-    watched.run(3.0 * friction, 1)
-    assert state.push == pytest.approx(FORCE + 10.0, rel=0.01)
-    # Another command for a greater force is no reflex.
-    watched.grip.retarget(FORCE + 12.0)
-    watched.run(3.0 * friction, 1, holding=False)
-    assert state.push == pytest.approx(FORCE + 10.0, rel=0.02)
+    watched.run(2.0 * friction, 1)
+    assert state.push == pytest.approx(FORCE + 10.0, rel=0.03)
+
+
+def test_a_load_that_stands_leaves_less_to_come() -> None:
+    """With 3 N on each tip, a third of what alone would be no danger is one."""
+    friction = 0.05 / 0.03
+    watched = at_rest()
+    for load in np.linspace(0.0, 3.0, 500):
+        watched.run(load, 1)
+    assert watched.run(3.0, 1000) == FORCE
+    assert watched.run(3.0 + 0.8 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
+
+
+def test_the_raise_is_at_most_a_share_of_the_force_asked_for() -> None:
+    watched = Watched(4.0, grip_raise_share=0.5)
+    watched.grip.begin_holding()
+    assert watched.run(50.0, 500, normal=4.0) == pytest.approx(6.0)
+
+
+def test_solid_tips_show_a_load_by_themselves() -> None:
+    watched = at_rest()
+    watched.held.sheared = 1.0
+    assert watched.run(0.0, 500) == FORCE
+    watched.held.sheared = 3.5  # and one that comes at once is more than half of what is borne
+    assert watched.run(0.0, 1) == FORCE + 10.0
 
 
 def test_what_one_joint_alone_shows_is_no_sudden_load() -> None:
@@ -162,27 +197,15 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force: float) -> N
         watched.grip.torques(Reading(), ObjectPose(), tick > 500)  # it was there before the grip
         assert watched.grip.given == force
     watched.held.unexplained = [0.35, 0.35]
-    watched.grip.torques(Reading(), ObjectPose(), True)
+    watched.grip.torques(Reading(dq=[GIVES_WAY, GIVES_WAY]), ObjectPose(), True)
     assert watched.grip.slip.reflex
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() -> None:
     for more, expected in ((2.0, 12.0), (100.0, 27.0), (0.0, 10.0)):
-        watched = Watched(grip_raise_max=more)
+        watched = Watched(grip_raise_max=more, grip_raise_share=10.0)
         watched.grip.begin_holding()
         assert watched.run(50.0, 500) == pytest.approx(expected)
-
-
-def test_a_wrong_torque_constant_is_no_load() -> None:
-    watched = Watched()
-    # 8 % of 10 N at 79 mm looks like 2.1 N on a lever of 30 mm.
-    wrong = 0.08 * 10.0 * 0.079 / 0.03
-    watched.run(wrong, 500, holding=False)
-    watched.grip.begin_holding()
-    assert watched.run(wrong, 500) == FORCE
-    for normal in np.linspace(10.0, 20.0, 200):
-        force = watched.run(wrong * normal / 10.0, 1, normal=normal)
-    assert force == FORCE
 
 
 def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques() -> None:

@@ -234,7 +234,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
             assert not contact.misfit
             assert contact.d == pytest.approx(hand.d[finger], abs=5.0 * contact.d_std)
             assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
-            assert contact.force == pytest.approx(hand.force[finger], rel=0.03)
+            assert contact.force == pytest.approx(hand.force[finger], rel=0.06)
             # As it acts on the face, of which the base feels what it does at the height a.
             shear = hand.tangential[finger] * (1.0 - hand.d[finger] / 0.020)
             assert abs(shear) > 0.2

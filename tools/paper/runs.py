@@ -139,7 +139,8 @@ def _daemon(*more: Sections | None) -> Daemon:
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
-        "tactile": {"rate": 1.0 / SCAN, "noise": 0.005 * MODULUS},
+        # A calibrated sensor: what its frames are higher is the tip, which is stiffer.
+        "tactile": {"rate": 1.0 / SCAN, "noise": 0.005 * MODULUS, "gain_error": 1e-3},
         "loop": {"clock": "virtual"},
         "simulation": {
             "tactile_delay": SCAN,

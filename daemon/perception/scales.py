@@ -1,0 +1,191 @@
+"""Tells a stiffer tip from a sensor that reads too much: the scales of what feels a force.
+
+A tip's normal force F is known in several ways, each off by a scale of its own:
+
+- the footprint's shape gives d, and so the table's F₀(d, θ), without any scale of the sensor; the
+  force is F = e^ε F₀ where the tip's modulus is e^ε times the settings';
+- the frame's height over the model's is A = e^(ε + γ), with e^γ the gain of the sensor;
+- both joints' mean torque is that of (1 + κ) e^ε M + o, with M the moment of the table's forces, κ
+  the error of the torque constant, and o an offset: friction, or a load that stood before the grip;
+- what both tips press is equal up to what the object rubs on.
+
+One frame can't tell ε from γ. A Kalman filter holds (ε, γ, κ, o) of both fingers, with priors: a
+modulus is known to some 20 % before it was calibrated, a sensor's gain changes by 5-32 % when it is
+mounted again (DTIC ADP011007), a torque constant is good to 10 %. Torques are taken in only while a
+grip's force ramps: a wrong scale grows with the force, a load along the faces doesn't. The height
+is taken in with each frame; what changes of it in a lasting grip is the sensor's, for a modulus
+doesn't jump. What was found stays for later grips.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.compiled.layout import Pair, Record
+
+FloatArray = NDArray[np.float64]
+
+STATES = 8
+MODULUS, GAIN, TORQUE, OFFSET = 0, 2, 4, 6  # places of the left finger's; the right one's follow
+
+MODULUS_ERROR = 0.2  # of a tip whose modulus nobody measured
+GAIN_DOUBTED = 1.5  # prior standard deviations off, a sensor's gain is reported
+CALIBRATED_ERROR = 0.05  # of one that `softfinger calibrate modulus` found
+_LOAD_ERROR = 0.05  # N·m, standard deviation of what stands in a joint beside its friction
+_GAIN_WALK = 0.05  # 1/√s, what a sensor's gain does in a grip: warmth, creep
+_OFFSET_WALK = 0.05  # N·m/√s, what friction does while the force ramps
+_FORGOTTEN = 0.1  # of what was learnt, with each new grip
+_HEIGHT_ERROR = 0.02  # of a frame's height, by all that the model leaves out
+_TORQUE_NOISE = 0.02  # N·m of a joint that stands
+_MOVING_NOISE = 0.05  # N·m of one that moves: inertia, damping
+_MOVING = 0.05  # rad/s
+_LATELY = 0.1  # s
+_BALANCE_ERROR = 0.05  # of the tips' forces, and …
+_RUBBED = 0.4  # … N that a table may take off one of them
+_GATE = 3.0  # standard deviations: what is further off counts as no more than so much
+
+
+class Prior(NamedTuple):
+    """Standard deviations, relative, of (left, right) modulus, and of every gain and torque."""
+
+    modulus: tuple[float, float]
+    gain: float
+    torque: float
+    friction: float  # of a joint [N·m]
+    inertia: float  # of a joint [kg·m²]
+
+
+class Scales(Record):
+    """What is known of both fingers' scales: logarithms of moduli and gains, torques, offsets."""
+
+    mean: Annotated[FloatArray, STATES]
+    covariance: Annotated[FloatArray, STATES, STATES]
+    prior: Annotated[FloatArray, STATES]  # variances
+    friction: float  # of a joint that moves [N·m]
+    inertia: float  # of a joint [kg·m²]
+    speed: float  # of the joints' closing when torques were taken in last [rad/s]
+    t: float  # and when that was [s]
+    modulus: Pair  # e^ε: force over the table's
+    torque: Pair  # of the joints, and …
+    moment: Pair  # … of the tips' forces about them, when torques were taken in last [N·m]
+    slopes: Annotated[FloatArray, STATES]  # scratch: of a measurement by the states
+    across: Annotated[FloatArray, STATES]  # scratch
+    gripping: bool  # both tips touch, and have since `begin_grip`
+
+
+def set_prior(scales: Scales, prior: Prior) -> None:
+    """Begin with what the settings say, and nothing learnt."""
+    offset = math.hypot(prior.friction, _LOAD_ERROR)
+    scales.mean[:] = 0.0
+    scales.modulus[:] = 1.0
+    scales.friction, scales.inertia = prior.friction, prior.inertia
+    scales.prior[:] = np.square(
+        [*prior.modulus, prior.gain, prior.gain, prior.torque, prior.torque, offset, offset]
+    )
+    scales.covariance[:] = np.diag(scales.prior)
+
+
+@inner_kernel
+def begin_grip(s: Scales) -> None:
+    """A new grip: offsets are unknown again, and a little of the rest is forgotten."""
+    s.gripping = True
+    for i in range(STATES):
+        for j in range(STATES):
+            if i >= OFFSET or j >= OFFSET:
+                s.covariance[i, j] = 0.0
+            else:
+                s.covariance[i, j] *= 1.0 - _FORGOTTEN
+        s.covariance[i, i] += s.prior[i] * (1.0 if i >= OFFSET else _FORGOTTEN)
+    s.mean[OFFSET] = s.mean[OFFSET + 1] = 0.0
+
+
+@inner_kernel
+def drift(s: Scales, dt: float) -> None:
+    """Let ``dt`` s pass in a grip."""
+    for k in range(2):
+        s.covariance[GAIN + k, GAIN + k] += _GAIN_WALK * _GAIN_WALK * dt
+        s.covariance[OFFSET + k, OFFSET + k] += _OFFSET_WALK * _OFFSET_WALK * dt
+
+
+@inner_kernel
+def _update(s: Scales, miss: float, variance: float, gate: float) -> None:
+    """Kalman's update by one measurement that is ``miss`` off, with `slopes` by the states.
+
+    Beyond a ``gate`` [standard deviations] it weighs as if it were that far off: nobody is believed
+    alone. Leaves the slopes 0.
+    """
+    slopes = s.slopes
+    across = s.across
+    expected = 0.0
+    for i in range(STATES):
+        total = 0.0
+        for j in range(STATES):
+            total += s.covariance[i, j] * slopes[j]
+        across[i] = total
+        expected += slopes[i] * total
+    variance = max(variance, miss * miss / (gate * gate) - expected)
+    inverse = 1.0 / (expected + variance)
+    for i in range(STATES):
+        s.mean[i] += across[i] * inverse * miss
+        for j in range(STATES):
+            s.covariance[i, j] -= across[i] * across[j] * inverse
+    slopes[:] = 0.0
+
+
+@inner_kernel
+def take_height(s: Scales, finger: int, height: float, variance: float) -> None:
+    """Take in the filtered ``height`` of a finger's frames over the model's."""
+    slopes = s.slopes
+    slopes[MODULUS + finger] = slopes[GAIN + finger] = 1.0
+    miss = math.log(max(height, 1e-3)) - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
+    _update(s, miss, variance + _HEIGHT_ERROR * _HEIGHT_ERROR, math.inf)
+
+
+@inner_kernel
+def take_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float) -> None:
+    """Take in the joints' ``torque`` [N·m] where the tips' forces make a ``moment`` [N·m].
+
+    The mean of both: what turns the object, shakes it or leans on it is in one as much as it lacks
+    in the other. ``speed`` [rad/s]: of their closing; ``t``: the time [s].
+    """
+    faster = speed - s.speed
+    since = t - s.t
+    s.speed = speed
+    s.t = t
+    if not 0.0 < since < _LATELY:
+        return
+    miss = 0.0
+    slopes = s.slopes
+    for k in range(2):
+        scaled = 0.5 * (1.0 + s.mean[TORQUE + k]) * moment[k]
+        miss += 0.5 * torque[k] - scaled - 0.5 * s.mean[OFFSET + k]
+        slopes[MODULUS + k] = scaled
+        slopes[TORQUE + k] = 0.5 * moment[k]
+        slopes[OFFSET + k] = 0.5
+    miss -= s.friction * min(max(speed / _MOVING, -1.0), 1.0) + s.inertia * faster / since
+    noise = _TORQUE_NOISE
+    if abs(speed) > _MOVING:
+        noise = _MOVING_NOISE
+    _update(s, miss, noise * noise, _GATE)
+
+
+@inner_kernel
+def take_balance(s: Scales, force1: float, force2: float) -> None:
+    """Take in that both tips press an object with about the same force."""
+    slopes = s.slopes
+    slopes[MODULUS] = 1.0
+    slopes[MODULUS + 1] = -1.0
+    error = _BALANCE_ERROR + _RUBBED / min(force1, force2)
+    _update(s, math.log(force2 / force1), error * error, _GATE)
+
+
+@inner_kernel
+def settle(s: Scales) -> None:
+    """Write the moduli that follow."""
+    for k in range(2):
+        s.modulus[k] = math.exp(s.mean[MODULUS + k])

@@ -1,0 +1,98 @@
+"""A witness that begins to lie in a grip: named, refused, never obeyed; by the plant's truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.perception.perception import Repeats
+from softfinger.tools.watched import Watched as Hand
+from tests.unit.test_control import grasped
+
+FORCE = 6.0
+BOTH = {"witness.left_sensor", "witness.right_sensor"}
+
+# What lies: (kind, value, over [s], fingers, who is to be named).
+LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str]]] = {
+    "one zero sinks": ("drift", -0.1, 1.0, (0,), {"witness.left_sensor"}),
+    "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH),
+    "both zeros rise": ("drift", 0.1, 1.0, (0, 1), BOTH),
+    "one image shifts": ("shift-x", 3.0, 0.0, (1,), {"witness.right_sensor"}),
+    "both images shift": ("shift-x", 3.0, 0.0, (0, 1), BOTH),
+    "one image is mirrored": ("mirror", 1.0, 0.0, (0,), {"witness.left_sensor"}),
+    "one current reads half": ("current", 0.5, 0.0, (0,), {"witness.left_current"}),
+    "one current reads double": ("current", 2.0, 0.0, (1,), {"witness.right_current"}),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
+    kind, value, over, fingers, named = LIES[lie]
+    with Hand({}) as hand:
+        grasped(hand, FORCE)
+        for finger in fingers:
+            hand.plant.measurement_faults[finger].begin(kind, value, hand.plant.t, over)
+        seen = hand.watch(1.5)
+        assert seen.force.max() < 1.3 * FORCE
+        found = {kind for _, kind, _ in hand.events if kind.startswith("witness")}
+        assert found == named
+        assert not [text for _, kind, text in hand.events if kind == "slip"]
+        if kind == "current":
+            assert hand.mode == "holding"
+            assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
+        else:  # without a sensor that can be believed, as without frames
+            assert hand.mode == "fault"
+            assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
+
+
+def test_frames_that_come_again_are_refused_and_a_new_force_is_not_built_up_on_them() -> None:
+    with Hand({}) as hand:
+        grasped(hand, FORCE)
+        for finger in hand.plant.measurement_faults:
+            finger.begin("replay", 0.6, hand.plant.t)
+        hand.command("grasp", force=20.0)
+        seen = hand.watch(1.0)
+        assert seen.force.max() < 1.3 * 20.0
+        assert hand.mode == "fault"
+        found = {kind for _, kind, _ in hand.events if kind.startswith("witness")}
+        assert found == BOTH
+
+
+@pytest.mark.parametrize("load", [(0.0, 5.0, 0.0), (3.0, 0.0, 0.0), (0.0, 0.0, 0.2)])
+def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]) -> None:
+    with Hand({}) as hand:
+        grasped(hand, 10.0)
+        for sign in (1.0, -1.0, 0.0):
+            hand.plant.push(*(sign * each for each in load))
+            hand.watch(0.8)
+        hand.command("rotate", angle=0.12)
+        hand.watch(1.0)
+        assert hand.mode == "holding"
+        assert not [event for event in hand.events if event[1].startswith("witness")]
+
+
+def given(repeats: Repeats, frames: list[int]) -> bool:
+    for number in frames:
+        repeats.look(np.full((2, 2), number, np.uint16))
+    return repeats.long
+
+
+SEQUENCES: dict[str, tuple[Callable[[], list[int]], bool]] = {
+    "all differ": (lambda: list(range(400)), False),
+    "one again and again": (lambda: [7] * 400, False),
+    "few values, as noise has them": (
+        lambda: np.random.default_rng(1).integers(0, 12, 400).tolist(),
+        False,
+    ),
+    "sixty again": (lambda: [*range(60), *range(20)], True),
+    "again, but longer ago than is remembered": (lambda: [*range(300), *range(20)], False),
+}
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_only_an_order_that_comes_again_is_a_repetition(name: str) -> None:
+    frames, expected = SEQUENCES[name]
+    assert given(Repeats(100.0), frames()) is expected
+    assert not given(Repeats(100.0, judged=False), frames())

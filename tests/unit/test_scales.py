@@ -1,0 +1,148 @@
+"""Which scale is it: the kernels against plain NumPy, and grips of wrong scales on the plant."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.perception import scales
+from softfinger.daemon.perception.scales import Prior, Scales, set_prior
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.layout import Pair, Records
+from softfinger.tools.watched import Watched as Hand
+from tests.unit.test_control import grasped
+
+PRIOR = Prior((0.2, 0.05), gain=0.25, torque=0.1, friction=0.05, inertia=0.01)
+
+
+@kernel
+def begin(records: Records[Scales]) -> None:
+    scales.begin_grip(records[0])
+
+
+@kernel
+def height(records: Records[Scales], finger: int, value: float, variance: float) -> None:
+    scales.take_height(records[0], finger, value, variance)
+
+
+@kernel
+def torques(records: Records[Scales], torque: Pair, moment: Pair, speed: float, t: float) -> None:
+    scales.take_torque(records[0], torque, moment, speed, t)
+
+
+@kernel
+def balance(records: Records[Scales], force1: float, force2: float) -> None:
+    scales.take_balance(records[0], force1, force2)
+
+
+class Reference:
+    """Kalman's equations in matrices; states as `perception.scales` has them."""
+
+    def __init__(self) -> None:
+        offset = 0.05**2 + 0.05**2
+        self.prior = np.array([0.2**2, 0.05**2, *[0.25**2] * 2, *[0.1**2] * 2, offset, offset])
+        self.x = np.zeros(8)
+        self.p = np.diag(self.prior)
+
+    def begin(self) -> None:
+        kept, forgotten = self.p * 0.9, np.diag(self.prior) * 0.1
+        self.p = kept + forgotten
+        self.p[6:, :] = self.p[:, 6:] = 0.0
+        self.p[6:, 6:] = np.diag(self.prior[6:])
+        self.x[6:] = 0.0
+
+    def take(self, h: np.ndarray[Any, Any], miss: float, r: float, gate: float = 3.0) -> None:
+        s = h @ self.p @ h
+        r = max(r, miss**2 / gate**2 - s)
+        gain = self.p @ h / (s + r)
+        self.x = self.x + gain * miss
+        self.p = (np.eye(8) - np.outer(gain, h)) @ self.p
+
+
+def test_the_filter_is_kalmans() -> None:
+    rng = np.random.default_rng(3)
+    found, wanted = Scales(), Reference()
+    set_prior(found, PRIOR)
+    begin(found.array)
+    wanted.begin()
+    t = 1.0
+    torques(found.array, np.zeros(2), np.zeros(2), 0.0, t)  # the first only says how fast
+    for k in range(200):
+        finger, value, variance = k % 2, float(np.exp(rng.normal(0.3, 0.1))), 1e-3
+        height(found.array, finger, value, variance)
+        h = np.zeros(8)
+        h[finger] = h[2 + finger] = 1.0
+        wanted.take(h, np.log(value) - wanted.x @ h, variance + 0.02**2, np.inf)
+        moment, speed = rng.uniform(0.1, 0.5, 2), 0.0 if k % 3 else 0.03
+        torque = 1.2 * moment + rng.normal(0.0, 0.3 if k % 50 == 7 else 0.02, 2)  # some far off
+        before = 0.0 if k == 0 or (k - 1) % 3 else 0.03
+        t += 0.01
+        torques(found.array, torque, moment, speed, t)
+        scaled = 0.5 * (1.0 + wanted.x[4:6]) * moment
+        h = np.concatenate([scaled, np.zeros(2), 0.5 * moment, [0.5, 0.5]])
+        miss = (0.5 * torque - scaled - 0.5 * wanted.x[6:]).sum()
+        miss -= 0.05 * speed / 0.05 + 0.01 * (speed - before) / 0.01
+        wanted.take(h, miss, 0.02**2)
+        forces = rng.uniform(3.0, 9.0, 2)
+        balance(found.array, *forces.tolist())
+        h = np.array([1.0, -1.0, 0, 0, 0, 0, 0, 0])
+        wanted.take(h, np.log(forces[1] / forces[0]), (0.05 + 0.4 / forces.min()) ** 2)
+        if k == 100:
+            begin(found.array)
+            wanted.begin()
+    np.testing.assert_allclose(found.mean, wanted.x, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.covariance, wanted.p, rtol=1e-7, atol=1e-14)
+
+
+CASES: dict[str, tuple[dict[str, Any], float, float]] = {
+    "honest": ({}, 1.0, 0.06),
+    "both read 1.4": ({"tactile_gain": (1.4, 1.4)}, 1.4, 0.15),
+    "both read 0.6": ({"tactile_gain": (0.6, 0.6)}, 0.6, 0.15),
+    "left reads 0.5": ({"tactile_gain": (0.5, 1.0)}, 0.5, 0.15),
+    "soft": ({"modulus_scale": 0.6}, 1.0, 0.15),
+    "stiff": ({"modulus_scale": 1.6}, 1.0, 0.15),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("force", [6.0, 12.0])
+def test_a_wrong_scale_is_told_from_the_tips_stiffness(case: str, force: float) -> None:
+    simulation, gain, within = CASES[case]
+    with Hand({"simulation": simulation}) as hand:
+        grasped(hand, force)
+        assert hand.plant.normal.mean() == pytest.approx(force, rel=within)
+        found = hand.contact_filter.grasp.scales
+        stiff = np.exp(found.mean[scales.MODULUS])
+        assert np.exp(found.mean[scales.GAIN]) == pytest.approx(gain, rel=0.2)
+        assert stiff == pytest.approx(simulation.get("modulus_scale", 1.0), rel=0.2)
+        # What is told of the force's error is about what it is.
+        contact = hand.contacts[0]
+        off = contact.force - hand.plant.force[0]
+        assert abs(off) < 2.5 * contact.force_std < 0.4 * force
+        assert not [event for event in hand.events if event[1] == "slip"]
+
+
+def test_a_gain_that_changes_in_the_grip_is_the_sensors() -> None:
+    with Hand({}) as hand:
+        grasped(hand, 6.0)
+        before = hand.plant.normal.mean()
+        for finger in hand.plant.measurement_faults:
+            finger.begin("gain", 0.5, hand.plant.t, 1.0)
+        hand.watch(3.0)
+        assert hand.plant.normal.mean() == pytest.approx(before, rel=0.03)
+        found = hand.contact_filter.grasp.scales
+        assert np.exp(found.mean[scales.GAIN]) == pytest.approx(0.5, rel=0.25)
+        named = {event[1] for event in hand.events if event[1].startswith("witness")}
+        assert named == {"witness.left_sensor", "witness.right_sensor"}
+
+
+def test_a_wrong_torque_constant_is_no_load() -> None:
+    for wrong in (0.9, 1.1):
+        with Hand({}) as hand:
+            hand.plant.plant.parameters.torque_constant *= wrong
+            grasped(hand)
+            hand.watch(2.0)
+            assert hand.plant.normal.mean() == pytest.approx(10.0, rel=0.12)
+            assert not [event for event in hand.events if event[1] == "slip"]
