@@ -153,9 +153,7 @@ class FingerState:
     )
     shear_y: float = _contact("N", "and across the plane")
     gain: float = _contact("", "measured over modelled pressure")
-    modulus_scale: float = _contact(
-        "", "of the tip's modulus over the settings', as grips tell it"
-    )
+    modulus_scale: float = _contact("", "of the tip's modulus over the settings', as grips tell it")
     modulus_scale_std: float = _contact("", "its standard deviation")
     sensor_gain: float = _contact("", "of the sensor: gain over modulus_scale")
     sensor_gain_std: float = _contact("", "its standard deviation")
