@@ -238,7 +238,8 @@ def advance(
     right.d.variance += _DRIFT_D * _DRIFT_D * dt
     left.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
     right.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
-    scales.drift(f.grasp.scales, dt)
+    if both:
+        scales.drift(f.grasp.scales, dt)
     f.angle.variance += _DRIFT_ANGLE * _DRIFT_ANGLE * dt
     f.taper_variance += _DRIFT_TAPER * _DRIFT_TAPER * dt
     f.newest = (f.newest + 1) % len(history)
@@ -368,15 +369,15 @@ def correct(
     angle = theta - q if finger == 0 else theta + q
     sense = -1.0 if finger == 0 else 1.0
     angle_variance = theta_variance + _STEP_VARIANCE * f.count * f.count
-    firm = min(f.grasp.normal[0], f.grasp.normal[1]) > _FIRM
-    if tip.live and other.live and firm:
+    both = tip.live and other.live
+    if both and f.grasp.witnesses.drifted[finger] > witnesses.DRIFT_TIME:
+        return False
+    if both and min(f.grasp.normal[0], f.grasp.normal[1]) > _FIRM:
         miss = angle - (f.angle.mean + 0.5 * sense * f.taper - turned)
         unsure = _face_variance(f, sense) + angle_variance
         speed = abs(tip.speed) + abs(other.speed)
         if witnesses.refuses(f.grasp.witnesses, finger, miss, unsure, speed):
             return False
-    if f.grasp.witnesses.drifted[finger] > witnesses.DRIFT_TIME:
-        return False
     tip.unseen = min(tip.unseen, f.slow * max(f.t - t, 0.0))
     tip.tilt_y = tilt_y
     tip.shear = shear

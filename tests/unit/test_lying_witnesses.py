@@ -47,6 +47,25 @@ def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
+def test_a_sensor_that_is_honest_again_is_believed_again() -> None:
+    with Hand({}) as hand:
+        grasped(hand, FORCE)
+        for finger in hand.plant.measurement_faults:
+            finger.begin("drift", -0.1, hand.plant.t, 1.0)
+        hand.watch(1.5)
+        assert hand.mode == "fault"
+        for finger in hand.plant.measurement_faults:
+            finger.clear()
+        hand.watch(1.0)
+        hand.command("clear")
+        hand.plant.place_object()
+        hand.events.clear()
+        grasped(hand, FORCE)
+        assert hand.mode == "holding"
+        assert hand.plant.normal.mean() == pytest.approx(FORCE, rel=0.1)
+        assert not [kind for _, kind, _ in hand.events if kind.startswith("witness")]
+
+
 def test_frames_that_come_again_are_refused_and_a_new_force_is_not_built_up_on_them() -> None:
     with Hand({}) as hand:
         grasped(hand, FORCE)
