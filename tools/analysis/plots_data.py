@@ -26,7 +26,10 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _TICK = ("mono_ns", "timestamp")
-_FINGER = ("valid", "contact", "d", "theta", "force", "energy", "d_std", "theta_std", "gain")
+_FINGER = (
+    *("valid", "contact", "d", "theta", "force", "energy"),
+    *("d_std", "theta_std", "force_std", "gain"),
+)
 _OBJECT = ("valid", "angle")
 _TRUE = ("d", "theta", "force")
 _TRUE_OBJECT = ("angle",)

@@ -1,7 +1,7 @@
 """Pages that compare measurements with the contact model: over θ, and on the energy landscape.
 
 The model is that of the recording's own settings and calibrations; force and energy are those of
-the state: the model times the gain measured from the pressure.
+the state: the model times the scale of the tip's modulus that grips have found.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _groups(
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """F and U against θ beside the model's curves at fixed d, and measured over modelled force."""
+    """F and U against θ beside the curves at fixed d, and measured over modelled pressure."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
     figure = style.new_figure(7.2, 1.9 + 3.0 * len(groups))
@@ -98,7 +98,7 @@ def draw_angle(run: RecordedRun) -> Figure:
             label=name,
         )
     gain.axhline(1.0, color=style.INK, linewidth=0.8)
-    gain.set(xlabel="θ [°]", ylabel="measured over\nmodelled force")
+    gain.set(xlabel="θ [°]", ylabel="measured over\nmodelled pressure")
     every = np.concatenate([run.states[f"{name}.gain"][run.touching(name)] for name in fingers])
     reach = max(1.6 * float(np.quantile(np.abs(every - 1.0), 0.98)), 0.01)
     gain.set_ylim(1.0 - reach, 1.0 + reach)
