@@ -93,13 +93,20 @@ class Interrupted(BaseException):
     """A signal asked for the end before anything ran. No ``except Exception`` may hold it up."""
 
 
+# A signal whose default ends the process without a word would leave torque to the watchdog.
+_ENDING = (
+    *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP),  # SIGHUP: the terminal is gone
+    *(signal.SIGQUIT, signal.SIGUSR2, signal.SIGALRM),
+)
+
+
 class Signals:
-    """SIGINT, SIGTERM and SIGHUP (the terminal is gone) end, quietly, at whatever stage."""
+    """Every signal that would end the process ends it quietly, at whatever stage."""
 
     def __init__(self) -> None:
         self._running: Endable | None = None
         self._ended = self._held = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in _ENDING:
             signal.signal(number, self._end)
 
     def hand_over(self, running: Endable) -> None:

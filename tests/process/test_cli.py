@@ -174,6 +174,20 @@ def test_a_signal_during_start_up_ends_it_without_a_trace(profile: Profile, numb
     assert "ended" in said.splitlines()[-1]
 
 
+@pytest.mark.parametrize("number", [signal.SIGQUIT, signal.SIGUSR2, signal.SIGALRM])
+def test_signals_that_would_end_a_process_at_once_turn_torque_off_first(
+    profile: Profile, addresses: tuple[str, str], number: int
+) -> None:
+    process = subprocess.Popen(
+        [*SOFTFINGER, "run", "--config", str(profile(""))], stderr=subprocess.PIPE, text=True
+    )
+    assert ask(addresses[1], "arm")["ok"]
+    process.send_signal(number)
+    said = process.communicate(timeout=120)[1]
+    assert process.returncode == 0
+    assert "ended, torque off" in said
+
+
 def test_a_reader_of_the_log_that_stops_reading_stops_nothing(
     profile: Profile, addresses: tuple[str, str]
 ) -> None:
