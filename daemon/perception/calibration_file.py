@@ -25,7 +25,7 @@ from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
 
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
-_STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law")
+_STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
 _TABLE_STEPS = 8192  # of a curve's table: 64 KB
@@ -115,6 +115,18 @@ class ModulusStep(_StepModel):
         return Material.constant(self.modulus)
 
 
+class ScalesStep(_StepModel):
+    """What grips told of the finger's scales: (mean, relative standard deviation) of each.
+
+    Of the modulus over this file's or the settings', the sensor's gain, the joint's torque.
+    """
+
+    date: str
+    modulus: tuple[Positive, Positive]
+    gain: tuple[Positive, Positive]
+    torque: tuple[Positive, Positive]
+
+
 class Calibration(_StepModel):
     """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``."""
 
@@ -127,6 +139,7 @@ class Calibration(_StepModel):
     centre: CentreStep | None = None
     modulus: ModulusStep | None = None
     law: TipCurves | None = None
+    scales: ScalesStep | None = None
 
     @property
     def identity(self) -> str:

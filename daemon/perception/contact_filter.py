@@ -34,8 +34,8 @@ from softfinger.daemon.perception.contact_filter_kernels import FilterState, Pas
 from softfinger.daemon.perception.scales import (
     GAIN,
     MODULUS,
-    MODULUS_ERROR,
     TORQUE,
+    UNKNOWN,
     Prior,
     Scales,
     set_prior,
@@ -63,10 +63,9 @@ class ContactFilter:
         settings: Settings,
         tables: tuple[ContactTable, ContactTable],
         materials: tuple[Material, Material] | None = None,
-        modulus_errors: tuple[float, float] = (MODULUS_ERROR, MODULUS_ERROR),
+        priors: tuple[Prior, Prior] = (UNKNOWN, UNKNOWN),
     ) -> None:
-        """Take each tip's table, its material, whose law may be off its points, and how well its
-        modulus is known (relative standard deviation)."""
+        """Take each tip's table, its material, whose law may be off its points, and its scales."""
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._with_object = settings.scene.object_model
@@ -88,18 +87,8 @@ class ContactFilter:
             law = 0.0 if materials is None else materials[finger].force_error(shares)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
         control = settings.control
-        gain = settings.tactile.gain_error
-        set_prior(
-            state.grasp.scales,
-            Prior(
-                modulus_errors,
-                gain,
-                control.torque_error,
-                control.joint_friction,
-                control.joint_inertia,
-            ),
-        )
-        self._priors = [(error, gain) for error in modulus_errors]
+        set_prior(state.grasp.scales, priors, control.joint_friction, control.joint_inertia)
+        self._priors = priors
         self._history: Any = np.zeros(
             round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
         )
@@ -245,13 +234,12 @@ def _fill_from_frame(
     estimate: ContactEstimate,
     table: FloatArray,
     law: FloatArray,
-    prior: tuple[float, float],
+    prior: Prior,
     radius: float,
 ) -> None:
     """Fill ``contact`` from one frame's estimate alone; ``table`` and ``law``: its tip's.
 
-    ``prior``: standard deviations of modulus and gain, which share out what the frame is higher
-    than the model.
+    By the ``prior``, modulus and gain share out what the frame is higher than the model.
     """
     contact.d, contact.theta = estimate.d, estimate.tilt_x  # and without a contact 0, as all else
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
@@ -260,8 +248,9 @@ def _fill_from_frame(
     if estimate.contact:
         tilt = total_tilt(contact.theta, contact.tilt_y)
         force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
-        stiff, gain = prior[0] ** 2, prior[1] ** 2
-        modulus = contact.gain ** (stiff / (stiff + gain))
+        stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
+        expected = prior.modulus[0] * prior.gain[0]
+        modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
         contact.force, contact.energy = modulus * force, modulus * energy
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
-from softfinger.daemon.perception.scales import CALIBRATED_ERROR, MODULUS_ERROR
+from softfinger.daemon.perception.scales import CALIBRATED_ERROR, MODULUS_ERROR, UNKNOWN, Prior
 from softfinger.daemon.profile.factory import (
     law_problem,
     make_grid,
@@ -41,7 +41,7 @@ class FingerModel:
     table: ContactTable
     grid: SensorGrid
     calibration: Calibration | None = None
-    modulus_error: float = MODULUS_ERROR  # relative standard deviation
+    scales: Prior = UNKNOWN
 
     @property
     def own_material(self) -> bool:
@@ -81,12 +81,8 @@ def make_models(
                 common = law, make_table(settings, law, cache, on_event)
             material, table = common
         grid = calibrated_grid(settings, finger, calibration)
-        error = settings.material.modulus_error or MODULUS_ERROR
-        if measured:
-            error = CALIBRATED_ERROR
-        elif calibration is not None and calibration.modulus is not None:
-            error = max(CALIBRATED_ERROR, calibration.modulus.residual)
-        made[finger] = FingerModel(finger, material, table, grid, calibration, error)
+        scales = _known_scales(settings, calibration)
+        made[finger] = FingerModel(finger, material, table, grid, calibration, scales)
         if calibration is not None and on_event is not None:
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:
@@ -97,6 +93,20 @@ def make_models(
             on_event("info", "material", text)
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))
     return left, right
+
+
+def _known_scales(settings: Settings, calibration: Calibration | None) -> Prior:
+    """Return what is known of a finger's scales: by earlier grips, or else by the settings."""
+    if calibration is not None and calibration.scales is not None:
+        found = calibration.scales
+        return Prior(found.modulus, found.gain, found.torque)
+    error = settings.material.modulus_error or MODULUS_ERROR
+    if settings.tip.physics == "measured":
+        error = CALIBRATED_ERROR
+    elif calibration is not None and calibration.modulus is not None:
+        error = max(CALIBRATED_ERROR, calibration.modulus.residual)
+    gain, torque = settings.tactile.gain_error, settings.control.torque_error
+    return Prior((1.0, error), (1.0, gain), (1.0, torque))
 
 
 def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:

@@ -48,7 +48,7 @@ class Perception:
             settings,
             (models[0].table, models[1].table),
             (models[0].material, models[1].material),
-            (models[0].modulus_error, models[1].modulus_error),
+            (models[0].scales, models[1].scales),
         )
 
     def update(self, state: State) -> None:

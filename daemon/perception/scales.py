@@ -14,7 +14,7 @@ modulus is known to some 20 % before it was calibrated, a sensor's gain changes 
 mounted again (DTIC ADP011007), a torque constant is good to 10 %. Torques are taken in only while a
 grip's force ramps: a wrong scale grows with the force, a load along the faces doesn't. The height
 is taken in with each frame; what changes of it in a lasting grip is the sensor's, for a modulus
-doesn't jump. What was found stays for later grips.
+doesn't jump. What was found stays for later grips; `softfinger calibrate scales` keeps it.
 """
 
 from __future__ import annotations
@@ -51,13 +51,14 @@ _GATE = 3.0  # standard deviations: what is further off counts as no more than s
 
 
 class Prior(NamedTuple):
-    """Standard deviations, relative, of (left, right) modulus, and of every gain and torque."""
+    """One finger's scales as they were known before a grip: (mean, relative standard deviation)."""
 
-    modulus: tuple[float, float]
-    gain: float
-    torque: float
-    friction: float  # of a joint [N·m]
-    inertia: float  # of a joint [kg·m²]
+    modulus: tuple[float, float] = (1.0, MODULUS_ERROR)
+    gain: tuple[float, float] = (1.0, 0.25)
+    torque: tuple[float, float] = (1.0, 0.1)
+
+
+UNKNOWN = Prior()
 
 
 class Scales(Record):
@@ -65,7 +66,8 @@ class Scales(Record):
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
-    prior: Annotated[FloatArray, STATES]  # variances
+    expected: Annotated[FloatArray, STATES]  # means of the prior, and …
+    prior: Annotated[FloatArray, STATES]  # … its variances
     friction: float  # of a joint that moves [N·m]
     inertia: float  # of a joint [kg·m²]
     speed: float  # of the joints' closing when torques were taken in last [rad/s]
@@ -78,16 +80,20 @@ class Scales(Record):
     gripping: bool  # both tips touch, and have since `begin_grip`
 
 
-def set_prior(scales: Scales, prior: Prior) -> None:
-    """Begin with what the settings say, and nothing learnt."""
-    offset = math.hypot(prior.friction, _LOAD_ERROR)
-    scales.mean[:] = 0.0
-    scales.modulus[:] = 1.0
-    scales.friction, scales.inertia = prior.friction, prior.inertia
-    scales.prior[:] = np.square(
-        [*prior.modulus, prior.gain, prior.gain, prior.torque, prior.torque, offset, offset]
-    )
+def set_prior(
+    scales: Scales, fingers: tuple[Prior, Prior], friction: float, inertia: float
+) -> None:
+    """Begin with what is known of each finger; joints have ``friction`` [N·m], ``inertia``."""
+    scales.friction, scales.inertia = friction, inertia
+    for k, prior in enumerate(fingers):
+        scales.expected[MODULUS + k] = math.log(prior.modulus[0])
+        scales.expected[GAIN + k] = math.log(prior.gain[0])
+        scales.expected[TORQUE + k] = prior.torque[0] - 1.0
+        scales.prior[[MODULUS + k, GAIN + k, TORQUE + k]] = np.square([each[1] for each in prior])
+        scales.prior[OFFSET + k] = friction**2 + _LOAD_ERROR**2
+    scales.mean[:] = scales.expected
     scales.covariance[:] = np.diag(scales.prior)
+    scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
 
 
 @inner_kernel

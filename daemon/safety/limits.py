@@ -458,7 +458,8 @@ def _gain_doubt(view: View, finger: int) -> str:
     """Say what a sensor reads where its gain is off by more than is usual, or an empty text."""
     scales = view.grasp.scales
     at = GAIN + finger
-    off, unsure = scales.mean[at], math.sqrt(scales.covariance[at, at])
+    off = scales.mean[at] - scales.expected[at]
+    unsure = math.sqrt(scales.covariance[at, at])
     if not abs(off) - unsure > GAIN_DOUBTED * math.sqrt(scales.prior[at]):
         return ""
     return (

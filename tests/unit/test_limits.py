@@ -11,7 +11,7 @@ import pytest
 
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
-from softfinger.daemon.perception.scales import GAIN, Prior, set_prior
+from softfinger.daemon.perception.scales import GAIN, UNKNOWN, set_prior
 from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS, View
 from softfinger.daemon.types import State
@@ -309,7 +309,7 @@ def test_a_warning_at_its_limit_does_not_flicker() -> None:
 
 def test_each_witness_that_is_doubted_is_named() -> None:
     grasp = GraspState()
-    set_prior(grasp.scales, Prior((0.2, 0.2), 0.25, 0.1, 0.05, 0.01))
+    set_prior(grasp.scales, (UNKNOWN, UNKNOWN), 0.05, 0.01)
     judge, state = safety(grasp=grasp), sound()
     judged(judge, state, 0.5)
     assert judge.warnings == []

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.perception import scales
-from softfinger.daemon.perception.scales import Prior, Scales, set_prior
+from softfinger.daemon.perception.scales import UNKNOWN, Prior, Scales, set_prior
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Pair, Records
 from softfinger.tools.watched import Watched as Hand
 from tests.unit.test_control import grasped
 
-PRIOR = Prior((0.2, 0.05), gain=0.25, torque=0.1, friction=0.05, inertia=0.01)
+PRIORS = UNKNOWN, Prior(modulus=(1.3, 0.05))
 
 
 @kernel
@@ -43,7 +43,7 @@ class Reference:
     def __init__(self) -> None:
         offset = 0.05**2 + 0.05**2
         self.prior = np.array([0.2**2, 0.05**2, *[0.25**2] * 2, *[0.1**2] * 2, offset, offset])
-        self.x = np.zeros(8)
+        self.x = np.array([0.0, np.log(1.3), 0, 0, 0, 0, 0, 0])
         self.p = np.diag(self.prior)
 
     def begin(self) -> None:
@@ -64,7 +64,7 @@ class Reference:
 def test_the_filter_is_kalmans() -> None:
     rng = np.random.default_rng(3)
     found, wanted = Scales(), Reference()
-    set_prior(found, PRIOR)
+    set_prior(found, PRIORS, friction=0.05, inertia=0.01)
     begin(found.array)
     wanted.begin()
     t = 1.0

@@ -6,10 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from softfinger.tools.arguments import add_profile, number, profile
+from softfinger.tools.arguments import add_keys, add_profile, number, profile, stream_address
 from softfinger.tools.extras import MissingExtra, require
 
-STEPS = ("joints", "tare", "equilibrate", "curve", "centre", "modulus", "law")
+STEPS = ("joints", "tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
 _EPILOG = """\
 the joints, of both fingers; FILE is a profile, made of --config's if absent:
   joints       with torque off each finger is closed, opened and put upright by hand: its servo,
@@ -23,6 +23,8 @@ steps of a tip, in this order; each is written into FILE, which keeps the others
   modulus      a run of known displacement (--d): E, or with --law the curve stress over strain
   law          presses at known depths and tilts (--d, --theta): springs or solid rubber, its E and
                ν, how well each explains the frames, and what error it leaves
+  scales       what a running daemon's grips, or a recording's, told of the tip's modulus, the
+               sensor's gain and the joint's torque: the daemon begins with it next time
 
 Frames come live from the sensor of the profile, load by load, or from recordings: one for each
 load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
@@ -31,7 +33,8 @@ Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
 Each step draws its result and residuals beside FILE, where matplotlib is installed.
-A new equilibrate removes curve and modulus, a new curve removes modulus: they depend on it.
+A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
+scales: they depend on it.
 """
 
 
@@ -90,6 +93,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--plot", type=Path, metavar="PICTURE", help="the picture's file (default: FILE.STEP.png)"
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
+    parser.add_argument(
+        "--address", type=stream_address, default="", help="scales: the daemon's stream"
+    )
+    add_keys(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -102,6 +109,11 @@ def run(arguments: argparse.Namespace) -> int:
         from softfinger.tools.calibration.joints import calibrate_joints
 
         print(f"joints: {calibrate_joints(arguments, settings)}\n  written to {arguments.file}")
+        return 0
+    if arguments.step == "scales":
+        from softfinger.tools.calibration.scales import calibrate_scales
+
+        print(f"scales: {calibrate_scales(arguments, settings)}; written to {arguments.file}")
         return 0
     from softfinger.daemon.perception.calibration_file import save_calibration
     from softfinger.kinematics.calibration.calibration import CalibrationError

@@ -192,7 +192,7 @@ def _equilibrate(step: Step) -> Done:
         f"{len(step.loads.frames)} pressures, cells differ by {found.spread:.2%} rms before and "
         f"{found.residual:.2%} after; {dead} dead"
     )
-    calibration = step.result(equilibrate=result, curve=None, modulus=None, law=None)
+    calibration = step.result(equilibrate=result, curve=None, modulus=None, law=None, scales=None)
     return calibration, line, {"gain": found.gain}
 
 
@@ -221,7 +221,7 @@ def _curve(step: Step) -> Done:
     )
     line = f"{found.kind} from {len(force)} loads, forces within {found.residual:.2%} rms"
     picture = {"force": force, "errors": found.errors}
-    return step.result(curve=result, modulus=None, law=None), line, picture
+    return step.result(curve=result, modulus=None, law=None, scales=None), line, picture
 
 
 def _centre(step: Step) -> Done:
@@ -293,7 +293,7 @@ def _modulus(step: Step) -> Done:
     table = ContactTable.build(tip, Material.constant(found.modulus))
     model = table(d - found.offset, theta).force
     picture = {"d": d, "force": force, "model": model, "fit": found, "law": (strain, stress)}
-    return step.result(modulus=result), line, picture
+    return step.result(modulus=result, scales=None), line, picture
 
 
 def _law(step: Step) -> Done:
@@ -312,7 +312,7 @@ def _law(step: Step) -> Done:
     material = make_material(settings.material)
     fits = compare_tips(presses, settings.tip.radius, grid, live, material)
     best, lines = fits[0], [_told(each) for each in fits]
-    steps: dict[str, Any] = {}
+    steps: dict[str, Any] = {"scales": None}
     wanted = f'tip.physics = "{best.tip.physics}"'
     if best.tip.physics == "solid":
         wanted += f', tip.base = "{best.tip.base}", tip.face = "{best.tip.face}"'

@@ -1,0 +1,82 @@
+"""`softfinger calibrate scales`: what grips told is kept, and the next daemon begins with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.client import Hand
+from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.daemon.wire.schema import STATE
+from softfinger.tools.cli import main
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.watched import Watched
+from tests.harness.daemon_process import Running, insist
+from tests.harness.recorded_hand import record_hand
+from tests.unit.test_control import grasped
+
+WRONG = {"tactile_gain": (0.6, 1.4)}
+
+
+def test_a_daemon_begins_with_what_grips_told(
+    start: Callable[..., Running],
+    profile: Callable[[str], Path],
+    addresses: tuple[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    start("--config", str(profile("[simulation]\ntactile_gain = [0.6, 1.4]\n")))
+    files = tuple(str(tmp_path / f"{name}.json") for name in ("left", "right"))
+
+    def calibrate(finger: int) -> int:
+        words = ["--finger", ("left", "right")[finger], "--address", addresses[0]]
+        return main(["calibrate", "scales", files[finger], *words])
+
+    with Hand(*addresses, timeout=60.0) as hand:
+        hand.state()
+        assert calibrate(0) == 1
+        assert "grasp something firmly first" in capsys.readouterr().err
+        assert not Path(files[0]).exists()
+        insist(hand.arm)
+        insist(lambda: hand.grasp(force=10.0))
+        hand.wait_for(lambda state: state.mode == "holding", 60.0)
+        assert [calibrate(0), calibrate(1)] == [0, 0]
+        found = [load_calibration(Path(file)).scales for file in files]
+    for step, gain in zip(found, (0.6, 1.4), strict=True):
+        assert step is not None
+        assert step.gain[0] == pytest.approx(gain, rel=0.1)
+        assert step.modulus[0] == pytest.approx(1.0, rel=0.1)
+    assert f"gain {found[0].gain[0]:.3f} ± " in capsys.readouterr().out  # type: ignore[union-attr]
+
+    with Watched({"simulation": WRONG, "tactile": {"calibration": files}}) as after:
+        first = grasped(after, 8.0).force
+        assert first[-250:].mean() == pytest.approx(8.0, rel=0.05)
+        assert first.max() < 1.12 * 8.0
+        assert after.contacts[0].sensor_gain == pytest.approx(0.6, rel=0.1)
+        assert not [event for event in after.events if event[1].startswith("witness")]
+
+
+def test_a_recordings_last_state_tells_as_much(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, file = tmp_path / "run.mcap", tmp_path / "left.json"
+    due: dict[int, dict[str, Any]] = {
+        100: {"command": "arm"},
+        200: {"command": "grasp", "force": 9.0},
+    }
+    record_hand(run, due, 2.0)
+    words = ["calibrate", "scales", str(file), "--recording", str(run)]
+    assert main(words) == 0
+    *_, (_, last) = Recording(run).messages({STATE})
+    told = last["left"]
+    found = load_calibration(file).scales
+    assert found is not None
+    mean, std = told["torque_scale"], told["torque_scale_std"]
+    assert found.torque == pytest.approx((mean, std / mean))
+    without = tmp_path / "without.mcap"
+    record_hand(without, due, 0.1, without=(STATE,))
+    assert main([*words, str(without)]) == 1
+    assert f"{without}: no hand/state in it" in capsys.readouterr().err
