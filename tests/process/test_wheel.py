@@ -24,23 +24,69 @@ assert SensorGrid(rows=8, cols=8, pitch=0.005).pressure(tip, material, 0.004, 0.
 """
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
+_SOURCES = ("MANIFEST.in", "Makefile", "README.md", "constraints.txt", "pyproject.toml", "setup.py")
+_FOLDERS = ("config", "daemon", "docs", "kinematics", "research", "softfinger", "tests", "tools")
+
+
+def copied(source: Path) -> Path:
     source.mkdir()
-    for name in ("config", "daemon", "kinematics", "research", "softfinger", "tools"):
+    for name in _FOLDERS:
         shutil.copytree(
             ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
         )
-    for name in ("LICENSE", "README.md", "pyproject.toml"):
+    for name in ("LICENSE", *_SOURCES):
         shutil.copy(ROOT / name, source)
-    words = ("wheel", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", str(folder))
-    subprocess.run(
-        [sys.executable, "-m", "pip", *words, str(source)], check=True, capture_output=True
+    return source
+
+
+def build(what: str, source: Path, into: Path) -> subprocess.CompletedProcess[str]:
+    words = f"import setuptools.build_meta as backend; backend.build_{what}({str(into)!r})"
+    return subprocess.run(
+        [sys.executable, "-c", words], cwd=source, capture_output=True, text=True, check=False
     )
-    (built,) = folder.glob("softfinger-*.whl")
-    return built
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a clone's sdist unpacks to."""
+    folder = tmp_path_factory.mktemp("sdist")
+    built = build("sdist", copied(folder / "source"), folder)
+    assert built.returncode == 0, built.stderr
+    (packed,) = folder.glob("softfinger-*.tar.gz")
+    shutil.unpack_archive(packed, folder / "unpacked")
+    (unpacked,) = (folder / "unpacked").iterdir()
+    return unpacked
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist: Path) -> Path:
+    built = build("wheel", sdist, sdist.parent)
+    assert built.returncode == 0, built.stderr
+    (packed,) = sdist.parent.glob("softfinger-*.whl")
+    return packed
+
+
+def test_the_sdist_carries_what_its_tests_and_pages_need(sdist: Path) -> None:
+    assert all((sdist / name).is_file() for name in _SOURCES)
+    for folder in ("docs", "tests"):
+        files = [each for each in (ROOT / folder).rglob("*") if each.is_file()]
+        missing = [each for each in files if not (sdist / each.relative_to(ROOT)).exists()]
+        assert not [each for each in missing if each.suffix != ".pyc"]
+
+
+@pytest.mark.parametrize("found", ["a file", "nothing"])
+def test_a_clone_without_links_is_not_built(found: str, tmp_path: Path) -> None:
+    source = copied(tmp_path / "source")
+    link = source / "softfinger" / "daemon"
+    link.unlink()
+    if found == "a file":
+        link.write_text("../daemon", encoding="utf-8")
+    else:
+        shutil.rmtree(source / "daemon")
+    told = build("wheel", source, tmp_path)
+    assert told.returncode == 1
+    assert f"softfinger/daemon: found {found}, expected a link to ../daemon: " in told.stderr
+    assert not list(tmp_path.glob("*.whl"))
 
 
 def test_it_holds_one_package_with_all_its_data(wheel: Path) -> None:
