@@ -10,25 +10,25 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from softfinger.daemon.client.asynchronous import AsyncHand
-    from softfinger.daemon.client.hand import Hand
+    from softfinger.daemon.client import (
+        AsyncHand,
+        Hand,
+        HandClosed,
+        HandFault,
+        HandState,
+        NoAnswer,
+        NoStream,
+        NotInTime,
+        Refused,
+    )
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
     from softfinger.kinematics.estimation.estimator import ContactEstimator
     from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+    from softfinger.tools.recordings.reader import read_recording
 
 __version__ = "0.1.0"
-
-_MODULES = {
-    "AsyncHand": "softfinger.daemon.client.asynchronous",
-    "ContactEstimator": "softfinger.kinematics.estimation.estimator",
-    "ContactTable": "softfinger.kinematics.contact.table",
-    "Fingertip": "softfinger.kinematics.contact.closed_form",
-    "Hand": "softfinger.daemon.client.hand",
-    "Material": "softfinger.kinematics.contact.material",
-    "SensorGrid": "softfinger.kinematics.sensing.pressure_grid",
-}
 
 __all__ = [
     "AsyncHand",
@@ -36,11 +36,28 @@ __all__ = [
     "ContactTable",
     "Fingertip",
     "Hand",
+    "HandClosed",
+    "HandFault",
+    "HandState",
     "Material",
+    "NoAnswer",
+    "NoStream",
+    "NotInTime",
+    "Refused",
     "SensorGrid",
     "SoftfingerError",
     "__version__",
+    "read_recording",
 ]
+
+_MODULES = {
+    "ContactEstimator": "kinematics.estimation.estimator",
+    "ContactTable": "kinematics.contact.table",
+    "Fingertip": "kinematics.contact.closed_form",
+    "Material": "kinematics.contact.material",
+    "SensorGrid": "kinematics.sensing.pressure_grid",
+    "read_recording": "tools.recordings.reader",
+}
 
 
 class SoftfingerError(Exception):
@@ -48,10 +65,10 @@ class SoftfingerError(Exception):
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name not in __all__:
         raise AttributeError(f"module 'softfinger' has no attribute {name!r}")
-    value = getattr(import_module(_MODULES[name]), name)
-    globals()[name] = value
+    module = import_module(f"softfinger.{_MODULES.get(name, 'daemon.client')}")
+    value = globals()[name] = getattr(module, name)
     return value
 
 

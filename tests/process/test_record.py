@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import zmq
 
-from softfinger.daemon.client import Hand
+from softfinger import Hand, read_recording
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
@@ -96,6 +96,21 @@ def test_what_is_read_is_what_was_published(tmp_path: Path) -> None:
     assert recording.duration == 399.0
     assert recording.count(schema.STATE) == 400
     assert recording.counts["hand/tactile/left"] == 20
+
+
+def test_a_recordings_states_are_columns(tmp_path: Path) -> None:
+    states = [message for topic, message in written(tmp_path / "a.mcap") if topic == schema.STATE]
+    columns = read_recording(tmp_path / "a.mcap")
+    assert columns["seq"].tolist() == list(range(400))
+    assert columns["left.force"].tolist() == [each["left"]["force"] for each in states]
+    assert columns["mode"][0] == states[0]["mode"]
+    assert columns["t"][0] == 0.0
+    assert {len(column) for column in columns.values()} == {400}
+    writer = RecordingWriter(tmp_path / "b.mcap")
+    writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})
+    writer.close()
+    with pytest.raises(RecordingError, match="b.mcap: no hand/state in it"):
+        read_recording(str(tmp_path / "b.mcap"))
 
 
 @pytest.mark.parametrize("topic", TOPICS)

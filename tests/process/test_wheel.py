@@ -15,7 +15,8 @@ ROOT = Path(__file__).parents[2]
 _FOREIGN = 'raise ImportError("a package of somebody else, imported in the place of ours")\n'
 _PUBLIC = """
 import sys
-from softfinger import AsyncHand, Hand
+from softfinger import AsyncHand, Hand, HandFault, Refused
+assert issubclass(Refused, Exception) and issubclass(HandFault, Exception)
 loaded = [name for name in sys.modules if name.startswith(("numba", "softfinger.daemon.loop"))]
 assert not loaded, loaded
 from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
@@ -100,6 +101,20 @@ def test_it_holds_one_package_with_all_its_data(wheel: Path) -> None:
     data = ("py.typed", "daemon/wire/STREAM.md", "tools/viewing/foxglove_layout.json")
     assert {f"softfinger/{name}" for name in data} <= names
     assert not any(name.startswith("softfinger/tests") for name in names)
+
+
+def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path: Path) -> None:
+    """The clone's folder has the package's name, and stands before what is installed."""
+    source = copied(tmp_path / "softfinger")
+    assert build("editable", source, tmp_path).returncode == 0
+    (packed,) = tmp_path.glob("*.whl")
+    zipfile.ZipFile(packed).extractall(tmp_path / "site")
+    script = tmp_path / "script.py"
+    begin = f"import site; site.addsitedir({str(tmp_path / 'site')!r})\n"
+    script.write_text(begin + "from softfinger import Refused, __file__ as at; print(at)\n")
+    words = [sys.executable, "-S", str(script)]  # without the site that this test itself runs in
+    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert told.stdout.strip() == str(source / "softfinger" / "__init__.py"), told.stderr
 
 
 def test_folders_of_the_same_names_are_in_nobodys_way(wheel: Path, tmp_path: Path) -> None:

@@ -1,4 +1,7 @@
-"""`Recording`: an MCAP file's summary, and its messages in the order in which they came."""
+"""`Recording`: an MCAP file's summary, and its messages in the order in which they came.
+
+`read_recording` gives its states as NumPy columns.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,27 @@ from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, f
 if TYPE_CHECKING:
     from mcap.records import Chunk, McapRecord
     from mcap.summary import Summary
+    from numpy.typing import NDArray
 
 _RECORD_LIMIT = 256 * 1024 * 1024  # bytes; our own chunks are a thousandth of it
+
+
+def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
+    """Return a recording's states as one array a field, in the order in which they came.
+
+    The names are those of `hand/state`, nested ones with a dot (``left.force``); ``t`` is the time
+    from the first state on [s]. ``pandas.DataFrame(read_recording("run.mcap"))`` takes it as it is.
+    Raises RecordingError for a file that is no recording or holds no state.
+    """
+    from softfinger.daemon.client.records import read, to_columns
+    from softfinger.daemon.wire.schema import STATE, HandState
+
+    recording = Recording(Path(path))
+    states = [read(HandState, message) for _, message in recording.messages({STATE})]
+    if not states:
+        raise RecordingError(f"{path}: no {STATE.decode()} in it")
+    columns = to_columns(states)
+    return {"t": (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9, **columns}
 
 
 class Recording:
