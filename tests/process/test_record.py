@@ -109,7 +109,7 @@ def test_a_recordings_states_are_columns(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "b.mcap")
     writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})
     writer.close()
-    with pytest.raises(RecordingError, match="b.mcap: no hand/state in it"):
+    with pytest.raises(RecordingError, match=r"b\.mcap: no hand/state in it"):
         read_recording(str(tmp_path / "b.mcap"))
 
 

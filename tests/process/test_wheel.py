@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).parents[2]
 _FOREIGN = 'raise ImportError("a package of somebody else, imported in the place of ours")\n'
@@ -137,3 +141,16 @@ def test_folders_of_the_same_names_are_in_nobodys_way(wheel: Path, tmp_path: Pat
     assert run("-m", "softfinger", "--version").startswith("softfinger ")
     assert "tip.force" in run("-m", "softfinger", "limits")
     assert run("-m", "softfinger", "config", "reference", "tip.radius") == "tip.radius = 0.02 # m\n"
+
+
+def test_each_pin_may_be_installed_on_the_oldest_python_that_is_promised() -> None:
+    """By what is installed here of constraints.txt; patch versions count, as 3.11.2's."""
+    oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    assert oldest.startswith(">=")
+    looked_at = 0
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        with contextlib.suppress(PackageNotFoundError):  # of an extra that no test needs
+            wanted = metadata(line.split("==")[0])["Requires-Python"] or ""
+            assert SpecifierSet(wanted).contains(oldest.removeprefix(">=")), f"{line}: {wanted}"
+            looked_at += 1
+    assert looked_at > 40
