@@ -63,7 +63,7 @@ class Tare:
 
 
 def tare(frames: ArrayLike) -> Tare:
-    """The zero of each cell from unloaded frames [n, rows, cols].
+    """Return the zero of each cell from unloaded frames [n, rows, cols].
 
     Raises CalibrationError when some cells vary far more than most: something presses meanwhile.
     """
@@ -80,7 +80,7 @@ def tare(frames: ArrayLike) -> Tare:
 
 
 def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
-    """``correlation`` and ``drift`` of a :class:`Tare`, from unloaded frames [n, rows, cols].
+    """Return ``correlation`` and ``drift`` of a :class:`Tare` from unloaded frames [n, rows, cols].
 
     What is within four standard errors of none counts as none.
     """
@@ -127,7 +127,7 @@ class Equilibration:
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
-    """Gains from frames [n, rows, cols] under each of several uniform pressures.
+    """Return gains from frames [n, rows, cols] under each of several uniform pressures.
 
     Least squares of each cell's readings against the mean of all live ones. Cells that respond by
     less than a fifth of the median are dead. Raises CalibrationError when nothing presses.
@@ -168,7 +168,7 @@ class SensorCurve:
 def fit_curve(
     kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float
 ) -> SensorCurve:
-    """The curve whose pressure over all cells makes the known forces.
+    """Return the curve whose pressure over all cells makes the known forces.
 
     ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
     the contact (see :func:`cleared`); ``force`` [n] N; ``area`` of a cell [m²]; ``full`` the
@@ -238,7 +238,7 @@ def _power(
 
 
 def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Readings [rows, cols], means of so many frames, with those within 4 σ of zero put to 0.
+    """Set those of the mean readings [rows, cols] of so many frames to 0 that are within 4 σ of it.
 
     Clipped noise has a positive mean, which over all the cells would weigh as much as a contact.
     """
@@ -247,7 +247,7 @@ def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
 
 
 def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
-    """Mean counts of many frames as they would be if noise didn't end at 0, over such a zero.
+    """Return the mean counts of many frames as they would be if noise did not end at 0.
 
     ``zero`` and ``noise`` are a tare's mean counts and their standard deviation. Of max(x + n, 0)
     with Gaussian n both rise with x, and so does their ratio, which tells what n is.
@@ -294,7 +294,7 @@ def fit_centre(
     noise: float,
     live: NDArray[np.bool_] | None = None,
 ) -> Centre:
-    """Centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
+    """Return centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
 
     ``frames`` [n, rows, cols] Pa. The pressure's centroid stands at centre + (a − d/3)·n, so both
     follow linearly from the estimated centroids; the estimate's own centre is brought along. A
@@ -370,7 +370,7 @@ def fit_modulus(
     free_offset: bool = True,
     tip: Fingertip | None = None,
 ) -> Modulus:
-    """A constant modulus from a compression run: √(F cos θ/π) is a line in d of slope √E.
+    """Fit a constant modulus to a compression run: √(F cos θ/π) is a line in d of slope √E.
 
     ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. ``free_offset``: the run's own
     zero of d is fitted too. A solid ``tip`` has its own force law. Raises CalibrationError for too
@@ -417,7 +417,7 @@ def fit_law(
     grid: SensorGrid,
     used: NDArray[np.bool_] | None = None,
 ) -> MeasuredLaw:
-    """σ(ε) from a compression run: each cell under the tip is a measured point of it.
+    """Return σ(ε) from a compression run: each cell under the tip is a measured point of it.
 
     ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
     out dead and saturated cells. A cell's strain is the model's, averaged over it; points are the

@@ -52,7 +52,7 @@ class PressSums:
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """The law of a tip of ``radius``, whose place on the ``grid`` is found along.
+    """Return the law of a tip of ``radius``, whose place on the ``grid`` is found along.
 
     Raises CurvesError.
     """

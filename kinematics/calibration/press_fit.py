@@ -1,4 +1,4 @@
-"""What presses at known depths and tilts tell of a tip: its physics, its modulus, its place.
+"""Fit of a tip's physics, modulus and place to presses at known depths and tilts.
 
 Least squares over all cells of all frames, for whichever tip, by the forward model alone.
 """
@@ -46,7 +46,7 @@ class Presses:
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT
     ) -> FloatArray:
-        """The frames of such presses by the model, for a modulus of 1, [cells that are used]."""
+        """Return the model's frames of these presses for a modulus of 1, [used cells]."""
         made = [
             grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
@@ -56,7 +56,7 @@ class Presses:
 
 @dataclass(frozen=True)
 class TipFit:
-    """How well one kind of tip explains the presses.
+    """Fit of one kind of tip to the presses.
 
     ``law`` is that of its material for a modulus of 1 at no strain. ``modulus`` [Pa] and the run's
     zero of d ``offset`` [m] are fitted, and a solid tip's ν; ``chi2`` is the squared misfit a cell
@@ -86,7 +86,7 @@ def _scaled(law: Material, factor: float) -> Material:
 
 
 def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT) -> TipFit:
-    """Modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
+    """Return modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
@@ -111,7 +111,7 @@ def compare_tips(
     live: NDArray[np.bool_],
     material: Material = _UNIT,
 ) -> list[TipFit]:
-    """Springs, and solid rubber on either base at its best ν: the best explanation first.
+    """Fit springs, and solid rubber on either base at its best ν; return the best fit first.
 
     With the face frictionless, and on the better base sticking. Springs of a constant modulus, and
     of the ``material``'s law where that is another one.
@@ -176,8 +176,8 @@ def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bo
 def fit_place(
     presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, turned: bool
 ) -> tuple[SensorGrid, float, float]:
-    """The grid with the tip's centre, and rotation if ``turned``; the last step [m]; the centre's
-    standard deviation [m] by what the fit leaves.
+    """Fit the tip's centre, and its rotation if ``turned``: the grid with both, the last step [m],
+    and the standard deviation [m] of the centre.
 
     Gauss-Newton on place, rotation and each press' own depth, begun at ``presses.d``; the tilts are
     known. For a tip whose centroid hardly moves with tilt, so that only the frames' shape tells.
@@ -225,7 +225,7 @@ def fit_place(
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """d [m] of an upright tip by its ``force`` [N], from the table."""
+    """Return d [m] of an upright tip by its ``force`` [N], from the table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
 
@@ -233,7 +233,9 @@ def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> Flo
 def modulus_by_force(
     d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip, free_offset: bool
 ) -> tuple[float, float, FloatArray]:
-    """E [Pa], the zero of d [m] if free, and the fit's forces [n], by least relative squares."""
+    """Fit E [Pa] and, if free, the zero of d [m] by least relative squares; return the forces [n],
+    too.
+    """
     unit, offset = ContactTable.build(tip, _UNIT), 0.0
     modulus = 0.0
     for _ in range(30):

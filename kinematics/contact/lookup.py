@@ -60,7 +60,7 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above 
 
 
 class TableHeader(Record):
-    """What a table's array starts with."""
+    """Head of a table's array."""
 
     format: float  # VERSION
     form: float  # CLOSED, or one of SLABS
@@ -75,7 +75,7 @@ class TableHeader(Record):
 
 
 def header_of(data: FloatArray) -> TableHeader:
-    """The header of a table's array."""
+    """Return the header of a table's array."""
     size = TableHeader.dtype.itemsize // data.itemsize
     return TableHeader(data[:size].view(TableHeader.dtype))
 
@@ -99,7 +99,9 @@ class TableError(SoftfingerError):
 
 
 def aligned(size: int) -> FloatArray:
-    """Zeros, float64 [size], starting at a cache line so that vector loads do not straddle two."""
+    """Return zeros, float64 [size], aligned to a cache line so that vector loads do not straddle
+    two.
+    """
     room = np.zeros(size + 8)
     skip = (-room.ctypes.data % 64) // 8
     return room[skip : skip + size]
@@ -151,7 +153,7 @@ def _slab(h: float) -> tuple[int, float]:
 
 @inlined_kernel
 def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
-    """The five ratios above the corner. The numbers of shapes are literals."""
+    """Return the five ratios above the corner. The numbers of shapes are literals."""
     i, x = _slab(h)
     y = 2.0 * y - 1.0
     if form == 1:
@@ -165,7 +167,7 @@ def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
 
 @inner_kernel
 def from_corner(p: Pointer, h: float, y: float) -> Ratios:
-    """The five ratios A + B log h below the lowest octave."""
+    """Evaluate the five ratios A + B log h below the lowest octave."""
     y *= CORNER_PIECES
     j = min(int(y), CORNER_PIECES - 1)
     y = 2.0 * (y - j) - 1.0
@@ -202,7 +204,7 @@ def _ratios(
 
 @inlined_kernel
 def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: bool) -> Six:
-    """What :func:`lookup` gives, in the domain."""
+    """Evaluate :func:`lookup` inside the domain."""
     form = int(header(p).form)
     if form == CLOSED:
         inverse = 1.0 / c
@@ -257,7 +259,7 @@ def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, fl
 
 @inlined_kernel
 def lookup_at(p: Pointer, d: float, theta: float) -> Six:
-    """:func:`lookup` in the table whose :func:`~compiled.simd.address` is ``p``.
+    """Evaluate :func:`lookup` in the table whose :func:`~compiled.simd.address` is ``p``.
 
     For kernels that call often: an array argument costs a reference count at each call.
     """
@@ -280,7 +282,7 @@ def lookup_at(p: Pointer, d: float, theta: float) -> Six:
 def push_at(
     p: Pointer, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
 ) -> Triple:
-    """N = ∂U/∂d in the domain, ∂N/∂d and ∂N/∂θ, for ``forces``: F, ∂F/∂d and ∂F/∂θ there."""
+    """Return N = ∂U/∂d in the domain, ∂N/∂d and ∂N/∂θ, for ``forces``: F, ∂F/∂d and ∂F/∂θ there."""
     force, force_d, force_theta = forces
     more = force_theta + force * tangent
     return force * inverse_cosine, force_d * inverse_cosine, more * inverse_cosine
@@ -288,7 +290,7 @@ def push_at(
 
 @kernel
 def lookup(data: FloatArray, d: float, theta: float) -> Six:
-    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
+    """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
 
     Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
     gives NaN out.
@@ -298,7 +300,7 @@ def lookup(data: FloatArray, d: float, theta: float) -> Six:
 
 @inlined_kernel
 def stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
-    """∂F/∂d [N/m] of an upright tip at d = ``reach`` [m]; ``scale`` is 2πE [Pa].
+    """Return ∂F/∂d [N/m] of an upright tip at d = ``reach`` [m]; ``scale`` is 2πE [Pa].
 
     E is the modulus at no strain.
     """
@@ -333,7 +335,8 @@ def lookups(
     out: FloatArray,
     inside: NDArray[np.bool_],
 ) -> None:
-    """:func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
+    """Evaluate :func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n], to
+    rounding.
 
     In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
     """

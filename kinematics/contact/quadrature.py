@@ -39,20 +39,20 @@ _DEEPEST = 2.0**-14  # where grading stops, over the singular point's own scale
 
 
 def gauss_rule(nodes: int = _NODES) -> FloatArray:
-    """Gauss-Legendre points and weights on [0, 1], float64 [2, nodes]."""
+    """Return Gauss-Legendre points and weights on [0, 1], float64 [2, nodes]."""
     points, weights = leggauss(nodes)
     return np.ascontiguousarray(np.stack([0.5 * (points + 1.0), 0.5 * weights]))
 
 
 def circle_rule(degree: int) -> FloatArray:
-    """cos χ and sin² χ, float64 [2, m]: equal weights, exact for a law of this ``degree``."""
+    """Return cos χ and sin² χ, float64 [2, m]: equal weights, exact for laws to this ``degree``."""
     count = max(1, degree // 2 + 1)
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
 
 
 def nodes_for(degree: int) -> int:
-    """Gauss points a piece for a law of this ``degree``."""
+    """Return Gauss points a piece for a law of this ``degree``."""
     return _NODES if degree <= 8 else _MORE_NODES
 
 
@@ -75,7 +75,7 @@ def ratios(
     s: float,
     c: float,
 ) -> tuple[float, float, float, float, float]:
-    """Ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
+    """Return ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
 
     gauss: [2, n] points and weights on [0, 1]. circle: [2, m] cos χ and sin² χ of the equidistant
     angles. parts: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it so
@@ -172,7 +172,7 @@ def ratios_at(
     c: FloatArray,
     out: FloatArray,
 ) -> None:
-    """:func:`ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
+    """Evaluate :func:`ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
     for i in range(delta.shape[0]):
         (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i]) = ratios(
             gauss, circle, parts, delta[i], h[i], s[i], c[i]
@@ -182,7 +182,7 @@ def ratios_at(
 def integrate(
     tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike, nodes: int | None = None
 ) -> Closed:
-    """Force, energy and first partials of any material by integration, to 1e-14 relative.
+    """Return force, energy and first partials of any material by integration, to 1e-14 relative.
 
     d [m] and θ [rad] broadcast. Zeros for d ≤ 0; NaN outside the domain d ≤ a, |θ| ≤ θ's limit.
     ``nodes`` is the number of Gauss points a piece, chosen by the law's degree when not given.

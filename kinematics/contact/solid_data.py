@@ -55,7 +55,7 @@ class SolidData:
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """The data of a solid ``tip``'s ν, base and face."""
+    """Return the data of a solid ``tip``'s ν, base and face."""
     block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
         kept: dict[str, Any] = {
@@ -96,7 +96,7 @@ def solid_data(tip: Fingertip) -> SolidData:
 
 
 def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
-    """g [i, j] and its partials, as `SolidData.energy` has them."""
+    """Return g [i, j] and its partials, as `SolidData.energy` has them."""
     by_t = 2.0 / root * _slope(energy)
     by_square = 2.0 / square * _slope(energy.T).T
     by_both = 2.0 / square * _slope(by_t.T).T
@@ -104,7 +104,7 @@ def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
 
 
 def powers(terms: FloatArray) -> FloatArray:
-    """Chebyshev coefficients [i, j] as those of powers."""
+    """Return Chebyshev coefficients [i, j] as those of powers."""
     left, right = (
         np.array([np.pad(chebyshev.cheb2poly(row), (0, n))[:n] for row in np.eye(n)])
         for n in terms.shape

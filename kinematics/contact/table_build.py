@@ -1,4 +1,4 @@
-"""How contact tables are fitted to the reference integrals, chosen by degree, with their error.
+"""Fit of contact tables to the reference integrals, chosen by degree, with certified error.
 
 A table's error is bounded piece by piece, over the whole domain with its edges: by the sum of the
 Chebyshev coefficients that the piece leaves out, what lies beyond them, and rounding. What it rests
@@ -76,7 +76,7 @@ class LawTerms:
 
     @classmethod
     def of(cls, material: Material) -> LawTerms:
-        """Rules and expansions for ``material``."""
+        """Return rules and expansions for ``material``."""
         return cls(
             material,
             gauss_rule(nodes_for(material.degree)),
@@ -87,7 +87,7 @@ class LawTerms:
 
 
 def build(tip: Fingertip, material: Material, tolerance: float) -> FloatArray:
-    """The array of the table of least degree within ``tolerance``; see ContactTable.build."""
+    """Build the table of least degree within ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
     law = LawTerms.of(material)

@@ -18,7 +18,7 @@ PLANES = 4  # spread: stress and its derivatives
 
 
 def parts_to_fit(width: float) -> int:
-    """Parts that a cell's side is cut into for the fit, 1 or 2, ``width`` in cells.
+    """Return the pieces that a cell's side is cut into for the fit, 1 or 2; ``width`` in cells.
 
     Towards the rim the pressure rises like a step, and where in a cell it does so shows in the
     cells beside it.
@@ -27,10 +27,10 @@ def parts_to_fit(width: float) -> int:
 
 
 def weights(stencil: FloatArray, parts: int) -> FloatArray:
-    """How a cell depends on the ``parts`` of cells, float64 [n], n a multiple of ``parts``.
+    """Return a cell's weights over the pieces of cells, float64 [n], n a multiple of ``parts``.
 
-    From the part on that has the cell's own number times ``parts``: the stencil, averaged over the
-    cell's parts, and zeros.
+    They begin at the piece with the cell's own number times ``parts``: the stencil, averaged over
+    the cell's pieces, and zeros.
     """
     whole = np.convolve(stencil, np.full(parts, 1.0 / parts))
     return np.pad(whole, (0, -len(whole) % parts))

@@ -25,7 +25,7 @@ PLANES = 3
 
 
 def cell_centres(grid: Grid, live: NDArray[np.bool_], reach: float, found: Reach) -> FloatArray:
-    """The planes of a grid whose ``live`` cells [rows, cols] are marked; fills in ``found``.
+    """Return the planes of a grid whose ``live`` cells [rows, cols] are marked; fills in ``found``.
 
     A cell is in reach when the disc of radius ``reach`` [m] round the tip's centre touches it.
     """
@@ -49,7 +49,7 @@ def cell_centres(grid: Grid, live: NDArray[np.bool_], reach: float, found: Reach
 
 @fast_inner_kernel
 def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[float, float, float]:
-    """Σ p (not finite where a cell is not), Σ p² and the largest p, at least 0, of first..last."""
+    """Return Σ p (not finite where a cell is not), Σ p² and the largest p ≥ 0, of first..last."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -68,7 +68,7 @@ def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[floa
 def sums_above(
     m: Moments, reach: Reach, frame: Pointer, centres: Pointer, size: int, level: float
 ) -> None:
-    """Σ p, Σ p x, Σ p y and the number of the cells in reach with p above ``level``, into ``m``.
+    """Sum p, p x, p y and the number of the cells in reach with p above ``level``, into ``m``.
 
     ``size`` is that of a plane.
     """
@@ -91,7 +91,7 @@ def sums_above(
 def sums_inside(
     m: Moments, frame: Pointer, centres: Pointer, size: int, first: int, last: int
 ) -> None:
-    """Σ p, Σ p x, Σ p y, Σ p (x² + y²), cells first..last whose centre ``m.face`` has pressed."""
+    """Sum p, p x, p y, p (x² + y²) of cells first..last whose centre ``m.face`` has pressed."""
     u = m.face.u
     v = m.face.v
     w = m.face.w
@@ -118,7 +118,7 @@ def sums_inside(
 
 @fast_inner_kernel
 def _any_reads(frame: Pointer, start: int, level: float) -> bool:
-    """Whether one of 64 cells does, in reach or not: half of the memory."""
+    """Return whether one of 64 cells reads ``level``, in reach or not: half of the memory."""
     found = False
     for k in range(start, start + 64):
         found |= frame[k] >= level
@@ -143,7 +143,7 @@ def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool
 
 @fast_inner_kernel
 def next_above(frame: Pointer, height: Pointer, start: int, last: int, level: float) -> int:
-    """The first cell in start..last that reads ``level`` or more; ``last`` if there is none."""
+    """Return the first cell in start..last that reads ``level`` or more; ``last`` if none does."""
     while start + 64 <= last and not (
         _any_reads(frame, start, level) and _any_of_64(frame, height, start, level)
     ):

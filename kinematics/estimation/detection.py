@@ -1,8 +1,7 @@
-"""Whether anything presses on a pressure grid, cheaply, and whether it can be one contact.
+"""Cheap test of a frame: does anything press on the grid, and can it be one contact?
 
-Cells that read high alone, as no contact can make them, are found and left out.
-
-Kernels that look at readings and noise alone; no displacement or tilt comes from here.
+Kernels on readings and noise alone, without displacement or tilt. Cells that read high alone, as no
+contact can make them, are found and masked.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _STRONG = 6.0  # noise: above it the largest cell is looked at first
 
 @inner_kernel
 def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float:
-    """How far the 5 × 5 cells round the cell ``at``, itself left out, stand above noise 1.
+    """Return how far the 5 × 5 cells round the cell ``at``, itself left out, stand above noise 1.
 
     Weights (1, 2, 2, 2, 1) both ways; the sum over its standard deviation. ``height`` is the plane
     of :mod:`estimation.cell_centres`: cells that are dead or out of reach don't count.
@@ -50,7 +49,7 @@ def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float
 
 @inner_kernel
 def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
-    """Cheap test of the frame, into ``state.signal``.
+    """Test the frame for a contact, cheaply, into ``state.signal``.
 
     A contact is a cell of ``peak_level`` · noise or more whose neighbours' weighted sum, itself
     left out, passes ``patch_level`` standard deviations: one outlier alone is none. At levels 3
@@ -89,7 +88,8 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
 def presses_outside(
     solid: SolidFit | None, state: EstimatorState, frame: Pointer, height: Pointer, level: float
 ) -> bool:
-    """Whether a cell of ``level`` or more, and not it alone, lies two cells off the footprint.
+    """Return whether a cell of ``level`` or more, with neighbours, lies two cells off the
+    footprint.
 
     Three standard deviations of the blur are added to the two cells. ``level`` is in the frame's
     unit; the neighbours' weighted mean must reach a third of it.
@@ -128,7 +128,7 @@ _DEAD = 1e3  # m below: no face is ever there
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
-    """Whether the largest cell stands alone as no contact can.
+    """Return whether the largest cell stands alone as no contact can.
 
     A contact about as wide as a cell could press ``signal.confined`` at most: a wider one never has
     a cell that stands at twice its neighbours.
@@ -154,7 +154,7 @@ def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
 
 @inner_kernel
 def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, height: Pointer) -> int:
-    """The number of outliers; ``state.signal`` is what :func:`activity` finds without them.
+    """Return the number of outliers; ``state.signal`` is what :func:`activity` finds without them.
 
     They are marked dead until :func:`restore_outliers`.
     """

@@ -115,7 +115,7 @@ def set_budget(
 
 
 def both_ways(correlation: FloatArray | None) -> FloatArray:
-    """The correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
+    """Return the correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
     assert correlation is not None
     rows, cols = correlation.shape
     return np.asarray(
@@ -135,7 +135,9 @@ def _fitted(rho: FloatArray, size: int) -> FloatArray:
 
 
 def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
-    """Σ over pairs of cells of field · ρ · field, for one field [rows, cols] or several […, n]."""
+    """Return Σ over pairs of cells of field · ρ · field, for one field [rows, cols] or several […,
+    n].
+    """
     several = fields.reshape(*fields.shape[:2], -1)
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
     kernel = np.zeros(shape)
@@ -214,7 +216,7 @@ def colour(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
 def smooth_misfit(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer
 ) -> tuple[float, float]:
-    """Σ over neighbours in the packed cells of the product of their residuals [Pa²]; their number.
+    """Return Σ over neighbouring packed cells of the product of residuals [Pa²], and their number.
 
     Noise of single cells adds nothing to it on average, what is smooth over the footprint all.
     """
@@ -242,7 +244,7 @@ def smooth_misfit(
 def hidden_misfit(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, beyond: float
 ) -> float:
-    """Square sum [Pa²] of what the model leaves smoothly over the footprint; 0 within the noise.
+    """Return the square sum [Pa²] of misfit smooth over the footprint; 0 within the noise.
 
     ``beyond`` [Pa²] is all that it leaves beyond what is expected: in a footprint of few cells no
     part of that can be told from smooth.
@@ -259,7 +261,9 @@ def hidden_misfit(
 
 @fast_inner_kernel
 def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
-    """Jᵀq and qᵀq of the patterns q: a shift of all cells, of the tip in x and in y, the pitch."""
+    """Set Jᵀq and qᵀq of the shared errors q: a shift of all cells, of the tip in x and in y, the
+    pitch.
+    """
     face = state.fit.face
     u = face.u
     v = face.v
@@ -338,7 +342,7 @@ def bend(solid: SolidFit | None, state: EstimatorState, d: float, out: Matrix) -
 def systematic(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, d: float, out: Matrix
 ) -> float:
-    """Covariance of (gain, u, v, w) by what all frames share, into ``out``.
+    """Compute the covariance of (gain, u, v, w) by what all frames share, into ``out``.
 
     ``fit.inverse`` is that of white noise of variance 1 [Pa²]. Returns the square sum [Pa²] that
     the fit leaves of it where each is twice its standard deviation.

@@ -33,7 +33,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 @dataclass(slots=True)
 class ContactEstimate:
-    """What one frame says about the contact; SI units, angles in rad.
+    """Estimate of the contact in one frame; SI units, angles in rad.
 
     ``contact``: something presses. ``valid`` promises one contact that the model describes: the
     fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
@@ -100,7 +100,7 @@ _FULL = {
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """How a board's readings end. Raises ValueError for values out of their range.
+    """Range of a board's readings. Raises ValueError for values out of their range.
 
     ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; None: an
     integer type's largest value. ``threshold`` is the smallest count the board sends, 0 stands for
@@ -306,7 +306,7 @@ class ContactEstimator:
 
 @lru_cache(maxsize=4)
 def _integrals(grid: SensorGrid, tip: Fingertip) -> FloatArray:
-    """Of a grid's cells under a tip: two fingers' are mostly the same."""
+    """Integrate a grid's cells under a tip; cached, since two fingers' are mostly the same."""
     return cell_integrals(grid.on(tip))
 
 

@@ -95,7 +95,7 @@ def _likelihood(
 
 @inner_kernel
 def _is_this_tip(state: EstimatorState) -> bool:
-    """Whether a misfit leaves it possible that the model is the tip's, and d is known at all."""
+    """Return whether the misfit allows the model to be the tip's, and d to be known at all."""
     estimate = state.estimate
     if estimate.shared > SHARED_MAX:
         return False
@@ -126,7 +126,7 @@ def _explain(state: EstimatorState) -> tuple[float, float]:
 def _judge_moments(
     state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None
 ) -> bool:
-    """Whether the model accounts for the frame at the moments' contact, as for the likelihood.
+    """Return whether the model accounts for the frame at the moments' contact, as for the fit.
 
     By one step of the likelihood's, which takes off what the moments' own small errors leave.
     """
@@ -248,7 +248,7 @@ def estimate_frame(
     places: IntArray | None,
     solids: Records[SolidFit] | None = None,
 ) -> None:
-    """One frame → the estimate in the state. The only compiled entry of the estimator.
+    """Estimate one frame into the state. The only compiled entry of the estimator.
 
     ``frame`` float64 [rows, cols] in counts, contiguous, ``scale`` Pa a count, ``step`` the width
     of a count's quantum [Pa], 0 for none. ``arena`` as `state.Places` says; ``places`` is scratch

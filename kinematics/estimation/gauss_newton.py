@@ -30,7 +30,8 @@ TAN_TILT_MAX = 3.0
 
 @inner_kernel
 def solve(fit: Fit, free: bool) -> bool:
-    """Gauss-Newton step in (gain, u, v, w), the inverse normal matrix and the decrement.
+    """Solve for the step in (gain, u, v, w); return the inverse normal matrix and the decrement,
+    too.
 
     Without a ``free`` gain its row is left out. False where a pivot of the scaled matrix is below
     1e-11: the frame doesn't determine every parameter.
@@ -97,9 +98,8 @@ def solve(fit: Fit, free: bool) -> bool:
 def set_covariance(
     solid: SolidFit | None, fit: Fit, inverse: Matrix, variance: float, out: Matrix
 ) -> None:
-    """Covariance of (d, n_x, n_y, gain) into ``out``, from that of (gain, u, v, w) over variance.
-
-    At the fit's face.
+    """Transform the covariance of (gain, u, v, w) over variance to (d, n_x, n_y, gain), at the
+    fit's face.
     """
     u = fit.face.u
     v = fit.face.v
@@ -129,7 +129,7 @@ def set_covariance(
 
 @inner_kernel
 def free_noise(square: float, floor: float) -> float:
-    """A cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
+    """Return a cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
 
     They read it from ``floor`` [Pa] on and 0 below, so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ:
     half of the variance without a floor. Where none is above it the noise is below a third of it.
@@ -152,7 +152,7 @@ def free_noise(square: float, floor: float) -> float:
 
 @inner_kernel
 def energy_of(state: EstimatorState) -> float:
-    """Σ p² [Pa²] of the cells in reach."""
+    """Return Σ p² [Pa²] of the cells in reach."""
     energy: float = state.signal.energy * state.signal.scale * state.signal.scale
     return energy
 
@@ -197,7 +197,7 @@ def _take_step(fit: Fit, a: float) -> bool:
 
 @inner_kernel
 def judge(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> float:
-    """χ² of the solved fit, and the covariance by what all frames share and by a smooth misfit.
+    """Compute χ² of the solved fit, and the covariance by shared errors and by a smooth misfit.
 
     The noise's variance [Pa²] is returned, widened by a misfit beyond its own scatter; after that
     ``fit.inverse`` is times it the covariance under the noise. Negative with too few cells.
@@ -254,7 +254,7 @@ def _finish(state: EstimatorState, packed: Pointer, iterations: int) -> bool:
 def conclude(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, iterations: int
 ) -> bool:
-    """The covariance and χ² at the fit's end; whether there are cells enough."""
+    """Return the covariance and χ² at the fit's end; whether there are cells enough."""
     fit = state.fit
     estimate = state.estimate
     estimate.gain = fit.gain
@@ -302,7 +302,7 @@ def fit(
     places: IntArray | None,
     tolerance: float,
 ) -> bool:
-    """Gauss-Newton from the contact in ``state.estimate``, the new estimate left there.
+    """Run Gauss-Newton from the contact in ``state.estimate`` and leave the new estimate there.
 
     Stops when the promised decrement is below ``tolerance`` · variance, that is the step is that
     part of the noise floor, squared. False when the frame doesn't determine the contact or the

@@ -44,7 +44,7 @@ CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 
 def set_law(law: Law, coefficients: FloatArray) -> None:
-    """Any material's law [pieces, order] in one of two forms.
+    """Convert any material's law [pieces, order] to one of two forms.
 
     A law of one polynomial of at most LAW_TERMS terms is kept; any other becomes LAW_PIECES cubics
     by value and slope at the pieces' ends, within 1e-9 of a smooth law.
@@ -73,7 +73,7 @@ def set_law(law: Law, coefficients: FloatArray) -> None:
 
 @fast_inner_kernel
 def footprint_energy(state: EstimatorState, packed: Pointer) -> tuple[float, float]:
-    """Σ W p² [Pa²] and Σ W over the packed cells."""
+    """Return Σ W p² [Pa²] and Σ W over the packed cells."""
     size = state.model.rows * state.model.cols
     energy = 0.0
     number = 0.0
@@ -176,7 +176,7 @@ def press(state: EstimatorState, packed: Pointer) -> None:
 
 @fast_inner_kernel
 def accumulate(state: EstimatorState, packed: Pointer) -> None:
-    """Sums for one Gauss-Newton step over the pressed cells, into ``state.fit.sums``.
+    """Sum up one Gauss-Newton step over the pressed cells, into ``state.fit.sums``.
 
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
     factor ∓gain, ∂/∂(u, v, w). A full cell counts only while the model stays below its end. No

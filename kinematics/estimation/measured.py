@@ -70,7 +70,7 @@ def sum_weights(
     radius: float,
     live: NDArray[np.bool_],
 ) -> FloatArray:
-    """What makes a frame's sums of its pressures [4, cells]: area, area times x, y and r².
+    """Return the weights of a frame's sums [4, cells]: area, area times x, y and r².
 
     Over the ``live`` cells under the tip; x and y are along the finger's axes.
     """
@@ -114,7 +114,7 @@ def _root_of(fit: MeasuredFit, force: float, q: float, t: float) -> float:
 def fit_measured_frame(
     fits: Records[MeasuredFit], frame: FloatArray, weights: FloatArray, scale: float
 ) -> None:
-    """One frame [rows, cols] → what the record says of it; ``scale`` Pa a unit."""
+    """Estimate one frame [rows, cols] into the record; ``scale`` Pa a unit."""
     fit = fits[0]
     fit.peak = 0.0
     fit.sums[:] = 0.0
@@ -253,7 +253,7 @@ def _between(fit: MeasuredFit, a: FloatArray, m: FloatArray, out: FloatArray) ->
 
 
 class MeasuredEstimator:
-    """As `ContactEstimator`, for a tip whose ``physics`` is "measured". Each frame stands alone.
+    """`ContactEstimator` for a tip whose ``physics`` is "measured". Each frame stands alone.
 
     ``grid`` has the tip where the law found it. ``live`` [rows, cols] bool masks dead cells;
     ``known`` are the sensor's other uncertainties. An estimate is ``valid`` where the curves were
@@ -298,7 +298,7 @@ class MeasuredEstimator:
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
     ) -> ContactEstimate:
-        """The one result object, from a frame [rows, cols] of any number type.
+        """Return the one result object, from a frame [rows, cols] of any number type.
 
         Its values times ``pascal_per_count`` are Pa. Raises ValueError for another shape.
         """

@@ -1,4 +1,4 @@
-"""From a pressure grid to a first estimate: the contact's centroid and extent.
+"""First estimate of a contact from a pressure grid's centroid and extent.
 
 Kernels for the moments of the pressure over the footprint, and the relations between those and
 (d, n). For a constant modulus they are closed:
@@ -51,7 +51,7 @@ _WEAK = 15.0  # noise: a largest cell below is looked for together with its neig
 
 
 def closed_trace(a: float, d: float, s: float) -> float:
-    """Trace of the pressure's covariance [m²] for a constant modulus, s = sin θ."""
+    """Return the trace of the pressure's covariance [m²] for a constant modulus, s = sin θ."""
     return d * (4.0 * a - d) / 6.0 - s * s * d * (12.0 * a - 5.0 * d) / 36.0
 
 
@@ -60,7 +60,7 @@ _trace = inner_kernel(closed_trace)
 
 @lru_cache(maxsize=4)
 def moment_ratios(tip: Fingertip, material: Material) -> FloatArray:
-    """Force, centroid and trace over the closed forms of E₀, float64 [RATIO_POINTS, 3], over d.
+    """Return force, centroid and trace over E₀'s closed forms, float64 [RATIO_POINTS, 3], over d.
 
     Rows are evenly spaced from 0 to 0.8 a. Integrated over the flattened disc in polar coordinates
     at a tilt of 0.2 rad.
@@ -107,10 +107,11 @@ def _ratio(m: Moments, a: float, d: float, column: int) -> float:
 
 @inner_kernel
 def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, own: float) -> None:
-    """Σp, centroid, trace of the covariance and number of the cells that ``moments.face`` presses.
+    """Compute Σp, centroid, trace of the covariance and number of the cells that ``moments.face``
+    presses.
 
     Those whose centre lies in the footprint; all 0 but the number where nothing presses. ``own``
-    [m²] is the trace of a point's own spread over cells, which is taken off.
+    [m²] is the trace of a point's own blur over cells, which is subtracted.
     """
     m = state.moments
     grid = state.grid
@@ -161,7 +162,7 @@ def _take(state: EstimatorState) -> None:
 
 @inner_kernel
 def track(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
-    """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
+    """Take moments from the last estimate, again while the footprint moves by about a cell."""
     estimate = state.estimate
     m = state.moments
     a = state.grid.radius
@@ -189,7 +190,7 @@ def start(
     arena: Pointer,
     places: IntArray | None,
 ) -> None:
-    """The estimate from the frame alone: its strongest cells, then twice their moments."""
+    """Estimate from the frame alone: its strongest cells, then twice their moments."""
     m = state.moments
     signal = state.signal
     centres = further(arena, state.at.centres)
@@ -215,9 +216,10 @@ def start(
 
 @inner_kernel
 def _sums_of_weak(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
-    """As :func:`sums_above` for pressures of a few times the noise, where lone cells mislead.
+    """Sum as :func:`sums_above` does, over weak pressures of a few times the noise.
 
-    Over cells of twice the noise whose neighbourhood stands out as a contact's.
+    Lone cells mislead there: the sums are over cells of twice the noise whose neighbourhood stands
+    out as a contact's.
     """
     m = state.moments
     level = 2.0 * state.signal.noise
@@ -264,7 +266,7 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
-    """Contact in ``state.moments`` anew, from the moments over its footprint, a cell wider.
+    """Refine the contact in ``state.moments`` by the moments over its footprint, a cell wider.
 
     Where the gain is fixed the displacement comes from the force, otherwise from the extent, and
     the gain from the force; 0 where nothing presses. ``state.fit.covariance`` takes that of
@@ -292,7 +294,7 @@ def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
 
 @inner_kernel
 def _set_contact(state: EstimatorState) -> None:
-    """What :func:`refine` finds, from the moments."""
+    """Set :func:`refine`'s contact from the moments."""
     m = state.moments
     grid = state.grid
     a = grid.radius

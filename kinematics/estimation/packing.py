@@ -142,7 +142,7 @@ def pack(
 
 @inner_kernel
 def _is_low(state: EstimatorState) -> bool:
-    """Whether the outline's lowest point over the base plane comes near to the rim."""
+    """Return whether the outline's lowest point over the base plane comes near to the rim."""
     face = state.fit.face
     a = state.model.radius
     cosine2 = 1.0 / (1.0 + face.v * face.v + face.w * face.w)

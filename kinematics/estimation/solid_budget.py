@@ -54,7 +54,7 @@ def set_solid_budget(
     places: IntArray,
     law: float,
 ) -> None:
-    """As `error_budget.set_budget`, for the live cells ``places`` of ``grid``.
+    """Set the budget as `error_budget.set_budget` does, for the live cells ``places`` of ``grid``.
 
     A shift is no contact to a solid tip whatever its size: the activity test takes the mean off.
     """
@@ -65,7 +65,7 @@ def set_solid_budget(
     across = np.linalg.inv(shear @ shear.T)
 
     def alone(fields: FloatArray) -> FloatArray:
-        """The fields less what is like shear."""
+        """Return the fields less their projection on shear."""
         return np.asarray(fields - fields @ shear.T @ across @ shear)
 
     shown = alone(live)

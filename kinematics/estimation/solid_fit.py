@@ -49,7 +49,7 @@ _STARTS = 8  # depths from which a frame alone is fitted
 
 
 def within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
-    """The cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
+    """Return the cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
 
     A bonded base's stress is singular there, which no two meshes have alike: from independent
     elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. Under a
@@ -75,7 +75,7 @@ def lay_out_solid(
     live: NDArray[np.bool_],
     material: Material,
 ) -> tuple[FloatArray, IntArray, SolidFit]:
-    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory.
+    """Return the arena of a grid under a solid tip, its live cells' numbers, and the fit's memory.
 
     Raises ValueError where there are too few.
     """

@@ -89,7 +89,7 @@ class SolidFit(Record):
 
 
 def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
-    """The fit's memory for the pictures of ``live`` cells, float64 [pictures, cells]."""
+    """Allocate the fit's memory for the pictures of ``live`` cells, float64 [pictures, cells]."""
     fit = SolidFit()
     fit.weights.assign(weights_of(tip, material))
     count, fit.cells = live.shape
@@ -130,7 +130,7 @@ def dot(a: Pointer, b: Pointer, count: int) -> float:
 
 @inner_kernel
 def columns_at(solid: SolidFit) -> Columns:
-    """What each picture counts in the contact at work, and the partials by −d, n_x and n_y."""
+    """Return each picture's weight in the contact at work, and the partials by −d, n_x and n_y."""
     weights = solid.weights
     weigh(weights, solid.d, solid.n_x, solid.n_y)
     by_d = address(weights.by_d)
@@ -146,7 +146,7 @@ def multiply(
     count: int,
     out: Pointer,
 ) -> None:
-    """The symmetric ``matrix`` [PICTURES, PICTURES] times four columns, into ``out`` by rows."""
+    """Multiply the symmetric ``matrix`` [PICTURES, PICTURES] by four columns, into ``out``."""
     a, b, c, d = columns
     for k in range(4 * PICTURES):
         out[k] = 0.0
@@ -167,7 +167,7 @@ def multiply(
 def presses(
     state: EstimatorState, solid: SolidFit, frame: Pointer, arena: Pointer, places: IntPointer
 ) -> bool:
-    """Whether the frame shows the first picture, by more than ``patch_level`` deviations.
+    """Return whether the frame shows the first picture, by more than ``patch_level`` deviations.
 
     The mean over the cells is taken off both, so that a shift of all their zeros, or noise that
     ends at 0, is no contact. Much of a solid tip's pressure is spread over its base: a weak contact
@@ -186,7 +186,7 @@ def presses(
 
 @inner_kernel
 def counting(state: EstimatorState, solid: SolidFit) -> int:
-    """How many pictures count at the contact, and near it: the others are well within the noise."""
+    """Return the number of pictures above the noise at the contact and near it."""
     weights = solid.weights
     weigh(weights, solid.d, solid.n_x, solid.n_y)
     least = _LOST * state.signal.variance / (state.fit.gain * state.fit.gain)
@@ -216,7 +216,7 @@ def set_model(solid: SolidFit, arena: Pointer, gain: float) -> None:
 
 @inner_kernel
 def _excess(model: float, floor: float, clip: float) -> float:
-    """How much more a cell reads on average than the model, cut at 0, with noise at ``floor``."""
+    """Return the mean excess of a cell over the model, cut at 0, with noise at ``floor``."""
     pressure = max(model, 0.0)
     most = max(pressure, floor) - model
     if clip > 0.0:

@@ -30,7 +30,7 @@ Strip: TypeAlias = Annotated[FloatArray, STRIPS]
 
 
 class Options(Record):
-    """What the estimator was made for; see `ContactEstimator`."""
+    """Constants of one estimator; see `ContactEstimator`."""
 
     noise: float  # of a cell [Pa]
     saturation: float  # [counts]
@@ -85,7 +85,7 @@ class Signal(Record):
 
 
 class Estimate(Record):
-    """What a frame leaves, where the next one starts: in the sensor's axes, then the finger's."""
+    """Estimate of one frame and start of the next: in the sensor's axes, then the finger's."""
 
     d: float
     gain: float
@@ -158,7 +158,7 @@ class Fit(Record):
 
 
 class Budget(Record):
-    """What the noise of single cells leaves out, see `error_budget`; and scratch for it."""
+    """Errors beside single cells' noise, see `error_budget`, and scratch for them."""
 
     baseline: float  # standard deviations: of a shift of all cells [Pa]
     shift: float  # the same, and of the pressed ones by the law's misfit
@@ -199,7 +199,7 @@ class Strips(Record):
 
 
 class Blur(Record):
-    """How a blurred grid is modelled: on parts of cells, spread by weights."""
+    """Model of a blurred grid: pieces of cells, blurred by weights."""
 
     parts_x: int  # of a cell
     parts_y: int
@@ -209,7 +209,7 @@ class Blur(Record):
 
 
 class Places(Record):
-    """Where in the arena each array starts."""
+    """Offsets of the arrays in the arena."""
 
     centres: int  # planes of cell_centres [3, cells]
     cells: int  # planes of cell_integrals [rows, CELL_PLANES, cols]

@@ -27,7 +27,7 @@ _SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
 
 @kernel
 def total_tilt(tilt_x: float, tilt_y: float) -> float:
-    """Angle between the object's normal and the tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
+    """Return the angle between normal and tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
@@ -35,7 +35,7 @@ def total_tilt(tilt_x: float, tilt_y: float) -> float:
 def held_motion(
     q: Two, d: Two, angle: float, taper: float, lengths: tuple[float, float, float, float]
 ) -> Motion:
-    """(arm1, arm2, turn1, turn2, slide, width, across) of a held object.
+    """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
     ``lengths`` [m] of the hand: half the pivots' separation, a finger's length and offset, and the
     tip's radius.
@@ -86,7 +86,9 @@ def sheared_gradient(
     theta: float,
     tangential: float,
 ) -> tuple[float, float]:
-    """(∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N]; ``contact`` as looked up."""
+    """Return (∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N] and a looked-up
+    ``contact``.
+    """
     force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
     sine = math.sin(theta)
     cosine = math.cos(theta)
@@ -109,7 +111,7 @@ def holding_levers(
     taper: float,
     motion: Motion,
 ) -> tuple[float, float, float, float, float]:
-    """(τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
+    """Return (τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
 
     The torques are the energy's gradient along the rolling increments, ``motion`` as
     :func:`held_motion` gives it,
@@ -167,7 +169,9 @@ def _unexplained(
     arm: float,
     lever: float,
 ) -> tuple[float, float, float]:
-    """What of side τ [N·m] one tip's N, ∂U/∂θ and T leave, and how fast it falls with T and T²."""
+    """Return the torque of side τ [N·m] that one tip's N, ∂U/∂θ and T leave, and its fall with T,
+    T².
+    """
     contact = lookup(data, d, theta)
     force, _, force_d, force_theta, _, _, _ = contact
     by_d, by_theta = sheared_gradient(contact, d, theta, shear)
@@ -197,7 +201,7 @@ def load_torques(
     rolled: Two,
     torques: Two,
 ) -> tuple[float, float, float, float]:
-    """(δ1, δ2, lever, bow): what of both torques [N·m] nothing but a load along t explains.
+    """Return (δ1, δ2, lever, bow): what of both torques [N·m] nothing but a load along t explains.
 
     Where each tip bears a share L [N] of a load 2 L along the object's t, both torques are
 
@@ -233,7 +237,7 @@ def load_torques(
 
 @inner_kernel
 def load_of(torque: float, lever: float, bow: float) -> tuple[float, float]:
-    """(L, slope): the load [N] of a torque = lever L + bow L² [N·m], and the torque's slope [m].
+    """Return (L, slope): load [N] of a torque = lever L + bow L² [N·m], and the torque's slope [m].
 
     Beyond the parabola's end, to which no load leads, L goes on with the least slope.
     """

@@ -1,4 +1,4 @@
-"""At which angle stuck tips let a held object come to rest, and how they let it stand upright.
+"""The angle at which stuck tips let a held object rest, and the spring that keeps it upright.
 
 Two fingers that mirror each other hold an object of width W between parallel faces, both tips d
 deep. Small motions that don't mirror are its angle φ and the fingers' lean δ = (q1 − q2)/2, with
@@ -39,7 +39,7 @@ def upright_spring(
     turning: float,
     lengths: tuple[float, float, float, float],
 ) -> float:
-    """The spring k [N·m/rad] between joints at ``q`` [rad] with which the object stands upright.
+    """Return the spring k [N·m/rad] between joints at ``q`` [rad] that keeps the object upright.
 
     ``d`` [m] and ``force`` [N] are the means of both tips, ``turning`` is their c; ``lengths`` [m]
     as in :func:`hand.grasp_state.held_motion`.
@@ -54,11 +54,11 @@ def upright_spring(
 def resting_share(
     d: float, width: float, spring: float, force: float, lengths: tuple[float, float, float, float]
 ) -> float:
-    """φ/φ0 of an object of ``width`` [m] held with a ``spring`` [N·m/rad] between the joints.
+    """Return φ/φ0 of an object of ``width`` [m] held with a ``spring`` [N·m/rad] between the
+    joints.
 
-    The tips are springs, as the paper's.
-
-    ``d`` [m] and ``force`` [N] are those of each tip, ``lengths`` as in :func:`upright_spring`.
+    The tips are the paper's springs. ``d`` [m] and ``force`` [N] are those of each tip, ``lengths``
+    as in :func:`upright_spring`.
     """
     half_separation, _, _, radius = lengths
     inward = half_separation - radius + d - 0.5 * width

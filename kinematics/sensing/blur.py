@@ -20,7 +20,7 @@ _MOST_PARTS = 8
 
 
 def stencil(width: float) -> FloatArray:
-    """Weights of the blur over neighbouring cells, float64 [2 n + 1], ``width`` in cells.
+    """Return the blur's weights over neighbouring cells, float64 [2 n + 1]; ``width`` in cells.
 
     Samples of the Gaussian: the trapezoid rule, whose error falls like exp(−2π² w²). Below
     three quarters of a cell five weights of the Gaussian's moments up to the fifth, which are exact
@@ -39,7 +39,7 @@ def stencil(width: float) -> FloatArray:
 
 
 def parts(width: float) -> int:
-    """Parts that a cell's side is cut into for the forward model, ``width`` in cells."""
+    """Return the pieces of a cell's side in the forward model; ``width`` in cells."""
     return min(max(math.ceil(1.0 / width), 2), _MOST_PARTS)
 
 

@@ -52,7 +52,7 @@ class Nodes(Record):
 
 @inner_kernel
 def nodes_needed(a: float, half: float, far: float) -> int:
-    """Gauss points a direction that keep a cell well within 1e-6 E; 0 where the angle is needed.
+    """Return the Gauss points a direction that keep a cell within 1e-6 E; 0 if the angle is needed.
 
     ``far`` is the distance of the farthest point from the axis, ``half`` half the cell's longer
     side: the rim is a branch point at (a − far)/half half-lengths behind the cell's end.
@@ -143,7 +143,7 @@ def _polynomial(nodes: Nodes, coefficients: FloatArray) -> None:
 
 @inner_kernel
 def evaluate(nodes: Nodes, face: Face, a: float, law: FloatArray) -> None:
-    """Strain, at most 1, and stress at the nodes, in SIMD lanes."""
+    """Evaluate strain, at most 1, and stress at the nodes, in SIMD lanes."""
     _strains(nodes, face, a)
     if law.shape[0] == 1:
         _polynomial(nodes, law[0])
@@ -248,7 +248,7 @@ _MEAN_NODES = 8
 
 
 def cell_integrals(grid: Grid) -> FloatArray:
-    """The planes of a grid's cells, all but LIVE.
+    """Return the planes of a grid's cells, all but LIVE.
 
     The strain's mean over a whole cell in the footprint is exactly 1 − u ḡ + v (xg) + w (yg), and
     its variance the same form's in the covariances. A cell that the rim cuts never lies in the

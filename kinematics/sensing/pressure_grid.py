@@ -172,7 +172,7 @@ class SensorGrid:
         return self.rows, self.cols
 
     def on(self, tip: Fingertip) -> Grid:
-        """The cells as kernels take them, counted from this tip's centre."""
+        """Return the cells as kernels take them, counted from this tip's centre."""
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
@@ -181,7 +181,7 @@ class SensorGrid:
         return Grid(np.array([fields], Grid.dtype))
 
     def to_sensor(self, n_x: float, n_y: float) -> tuple[float, float]:
-        """A vector's components along the finger's axes → along the sensor's."""
+        """Rotate a vector's components from the finger's axes to the sensor's."""
         if self.rotation == 0.0:
             return n_x, n_y
         c, s = math.cos(self.rotation), math.sin(self.rotation)
@@ -197,7 +197,7 @@ class SensorGrid:
         gain: float = 1.0,
         out: FloatArray | None = None,
     ) -> FloatArray:
-        """Pressure [Pa] averaged over each cell, float64 [rows, cols].
+        """Return the pressure [Pa] averaged over each cell, float64 [rows, cols].
 
         ``d`` [m] is the displacement, the tilts [rad] give the object's normal
         (sin tilt_x, sin tilt_y, …). Accurate to 1e-6 of the modulus, cut cells included; with a
@@ -233,11 +233,14 @@ class SensorGrid:
         return out
 
     def pictures(self, tip: Fingertip) -> FloatArray:
-        """The cells' means of a solid tip's modes and shear, see `solid_pressure`: [·, cells]."""
+        """Return the cells' means of a solid tip's modes and shear, see `solid_pressure`: [·,
+        cells].
+        """
         return _pictures(replace(self, rotation=0.0), tip)
 
     def finer(self, parts: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:
-        """The blur's stencils along x and y in parts of cells, and the unblurred grid of all parts.
+        """Return the blur's stencils along x and y in pieces of cells, and the unblurred grid of
+        pieces.
 
         ``parts`` (x, y) are those of a cell; the grid is as much wider as the stencils reach.
         """
@@ -264,7 +267,7 @@ def _pictures(grid: SensorGrid, tip: Fingertip) -> FloatArray:
 
 
 def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float, float]:
-    """(n_x, n_y) of tilts [rad], after checking that the contact is one. Raises ValueError."""
+    """Return (n_x, n_y) of tilts [rad]. Raises ValueError for tilts of no contact."""
     if not (math.isfinite(d) and math.isfinite(tilt_x) and math.isfinite(tilt_y)):
         raise ValueError(f"d and tilts must be finite, got {d}, {tilt_x}, {tilt_y}")
     if d > radius:

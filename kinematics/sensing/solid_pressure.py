@@ -30,7 +30,7 @@ _INSIDE, _CUT = 6, 24  # points a side of a cell, and of one that the rim cuts
 
 
 class Weights(Record):
-    """What each picture counts in one contact: their sum is the pressure over E; see `weigh`."""
+    """Weights of the pictures in one contact: their sum is the pressure over E; see `weigh`."""
 
     table: SolidTable
     modes: int
@@ -49,7 +49,7 @@ class Weights(Record):
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
-    """A solid tip's modes, without a contact yet. Raises MaterialError for one not linear."""
+    """Return a solid tip's modes, without a contact yet. Raises MaterialError unless linear."""
     data, weights = solid_data(tip), Weights()
     weights.table.assign(solid_table(tip, material))
     count, i, j = data.shares.shape
@@ -60,12 +60,12 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
 
 
 def pictures_of(harmonics: IntArray) -> int:
-    """How many pictures the modes make."""
+    """Return how many pictures the modes make."""
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
 def pictures(tip: Fingertip, cells: Grid) -> FloatArray:
-    """The modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
+    """Return modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
     data = solid_data(tip)
     out = np.zeros((pictures_of(data.harmonics) + 2, cells.rows * cells.cols))
     x, y = (
@@ -114,7 +114,7 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
 
 @inner_kernel
 def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """The weights of a contact and their partials by d [m], n_x and n_y, for pressures in Pa."""
+    """Set a contact's weights and their partials by d [m], n_x and n_y, for pressures in Pa."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)
@@ -172,7 +172,7 @@ def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def own_shear(weights: Weights, d: float, square: float) -> float:
-    """The shear over sin θ and a² [Pa] of a press straight on a sticking face, at the height a.
+    """Return shear over sin θ and a² [Pa] of a straight press on a sticking face, at the height a.
 
     The modes have it already. ``weights`` are those of the contact.
     """
@@ -260,7 +260,7 @@ def render_solid(
 
 
 class SolidPressure:
-    """What one tip of one material presses on the cells of given ``shown`` pictures."""
+    """Pressure of one tip of one material on the cells of given ``shown`` pictures."""
 
     def __init__(self, tip: Fingertip, material: Material, shown: FloatArray) -> None:
         self._weights = weights_of(tip, material).array
@@ -273,6 +273,6 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """As :func:`render_solid`; the whole ``shear``, that of a press straight if not given."""
+        """Render as :func:`render_solid`; ``shear`` is that of a straight press if not given."""
         whole = shear is not None
         render_solid(self._weights, self._shown, contact, shear or (0.0, 0.0), whole, gain, out)
