@@ -176,8 +176,7 @@ def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bo
 def fit_place(
     presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, turned: bool
 ) -> tuple[SensorGrid, float, float]:
-    """Fit the tip's centre, and its rotation if ``turned``: the grid with both, the last step [m],
-    and the standard deviation [m] of the centre.
+    """Fit the tip's centre, rotation if ``turned``; return grid, last step [m], centre's std [m].
 
     Gauss-Newton on place, rotation and each press' own depth, begun at ``presses.d``; the tilts are
     known. For a tip whose centroid hardly moves with tilt, so that only the frames' shape tells.
@@ -233,9 +232,7 @@ def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> Flo
 def modulus_by_force(
     d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip, free_offset: bool
 ) -> tuple[float, float, FloatArray]:
-    """Fit E [Pa] and, if free, the zero of d [m] by least relative squares; return the forces [n],
-    too.
-    """
+    """Fit E [Pa] and, if free, the zero of d [m] by least relative squares; the forces [n], too."""
     unit, offset = ContactTable.build(tip, _UNIT), 0.0
     modulus = 0.0
     for _ in range(30):

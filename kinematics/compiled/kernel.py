@@ -48,9 +48,7 @@ def kernel(function: Function) -> Function:
 
 
 def inner_kernel(function: Function) -> Function:
-    """Compile ``function`` for kernels alone, which inline or link it. Raises TypeError from
-    Python.
-    """
+    """Compile ``function`` for kernels alone; a call from Python raises TypeError."""
     return _inner(function)
 
 

@@ -153,8 +153,7 @@ _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 @_quiet
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
-    """Return force, energy and first partials of a constant ``modulus`` [Pa]; d [m], θ [rad]
-    broadcast.
+    """Return force, energy and partials of a constant ``modulus`` [Pa]; d [m], θ [rad] broadcast.
 
     Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
     """

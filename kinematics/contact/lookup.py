@@ -99,9 +99,7 @@ class TableError(SoftfingerError):
 
 
 def aligned(size: int) -> FloatArray:
-    """Return zeros, float64 [size], aligned to a cache line so that vector loads do not straddle
-    two.
-    """
+    """Return zeros, float64 [size], from a cache line on: vector loads don't straddle two."""
     room = np.zeros(size + 8)
     skip = (-room.ctypes.data % 64) // 8
     return room[skip : skip + size]
@@ -335,8 +333,7 @@ def lookups(
     out: FloatArray,
     inside: NDArray[np.bool_],
 ) -> None:
-    """Evaluate :func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n], to
-    rounding.
+    """Evaluate :func:`lookup` at each d, θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
 
     In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
     """

@@ -94,9 +94,7 @@ class Material:
 
     @classmethod
     def constant(cls, modulus: float) -> Material:
-        """Return Hooke's law of modulus E [Pa]. Raises MaterialError unless it is positive and
-        finite.
-        """
+        """Return Hooke's law of modulus E [Pa]. Raises MaterialError unless finite and > 0."""
         value = float(modulus)
         if not (value > 0.0 and math.isfinite(value)):
             raise MaterialError(f"the modulus must be positive and finite, not {modulus!r}")
@@ -139,8 +137,7 @@ class Material:
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
     def force_error(self, share: ArrayLike) -> FloatArray:
-        """Return the relative error of F, upright, by the law's misfit, at displacements over the
-        radius.
+        """Return F's relative error, upright, by the law's misfit, over displacements by radius.
 
         F/(2π h²) = ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d: the misfits, between the
         points on straight lines from 0 at no strain, against the law. ``share`` in (0, 1].
@@ -166,9 +163,7 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """Return σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, continued linearly beyond 1, NaN for
-        NaN.
-        """
+        """Return σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, linear beyond 1, NaN for NaN."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:

@@ -71,8 +71,7 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
 
 
 def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], FloatArray]:
-    """Return coefficients c_1, c_2, … of σ(ε) [Pa], and [2, n] the points' strains and misfits
-    [Pa].
+    """Return c_1, c_2, … of σ(ε) [Pa], and [2, n] the points' strains and misfits [Pa].
 
     The lowest degree is taken that comes about as near to the points as any. Beyond the last point
     the law goes on about straight.

@@ -141,8 +141,7 @@ def _held(table: SolidTable, t: float, square: float) -> Triple:
 
 @inner_kernel
 def _solid_lookup_at(p: Pointer, d: float, theta: float) -> Six:
-    """Evaluate `lookup.lookup_at`; where |θ| is beyond the data, the energy stays with θ at fixed
-    d.
+    """Evaluate `lookup.lookup_at`; with |θ| beyond the data the energy stays with θ at fixed d.
 
     The partials are those of that energy, and the force goes on with cos θ.
     """

@@ -88,8 +88,7 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
 def presses_outside(
     solid: SolidFit | None, state: EstimatorState, frame: Pointer, height: Pointer, level: float
 ) -> bool:
-    """Return whether a cell of ``level`` or more, with neighbours, lies two cells off the
-    footprint.
+    """Return whether cells of ``level`` or more, not one alone, lie two cells off the footprint.
 
     Three standard deviations of the blur are added to the two cells. ``level`` is in the frame's
     unit; the neighbours' weighted mean must reach a third of it.

@@ -135,9 +135,7 @@ def _fitted(rho: FloatArray, size: int) -> FloatArray:
 
 
 def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
-    """Return Σ over pairs of cells of field · ρ · field, for one field [rows, cols] or several […,
-    n].
-    """
+    """Return Σ over pairs of cells of field · ρ · field, for fields [rows, cols] or […, n]."""
     several = fields.reshape(*fields.shape[:2], -1)
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
     kernel = np.zeros(shape)
@@ -261,9 +259,7 @@ def hidden_misfit(
 
 @fast_inner_kernel
 def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
-    """Set Jᵀq and qᵀq of the shared errors q: a shift of all cells, of the tip in x and in y, the
-    pitch.
-    """
+    """Set Jᵀq and qᵀq of shared errors q: a shift of all cells, the tip's x and y, the pitch."""
     face = state.fit.face
     u = face.u
     v = face.v

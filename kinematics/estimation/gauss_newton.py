@@ -30,8 +30,7 @@ TAN_TILT_MAX = 3.0
 
 @inner_kernel
 def solve(fit: Fit, free: bool) -> bool:
-    """Solve for the step in (gain, u, v, w); return the inverse normal matrix and the decrement,
-    too.
+    """Return the step in (gain, u, v, w), the inverse normal matrix and the decrement.
 
     Without a ``free`` gain its row is left out. False where a pivot of the scaled matrix is below
     1e-11: the frame doesn't determine every parameter.
@@ -98,9 +97,7 @@ def solve(fit: Fit, free: bool) -> bool:
 def set_covariance(
     solid: SolidFit | None, fit: Fit, inverse: Matrix, variance: float, out: Matrix
 ) -> None:
-    """Transform the covariance of (gain, u, v, w) over variance to (d, n_x, n_y, gain), at the
-    fit's face.
-    """
+    """Transform the covariance of (gain, u, v, w) over variance to (d, n_x, n_y, gain)."""
     u = fit.face.u
     v = fit.face.v
     w = fit.face.w

@@ -107,8 +107,7 @@ def _ratio(m: Moments, a: float, d: float, column: int) -> float:
 
 @inner_kernel
 def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, own: float) -> None:
-    """Compute Σp, centroid, trace of the covariance and number of the cells that ``moments.face``
-    presses.
+    """Sum the cells that ``moments.face`` presses: Σp, centroid, trace of the covariance, number.
 
     Those whose centre lies in the footprint; all 0 but the number where nothing presses. ``own``
     [m²] is the trace of a point's own blur over cells, which is subtracted.

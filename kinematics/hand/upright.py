@@ -54,8 +54,7 @@ def upright_spring(
 def resting_share(
     d: float, width: float, spring: float, force: float, lengths: tuple[float, float, float, float]
 ) -> float:
-    """Return φ/φ0 of an object of ``width`` [m] held with a ``spring`` [N·m/rad] between the
-    joints.
+    """Return φ/φ0 of an object of ``width`` [m] held with a joint ``spring`` [N·m/rad].
 
     The tips are the paper's springs. ``d`` [m] and ``force`` [N] are those of each tip, ``lengths``
     as in :func:`upright_spring`.

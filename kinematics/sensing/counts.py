@@ -41,8 +41,7 @@ def look_up_pressure(
     per_step: float,
     out: FloatArray,
 ) -> None:
-    """Convert as :func:`to_pressure`, linearly from the curve's ``table`` at every 1/``per_step``
-    of x.
+    """Convert as :func:`to_pressure`, linearly in the curve's ``table`` of steps 1/``per_step``.
 
     A tenth of a power's time; beyond the table the last step goes on. For p = c x^b its error is
     below |b(b − 1)|/8 · (step/x)² of p, that of less than a tenth of a step.

@@ -233,14 +233,11 @@ class SensorGrid:
         return out
 
     def pictures(self, tip: Fingertip) -> FloatArray:
-        """Return the cells' means of a solid tip's modes and shear, see `solid_pressure`: [·,
-        cells].
-        """
+        """Return cells' means of a solid tip's modes and shear [·, cells], see `solid_pressure`."""
         return _pictures(replace(self, rotation=0.0), tip)
 
     def finer(self, parts: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:
-        """Return the blur's stencils along x and y in pieces of cells, and the unblurred grid of
-        pieces.
+        """Return the blur's stencils in x and y by pieces of cells, and the unblurred grid of all.
 
         ``parts`` (x, y) are those of a cell; the grid is as much wider as the stencils reach.
         """

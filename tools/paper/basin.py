@@ -50,7 +50,7 @@ _CLEAR, _LOST = 0.05, 5.0  # degrees between which the maps' colours run
 
 
 def left(law: str, tilt: float, force: float = _FORCE, **simulation: Any) -> float:
-    """The object's angle after a grasp [degrees]; NaN where it isn't held."""
+    """Return the object's angle after a grasp [degrees]; NaN if it isn't held."""
     sections: dict[str, dict[str, Any]] = {
         "loop": {"clock": "virtual"},
         "material": {"law": "constant"},
@@ -80,7 +80,7 @@ def _varied(name: str, value: float) -> dict[str, Any]:
 
 @cache
 def basin() -> tuple[Sheet, ...]:
-    """Where each law leaves an object over where it was, and what the upright law leaves."""
+    """Return where each law leaves an object over where it was, and what the upright law leaves."""
     ends = [(f"left by {law}", "deg", [left(law, tilt) for tilt in STARTS]) for law in LAWS]
     sheets = [sheet("basin_laws", ("put at", "deg", STARTS), *ends)]
     for name, (unit, values) in ACROSS.items():

@@ -69,14 +69,14 @@ class Imperfections:
 
     @classmethod
     def of(cls, simulation: SimulationSettings) -> Imperfections:
-        """Those of the settings."""
+        """Return the imperfections of the settings."""
         values = simulation.model_dump()
         return cls(**{each.name: values[f"tactile_{each.name}"] for each in fields(cls)})
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """How a board counts: the pressure of a count, the largest one, the smallest that is sent.
+    """Range of a board: the pressure of a count, the largest one, the smallest that is sent.
 
     Below ``threshold`` it sends 0. Raises ValueError for values out of their range.
     """
@@ -161,7 +161,7 @@ class SensorModel:
 
     @property
     def remembers(self) -> bool:
-        """What it reads depends on what pressed before, not on the present contact alone."""
+        """True if readings depend on earlier contacts, not on the present one alone."""
         return self._flaws.hysteresis > 0.0 or self._flaws.creep > 0.0
 
     def frame(
@@ -308,7 +308,7 @@ def drift(
 
 
 def crosstalk(signal: FloatArray, share: float, rows: FloatArray, cols: FloatArray) -> None:
-    """What every cell of each line reads too much: ``share`` of its line's mean signal.
+    """Add crosstalk to every cell of each line: ``share`` of its line's mean signal.
 
     Cells of a resistive matrix share their drive and sense lines, and current leaks along them.
     ``rows`` [rows] and ``cols`` [cols] take the lines' parts.
