@@ -168,7 +168,7 @@ def make_estimator(
         noise=tactile.noise,
         method=settings.estimator.method,
         free_gain=None if free_gain == "auto" else free_gain,
-        live=alive,
+        active=alive,
         readings=Readings(saturation, threshold, quantum),
         known=uncertainty(settings, calibration),
     )

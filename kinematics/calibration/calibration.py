@@ -35,7 +35,7 @@ _EXPONENTS = (0.3, 3.0)
 _RESTLESS = 8.0  # times the usual noise
 _FEW_CELLS = 4  # may be faulty
 _BINS = 24  # of strain
-_LEAST_TILT = math.radians(3.0)  # tilts that differ by less show no direction
+_TILT_MIN = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
 _LAGS = 8  # cells over which noise may be correlated
 _SEEN = 4.0  # standard errors
@@ -86,13 +86,13 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     """
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
-    spread = noise.std(axis=0)
-    rests = (spread > 0.0) & (spread <= _RESTLESS * np.median(spread))  # not dead or faulty
+    std = noise.std(axis=0)
+    rests = (std > 0.0) & (std <= _RESTLESS * np.median(std))  # not dead or faulty
     noise *= rests
     common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
     noise -= common[:, None, None] * rests
     own = float(noise.var())
-    noise /= np.where(rests, spread, 1.0)
+    noise /= np.where(rests, std, 1.0)
     shape = rows + _LAGS, cols + _LAGS
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
@@ -139,16 +139,16 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     typical = float(np.median(response))
     if not typical > 0.0:
         raise CalibrationError("equilibrate: most cells read nothing above their zero")
-    live = response > DEAD * typical
-    target = np.array([reading[live].mean() for reading in readings])
+    active = response > DEAD * typical
+    target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
         raise CalibrationError("equilibrate: a pressure reads nothing above the zero")
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.tensordot(target, readings, 1) / (readings**2).sum(axis=0)
-    gain = np.where(live, gain, 0.0)
+    gain = np.where(active, gain, 0.0)
     relative = target[:, None]
-    before = readings[:, live] / relative - 1.0
-    after = readings[:, live] * gain[live] / relative - 1.0
+    before = readings[:, active] / relative - 1.0
+    after = readings[:, active] * gain[active] / relative - 1.0
     return Equilibration(gain, _rms(before), _rms(after))
 
 
@@ -256,11 +256,11 @@ def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray
     above = 0.5 * (1.0 + np.array([math.erf(each) for each in z / math.sqrt(2.0)]))
     density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
     ended = z * above + density
-    spread = np.sqrt((z * z + 1.0) * above + z * density - ended * ended)
-    rest = float(np.median(zero))
-    if not 0.0 < rest < _ENDED * noise:
+    std = np.sqrt((z * z + 1.0) * above + z * density - ended * ended)
+    level = float(np.median(zero))
+    if not 0.0 < level < _ENDED * noise:
         return means - zero
-    sigma = rest / float(np.interp(rest / noise, ended / spread, ended))
+    sigma = level / float(np.interp(level / noise, ended / std, ended))
 
     def whole(counts: FloatArray) -> FloatArray:
         near = np.minimum(counts / sigma, z[-1])
@@ -292,7 +292,7 @@ def fit_centre(
     material: Material,
     grid: SensorGrid,
     noise: float,
-    live: NDArray[np.bool_] | None = None,
+    active: NDArray[np.bool_] | None = None,
 ) -> Centre:
     """Return centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
 
@@ -307,25 +307,25 @@ def fit_centre(
     s = np.sin(np.asarray(theta, np.float64))
     if s.shape != (len(stack),):
         raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
-    tilted = float(np.ptp(s)) > math.sin(_LEAST_TILT)
+    tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT):
         raise CalibrationError(
-            f"centre: the tilts differ by less than {math.degrees(_LEAST_TILT):g}°, so that tilt "
+            f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so that tilt "
             "can't be separated from place; press upright alone, or upright and tilted further"
         )
     if tip.physics == "solid":
-        used = np.broadcast_to(True if live is None else live, stack.shape)
+        used = np.broadcast_to(True if active is None else active, stack.shape)
         force = stack.sum(axis=(1, 2)) * math.prod(grid.pitches)
         presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
-        found, moved, std = fit_place(presses, tip, material, grid, tilted)
+        found, step, std = fit_place(presses, tip, material, grid, tilted)
         # A press is as upright as it can be told to be: a turn is like a shift by half of it.
         std = math.hypot(std, 0.5 * tip.radius * _UPRIGHT / math.sqrt(3.0 * len(s)))
-        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved, std)
+        return Centre(found.centre, found.rotation if tilted else None, 1.0, step, std)
     centre, rotation, scale, residual, std = grid.centre, None, 1.0, 0.0, 0.0
     for _ in range(4):
         at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)
-        estimator = ContactEstimator(tip, material, at, noise, free_gain=True, live=live)
-        points, arms, stray = np.empty((len(s), 2)), np.empty(len(s)), np.empty(len(s))
+        estimator = ContactEstimator(tip, material, at, noise, free_gain=True, active=active)
+        points, arms, scatter = np.empty((len(s), 2)), np.empty(len(s)), np.empty(len(s))
         for k, frame in enumerate(stack):
             estimate = estimator(frame)
             if not (estimate.contact and estimate.valid):
@@ -334,7 +334,7 @@ def fit_centre(
             normal = math.sin(estimate.tilt_x), math.sin(estimate.tilt_y)
             points[k] = np.array(centre) + arms[k] * np.array(normal)
             # A press is as upright as it can be told to be.
-            stray[k] = arms[k] * math.hypot(estimate.tilt_x_std, _UPRIGHT / math.sqrt(3.0))
+            scatter[k] = arms[k] * math.hypot(estimate.tilt_x_std, _UPRIGHT / math.sqrt(3.0))
         rows = np.ones((len(s), 1))
         if tilted:
             rows = np.stack([np.ones(len(s)), arms * s], axis=1)
@@ -344,7 +344,7 @@ def fit_centre(
         residual = math.sqrt(2.0) * _rms(misses)
         freedom = 2 * (len(s) - rows.shape[1])
         each = math.sqrt(float((misses**2).sum()) / freedom) if freedom else 0.0
-        each = max(each, float(stray.max()))
+        each = max(each, float(scatter.max()))
         std = each * math.sqrt(float(np.linalg.inv(rows.T @ rows)[0, 0]))
         if tilted:
             # The finger's x axis in the sensor's: (cos, −sin) of the rotation.

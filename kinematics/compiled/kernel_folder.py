@@ -28,7 +28,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-_KEPT = 4  # folders of other sources or compilers that stay: other checkouts, the last release
+_FOLDERS_MAX = (
+    4  # folders of other sources or compilers that stay: other checkouts, the last release
+)
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -107,7 +109,7 @@ def _prune(base: Path, current: Path) -> None:
         if _FOLDER.fullmatch(each.name) and each != current and not each.is_symlink()
     ]
     others.sort(key=lambda each: each.lstat().st_mtime, reverse=True)
-    for old in others[_KEPT:]:
+    for old in others[_FOLDERS_MAX:]:
         shutil.rmtree(old, ignore_errors=True)
 
 

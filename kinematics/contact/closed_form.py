@@ -122,8 +122,8 @@ def closed_form(
         return zero, zero, zero, zero, zero, zero
     inverse = 1.0 / math.cos(theta)
     slope = math.sin(theta) * inverse
-    push = math.pi * modulus * d
-    force_d = 2.0 * push * inverse
+    force_by_d = math.pi * modulus * d
+    force_d = 2.0 * force_by_d * inverse
     force = 0.5 * d * force_d
     energy_d = force * inverse
     energy = energy_d * d * (1.0 / 3.0)

@@ -136,16 +136,16 @@ class Material:
         """The law's largest distance from the points that it was made from [Pa]; 0 without."""
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
-    def force_error(self, share: ArrayLike) -> FloatArray:
+    def force_error(self, ratio: ArrayLike) -> FloatArray:
         """Return F's relative error, upright, by the law's misfit, over displacements by radius.
 
         F/(2π h²) = ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d: the misfits, between the
-        points on straight lines from 0 at no strain, against the law. ``share`` in (0, 1].
+        points on straight lines from 0 at no strain, against the law. ``ratio`` in (0, 1].
         """
-        shares = np.asarray(share, np.float64)
+        ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
-            return np.zeros(shares.shape)
-        ends = np.minimum(shares[..., None], 0.999)
+            return np.zeros(ratios.shape)
+        ends = np.minimum(ratios[..., None], 0.999)
         strain = ends * (np.arange(200) + 0.5) / 200
         weight = (1.0 - strain) ** -3
         x, misses = np.concatenate([np.zeros((2, 1)), self.misfits], axis=1)

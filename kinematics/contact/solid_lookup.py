@@ -27,7 +27,7 @@ from softfinger.kinematics.compiled.simd import (
     polynomials,
 )
 from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
-from softfinger.kinematics.contact.lookup import Six, Triple, lookup_at, push_at, stiffness_ahead
+from softfinger.kinematics.contact.lookup import Six, Triple, lookup_at, normal_at, stiffness_ahead
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
@@ -164,34 +164,34 @@ def _solid_lookup_at(p: Pointer, d: float, theta: float) -> Six:
     a = table.radius
     size = table.modulus * a * a * t * t * t
     depth = a * t * t
-    push = size * (2.5 * g + 0.5 * t * g_t)
+    normal = size * (2.5 * g + 0.5 * t * g_t)
     stiffness = 0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
-    push_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
+    normal_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
     held, held_t, held_s = _held(table, t, square)
     return (
-        c * push * held,
+        c * normal * held,
         size * depth * g,
-        c * (stiffness * held + push * held_t * 0.5 / (a * t)),
-        (c * push_theta - s * push) * held + c * push * chain * held_s,
-        push,
+        c * (stiffness * held + normal * held_t * 0.5 / (a * t)),
+        (c * normal_theta - s * normal) * held + c * normal * chain * held_s,
+        normal,
         chain * size * depth * g_s,
         inside,
     )
 
 
 @inner_kernel
-def _solid_stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
-    """Evaluate `lookup.stiffness_ahead`: Hertz's ∂N/∂d at d = ``reach``."""
+def _solid_stiffness_ahead(p: Pointer, scale: float, depth: float) -> float:
+    """Evaluate `lookup.stiffness_ahead`: Hertz's ∂N/∂d at d = ``depth``."""
     table = solid_at(p)
     stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
-    return stiffness * math.sqrt(reach * table.radius)
+    return stiffness * math.sqrt(depth * table.radius)
 
 
 @inner_kernel
-def _solid_push_at(
+def _solid_normal_at(
     p: Pointer, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
 ) -> Triple:
-    """Evaluate `lookup.push_at`."""
+    """Evaluate `lookup.normal_at`."""
     table = solid_at(p)
     if not table.sticks:
         force, force_d, force_theta = forces
@@ -228,5 +228,5 @@ def _is_solid(start: Any) -> bool:
 
 
 cast(Any, lookup_at).also(_solid_lookup_at, _is_solid)
-cast(Any, push_at).also(_solid_push_at, _is_solid)
+cast(Any, normal_at).also(_solid_normal_at, _is_solid)
 cast(Any, stiffness_ahead).also(_solid_stiffness_ahead, _is_solid)

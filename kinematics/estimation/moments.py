@@ -119,8 +119,8 @@ def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, o
     if m.face.low < m.face.high:
         # Only the rows of the footprint's box.
         first_row, last_row = rows_touched(m.face, grid)
-        first = max(first_row * grid.cols, state.reach.first)
-        last = min(last_row * grid.cols, state.reach.last)
+        first = max(first_row * grid.cols, state.region.first)
+        last = min(last_row * grid.cols, state.region.last)
         sums_inside(m, frame, centres, grid.rows * grid.cols, first, last)
     if m.total > 0.0:
         x = m.x / m.total
@@ -131,15 +131,15 @@ def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, o
 
 
 @inner_kernel
-def _d_from_extent(m: Moments, a: float, reach: float) -> float:
-    """d from the trace of the pressure's covariance and the centroid's distance ``reach``.
+def _d_from_extent(m: Moments, a: float, distance: float) -> float:
+    """d from the trace of the pressure's covariance and the centroid's distance ``distance``.
 
     Newton's iteration from ``m.d``; its last step is below 1e-5 of the radius, so that what is left
     is of 1e-10.
     """
     d = min(max(m.d, 0.01 * a), 0.9 * a)
     for _ in range(8):
-        s = min(reach / (_ratio(m, a, d, 1) * (a - d / 3.0)), 0.95)
+        s = min(distance / (_ratio(m, a, d, 1) * (a - d / 3.0)), 0.95)
         slope = (4.0 * a - 2.0 * d) / 6.0 - s * s * (12.0 * a - 10.0 * d) / 36.0
         miss = _trace(a, d, s) - m.trace / _ratio(m, a, d, 2)
         before = d
@@ -150,7 +150,7 @@ def _d_from_extent(m: Moments, a: float, reach: float) -> float:
 
 
 @inner_kernel
-def _take(state: EstimatorState) -> None:
+def _store(state: EstimatorState) -> None:
     """The moments' contact becomes the estimate."""
     estimate = state.estimate
     estimate.d = state.moments.d
@@ -172,11 +172,11 @@ def track(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
         m.n_y = estimate.n_y
         refine(state, frame, centres)
         grown = math.sqrt(m.d * (2.0 * a - m.d)) - math.sqrt(estimate.d * (2.0 * a - estimate.d))
-        moved = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
-        _take(state)
+        shift = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
+        _store(state)
         if not m.gain > 0.0:
             return False
-        if abs(grown) + moved < near:
+        if abs(grown) + shift < near:
             return True
     return False
 
@@ -186,30 +186,30 @@ def start(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray | None,
+    scratch: Pointer,
+    indices: IntArray | None,
 ) -> None:
     """Estimate from the frame alone: its strongest cells, then twice their moments."""
     m = state.moments
     signal = state.signal
-    centres = further(arena, state.at.centres)
+    centres = further(scratch, state.at.centres)
     peak = signal.peak
     if peak > _WEAK * signal.noise:
         level = max(4.0 * signal.noise, 0.15 * peak)
         size = state.grid.rows * state.grid.cols
-        sums_above(m, state.reach, frame, centres, size, level)
-        share = 1.0
+        sums_above(m, state.region, frame, centres, size, level)
+        cells_factor = 1.0
     else:
         _sums_of_weak(state, frame, centres)
-        share = 1.3  # of a weak contact's cells about three quarters pass
+        cells_factor = 1.3  # of a weak contact's cells about three quarters pass
     if not m.total > 0.0:
         at = signal.row * state.grid.cols + signal.col
         size = state.grid.rows * state.grid.cols
         m.total, m.x, m.y, m.number = 1.0, centres[X * size + at], centres[Y * size + at], 1.0
-    _set_from_area(m, state.grid, share * m.number)
+    _set_from_area(m, state.grid, cells_factor * m.number)
     refine(state, frame, centres)
     refine(state, frame, centres)
-    _take(state)
+    _store(state)
     state.estimate.gain = min(max(m.gain, 0.02), 50.0)
 
 
@@ -224,9 +224,9 @@ def _sums_of_weak(state: EstimatorState, frame: Pointer, centres: Pointer) -> No
     level = 2.0 * state.signal.noise
     patch = state.options.patch_level * state.signal.noise
     size = state.grid.rows * state.grid.cols
-    last = state.reach.last
+    last = state.region.last
     total = sum_x = sum_y = number = 0.0
-    at = next_above(frame, centres, state.reach.first, last, level)
+    at = next_above(frame, centres, state.region.first, last, level)
     while at < last:
         if neighbourhood(frame, centres, state.grid, at) > patch:
             value = frame[at]
@@ -315,18 +315,20 @@ def _set_contact(state: EstimatorState) -> None:
             d = min(max(d, 1e-4 * a), 0.95 * a)
         covariance[0, 0] = 0.25 * relative * d * d
     m.d = d
-    reach = _ratio(m, a, d, 1) * (a - d / 3.0)
-    _set_normal(m, m.x / reach, m.y / reach)
+    distance = _ratio(m, a, d, 1) * (a - d / 3.0)
+    _set_normal(m, m.x / distance, m.y / distance)
     if state.options.free_gain:
         cosine = math.sqrt(1.0 - m.n_x * m.n_x - m.n_y * m.n_y)
         gain = force * cosine / (math.pi * modulus * d * d * _ratio(m, a, d, 0))
         m.gain = gain
         # Over a disc of that many cells: mean of (r² − trace)².
         square = m.number * grid.pitch_x * grid.pitch_y / math.pi
-        spread = square * square / 3.0 - m.trace * square + m.trace * m.trace
+        variance = square * square / 3.0 - m.trace * square + m.trace * m.trace
         slope = (4.0 * a - 2.0 * d) / 6.0
-        by_d = relative * spread / (slope * slope)
+        by_d = relative * variance / (slope * slope)
         covariance[0, 0] = by_d
         covariance[3, 3] = gain * gain * (relative + 4.0 * by_d / (d * d))
         covariance[0, 3] = covariance[3, 0] = -2.0 * gain * by_d / d
-    covariance[1, 1] = covariance[2, 2] = relative * 0.25 * m.radius * m.radius / (reach * reach)
+    covariance[1, 1] = covariance[2, 2] = (
+        relative * 0.25 * m.radius * m.radius / (distance * distance)
+    )

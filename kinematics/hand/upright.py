@@ -28,7 +28,7 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-_LEAST_WIDTH = 0.1  # of the tip's radius, that W − d is not taken for less than
+_WIDTH_MIN = 0.1  # of the tip's radius, that W − d is not taken for less than
 
 
 @inner_kernel
@@ -47,11 +47,11 @@ def upright_spring(
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)
     width = 2.0 * (half_separation - inward - radius + d)
-    rest = max(width - d, _LEAST_WIDTH * radius)
-    return force * half_separation * (2.0 * inward + (1.0 - 2.0 * turning) * d) / rest
+    gap = max(width - d, _WIDTH_MIN * radius)
+    return force * half_separation * (2.0 * inward + (1.0 - 2.0 * turning) * d) / gap
 
 
-def resting_share(
+def resting_ratio(
     d: float, width: float, spring: float, force: float, lengths: tuple[float, float, float, float]
 ) -> float:
     """Return φ/φ0 of an object of ``width`` [m] held with a joint ``spring`` [N·m/rad].

@@ -72,7 +72,7 @@ def nodes_needed(a: float, half: float, far: float) -> int:
 
 
 @inner_kernel
-def _push_line(
+def _add_line(
     nodes: Nodes, a: float, y: float, left: float, right: float, n: int, w: float
 ) -> None:
     """Add the nodes of ∫ dx on the line ``y`` from ``left`` to ``right``, times ``w``.
@@ -102,7 +102,7 @@ def _push_line(
 
 
 @inner_kernel
-def push_whole(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
+def add_whole_cell(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
     """Add the nodes of the mean over a cell that lies in the footprint."""
     a = grid.radius
     x0 = grid.x + j * grid.pitch_x
@@ -115,7 +115,7 @@ def push_whole(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
     scale = 1.0 / (x1 - x0)
     for k in range(m):
         y = y0 + (y1 - y0) * GAUSS_NODES[m, k]
-        _push_line(nodes, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
+        _add_line(nodes, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
 
 
 @fast_inner_kernel
@@ -166,7 +166,7 @@ def _insert(breaks: FloatArray, count: int, value: float, low: float, high: floa
 
 
 @inner_kernel
-def push_cut(
+def add_cut_cell(
     nodes: Nodes, face: Face, grid: Grid, i: int, j: int, left_span: Span, right_span: Span
 ) -> None:
     """Add the nodes of the mean over a cell that the outline may cut.
@@ -235,14 +235,14 @@ def push_cut(
             inner = max(n, 4) if n > 0 else 0
             kink = (u - w * y) / v if beyond and v != 0.0 else math.inf
             if left < kink < right:
-                _push_line(nodes, a, y, left, kink, inner, weight)
+                _add_line(nodes, a, y, left, kink, inner, weight)
                 left = kink
-            _push_line(nodes, a, y, left, right, inner, weight)
+            _add_line(nodes, a, y, left, right, inner, weight)
 
 
 # Planes of a grid's cells, float64 [rows, CELL_PLANES, cols]: means over the whole cell of g, x g
 # and y g with g = 1/√(a² − x² − y²), their covariances, and 1 for a live cell, 0 for a dead one.
-PLAIN_MEAN, X_MEAN, Y_MEAN, LIVE, PLAIN_VAR, PLAIN_X, PLAIN_Y, X_VAR, X_Y, Y_VAR = range(10)
+PLAIN_MEAN, X_MEAN, Y_MEAN, ACTIVE, PLAIN_VAR, PLAIN_X, PLAIN_Y, X_VAR, X_Y, Y_VAR = range(10)
 CELL_PLANES = 10
 _MEAN_NODES = 8
 

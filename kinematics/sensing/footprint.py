@@ -104,12 +104,12 @@ def set_extremes(face: Face, a: float) -> None:
         face.high = face.right = a
     else:
         root = s * a * a - u * u
-        reach = math.sqrt((1.0 + v * v) * root)
-        face.low = (u * w - reach) / s
-        face.high = (u * w + reach) / s
-        reach = math.sqrt((1.0 + w * w) * root)
-        left = (u * v - reach) / s
-        right = (u * v + reach) / s
+        half_length = math.sqrt((1.0 + v * v) * root)
+        face.low = (u * w - half_length) / s
+        face.high = (u * w + half_length) / s
+        half_length = math.sqrt((1.0 + w * w) * root)
+        left = (u * v - half_length) / s
+        right = (u * v + half_length) / s
         e = 1.0 + w * w
         face.left = left
         face.left_y = w * (u - v * left) / e
@@ -156,13 +156,13 @@ def line_spans(
     w = face.v if upright else face.w
     start = grid.x if upright else grid.y
     pitch = grid.pitch_x if upright else grid.pitch_y
-    stretch = 1.0 + v * v
-    e = 1.0 / stretch
+    norm2 = 1.0 + v * v
+    e = 1.0 / norm2
     for k in range(first, last + 1):
         y = start + k * pitch
         rim = a * a - y * y
         q = u - w * y
-        square = stretch * rim - q * q
+        square = norm2 * rim - q * q
         root = math.sqrt(max(square, 0.0))
         edge = math.sqrt(max(rim, 0.0))
         near = (v * q - root) * e

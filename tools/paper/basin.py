@@ -15,7 +15,7 @@ import numpy as np
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.hand.upright import resting_share
+from softfinger.kinematics.hand.upright import resting_ratio
 from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
 from softfinger.tools.style import GREY, KINDS, MARKERS
@@ -96,7 +96,7 @@ def basin() -> tuple[Sheet, ...]:
 def _laws(laws: Sheet, *_: Sheet) -> Iterator[DrawnCurve]:
     starts = laws["put at"]
     for spring, text in ((0.0, "equal torques, no friction"), (1e9, "fingers locked")):
-        share = resting_share(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
+        share = resting_ratio(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
         line = {"color": GREY, "ls": "--" if spring else ":", "lw": 1.0}
         yield DrawnCurve(starts, share * starts, line, f"closed form: {text}")
     for law, color, marker in zip(LAWS, KINDS, MARKERS, strict=False):

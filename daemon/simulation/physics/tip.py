@@ -59,7 +59,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.contact.lookup import lookup_at, push_at, stiffness_ahead
+from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness_ahead
 
 D_MIN = 1e-9  # m, less is no contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
@@ -169,7 +169,7 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
             d_soft_d = 0.0
             d_soft_theta = 0.0
         force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(table, d_soft, tip.theta)
-        slope, slope_d, slope_theta = push_at(
+        slope, slope_d, slope_theta = normal_at(
             table, d_soft, tip.theta, (force, force_d, force_theta), tangent, inverse_cosine
         )
         scale = p.scale

@@ -19,7 +19,7 @@ from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, rende
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import average, parts
+from softfinger.kinematics.sensing.blur import average, pieces
 from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 
@@ -131,7 +131,7 @@ class SensorModel:
         self._pressure = self._rendered = np.zeros(shape)
         cells = grid
         if flaws.blur > 0.0:
-            n_x, n_y = (min(parts(flaws.blur / pitch), _MOST_PARTS) for pitch in grid.pitches)
+            n_x, n_y = (min(pieces(flaws.blur / pitch), _MOST_PARTS) for pitch in grid.pitches)
             self._parts = n_x, n_y
             self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._parts)
             self._rendered = np.zeros(cells.shape)
@@ -139,7 +139,7 @@ class SensorModel:
         self._solid: SolidPressure | None = None
         if tip.physics == "solid":
             blurred = replace(grid, blur=flaws.blur)
-            self._solid = SolidPressure(tip, material, blurred.pictures(tip))
+            self._solid = SolidPressure(tip, material, blurred.images(tip))
         self._plane, self._curved = Rendering(), CurvedContact()
         for contact in (self._plane, self._curved):
             contact.grid.assign(cells.on(tip))
