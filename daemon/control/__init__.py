@@ -1,4 +1,4 @@
-"""Which mode the hand is in and which goal it gives the joints: grip, setpoints, slip, tasks.
+"""Control: the hand's mode and the joints' goals, by grip, setpoints, slip and tasks.
 
 No socket, no servo protocol.
 """

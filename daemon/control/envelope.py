@@ -1,4 +1,4 @@
-"""What the hand is known to hold: a map over shape, size, friction and mass, found by simulation.
+"""Map of the objects that the hand can hold, over shape, size, friction and mass, by simulation.
 
 `softfinger envelope --keep` makes it, `grasp` asks it for a warning. It holds for the hand it was
 made for; the packaged one is the built-in hand's, and tells of others nothing.
@@ -28,13 +28,13 @@ _SECTIONS = ("hand", "tip", "material")
 
 
 def identity(settings: Settings) -> dict[str, Any]:
-    """What of the settings a map belongs to."""
+    """Return the settings that a map belongs to."""
     told = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
     return told | {"control": {"law": settings.control.law}}
 
 
 def raised(settings: Settings, force: float) -> float:
-    """What a grip that was asked for ``force`` [N] is raised to at most, which bears the weight."""
+    """Return the force [N] to which a grip of ``force`` [N] may be raised."""
     most = GRIP_SHARE * settings.safety.force_max
     return max(min(force + settings.control.grip_raise_max, most), force)
 
@@ -82,7 +82,7 @@ class Envelope:
         self._settings = settings
 
     def warning(self, force: float) -> str:
-        """Why a grasp with so many N may fail, by what the settings say of the object, or nothing.
+        """Return why a grasp of so many N may fail with the settings' object; empty if not.
 
         Taken are the nearest size, friction that is no more than `control.tip_friction`, and the
         mass whose weight is `control.object_load`, scaled by what the grip may be raised to.

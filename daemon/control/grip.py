@@ -75,12 +75,12 @@ class Grip:
 
     @property
     def upright(self) -> bool:
-        """Whether a grip is not to look at the object's angle by itself."""
+        """True if a grip takes no account of the object's angle."""
         return self._state.law.upright
 
     @property
     def shaking(self) -> bool:
-        """Whether the fingers are still to bring the object upright."""
+        """True while the fingers are still to bring the object upright."""
         state = self._state
         awaited = state.law.upright and self._alone is None and not state.steering
         return awaited and state.shaken < state.law.dither_time
@@ -120,11 +120,11 @@ class Grip:
         self._state.joint_stiffness = joint_stiffness
 
     def begin_holding(self) -> None:
-        """The grip is settled: from now on loads from outside show."""
+        """Mark the grip as settled: from now on loads from outside show."""
         kernels.begin_holding(self._state.array, self._grasp.array)
 
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
-        """Joint torques [N·m], positive closing; a finger that takes no part gets 0.
+        """Return joint torques [N·m], positive closing; a finger that takes no part gets 0.
 
         ``holding``: nothing but loads moves the joints.
         """
@@ -145,7 +145,7 @@ class Grip:
         return torque1, torque2
 
     def coast(self, reading: Reading) -> tuple[float, float]:
-        """Joint torques [N·m] while frames are late: the push stays, and turning comes to rest.
+        """Return joint torques [N·m] while frames are late: the force stays, turning ends.
 
         Joints are read all the same. Torques that stayed as they are would turn the object on, to
         the end of what damps and steers it.

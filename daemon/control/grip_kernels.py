@@ -33,7 +33,7 @@ _TURN_MIN = 0.1  # of the object over a joint's lean, likewise
 
 
 class GripLaw(Record):
-    """What is set once."""
+    """Constants of the grip laws."""
 
     dt: float  # [s]
     force_gain: float
@@ -57,7 +57,7 @@ class GripLaw(Record):
 
 
 class GripState(Record):
-    """What commands set and what the laws remember."""
+    """Commanded values and memory of the grip laws."""
 
     law: GripLaw
     force: SetpointState  # mean of the tips [N]
@@ -98,7 +98,7 @@ def start(
 
 @kernel
 def begin_holding(grips: Records[GripState], grasps: Records[GraspState]) -> None:
-    """The grip is settled: from now on loads show."""
+    """Mark the grip as settled: from now on loads show."""
     slip_monitor.begin(grips[0].slip, grasps[0])
 
 
@@ -112,7 +112,7 @@ def squeeze(
     dq: tuple[float, float],
     holding: bool,
 ) -> tuple[float, float, float, bool]:
-    """Torques of both joints [N·m], the target force [N], and whether the object slipped.
+    """Return torques of both joints [N·m], the target force [N], and whether the object slipped.
 
     ``turned`` is the object's angle [rad], NaN where it is not known. ``dq``: joint velocities
     [rad/s]. ``holding``: nothing but loads moves the joints.
@@ -146,7 +146,7 @@ def squeeze(
 def coast(
     grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """In the place of `squeeze` while frames are late: the push stays, turning comes to rest."""
+    """Replace :func:`squeeze` while frames are late: the force stays, turning comes to rest."""
     g = grips[0]
     g.lean *= g.law.rest
     g.offset += g.lean * g.law.dt
@@ -161,7 +161,7 @@ def press(
     finger: int,
     dq: float,
 ) -> float:
-    """Torque [N·m] of one ``finger`` on an object that stands by itself."""
+    """Return torque [N·m] of one ``finger`` on an object that stands by itself."""
     g = grips[0]
     wanted = setpoint.advance(g.force, force_windows, g.force_rate)
     push = wanted + _correction(g, wanted, grasps[0].force[finger])
@@ -173,7 +173,7 @@ def press(
 def coast_alone(
     grips: Records[GripState], grasps: Records[GraspState], finger: int, dq: float
 ) -> float:
-    """In the place of `press` while frames are late."""
+    """Replace :func:`press` while frames are late."""
     return _torque_alone(grips[0], grasps[0], finger, 0.0, dq)
 
 
@@ -184,14 +184,14 @@ def _mean_stiffness(grasp: GraspState) -> float:
 
 @inner_kernel
 def _turning(grasp: GraspState) -> float:
-    """How far the object turns when one joint leans forward and the other back."""
+    """Return how far the object turns when one joint leans forward and the other back."""
     both: float = grasp.turn[0] + grasp.turn[1]
     return max(both, _TURN_MIN)
 
 
 @inner_kernel
 def _correction(g: GripState, wanted: float, felt: float) -> float:
-    """What the force felt asks for beyond the feed-forward [N]."""
+    """Return the force [N] that feedback adds to the feed-forward."""
     law = g.law
     error = wanted - felt
     # Beyond what the servos may give, more error must not be stored.
@@ -332,5 +332,5 @@ def _torque_alone(g: GripState, grasp: GraspState, finger: int, rate: float, dq:
 
 @inner_kernel
 def _friction(law: GripLaw, rate: float) -> float:
-    """What a joint's friction takes [N·m] at the ``rate`` [rad/s] that is wanted."""
+    """Return a joint's friction [N·m] at the commanded ``rate`` [rad/s]."""
     return law.friction * min(max(rate / law.friction_speed, -1.0), 1.0)

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Mode(StrEnum):
-    """What the hand is doing."""
+    """Mode of the hand."""
 
     DISARMED = "disarmed"  # torque off
     ARMED = "armed"  # torque on, joints hold where they are

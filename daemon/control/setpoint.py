@@ -50,7 +50,7 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
 
 @inner_kernel
 def arrived(s: SetpointState) -> bool:
-    """At the target, at rest."""
+    """Return whether the setpoint is at rest at its target."""
     there: bool = s.idle >= s.first.length + s.second.length and s.ramp == s.target
     return there
 
@@ -93,7 +93,7 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
 
 
 class PairState(Record):
-    """Of both joints."""
+    """State of both joints."""
 
     left: SetpointState
     right: SetpointState
@@ -144,7 +144,7 @@ class Setpoint:
 
     @property
     def target(self) -> float:
-        """Where it goes; it may be set at any tick."""
+        """Target; it may be set at any tick."""
         return self.state.target
 
     @target.setter
@@ -153,20 +153,20 @@ class Setpoint:
 
     @property
     def value(self) -> float:
-        """Where it is."""
+        """Present value."""
         return self.state.value
 
     @property
     def speed(self) -> float:
-        """How fast it moves [1/s]."""
+        """Present speed [1/s]."""
         return self.state.speed
 
 
 class JointSetpoints:
-    """Of both joints, moved by one call."""
+    """Setpoints of both joints, moved by one call."""
 
     def __init__(self, dt: float, window: float) -> None:
-        """As `Setpoint`."""
+        """Take the arguments of `Setpoint`."""
         self._state = state = PairState()
         self._windows = [Setpoint(dt, window, one).windows for one in (state.left, state.right)]
         self._arrays = state.left.array, state.right.array

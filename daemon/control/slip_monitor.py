@@ -59,7 +59,7 @@ _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip h
 
 
 class SlipLaw(Record):
-    """What is set once."""
+    """Constants of one slip monitor."""
 
     dt: float  # [s]
     width: float  # of the object [m]
@@ -73,7 +73,7 @@ class SlipLaw(Record):
 
 
 class SlipState(Record):
-    """What is known of one held object."""
+    """Load, friction and margin of one held object."""
 
     law: SlipLaw
     load: float  # that each tip may bear along its face, hidden part included [N]
@@ -107,7 +107,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 
 @inner_kernel
 def forget(s: SlipState) -> None:
-    """Nothing is held any more, or something else."""
+    """Forget the object: nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
     s.load = s.felt = s.still = s.variance = s.age = 0.0
     s.smooth[0] = s.smooth[1] = s.speed = 0.0
@@ -116,7 +116,7 @@ def forget(s: SlipState) -> None:
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
-    """Holding begins, or begins again after a command: learn what is no load."""
+    """Begin holding, or begin again after a command: learn the torques that are no load."""
     s.known = grasp.load_lever > 0.0
     if not s.known:
         return
@@ -131,7 +131,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
 def look(
     s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: float, speed: float
 ) -> float:
-    """The grip force [N] to go to: ``asked``, or more where the margin needs it.
+    """Return the grip force [N] to go to: ``asked``, or more where the margin needs it.
 
     ``holding``: nothing but loads moves the joints. ``closing``, -1 to 1: how much of the joints'
     friction is given at present for closing. ``speed`` [rad/s]: of the joints' closing.
@@ -265,6 +265,6 @@ def _watch_turning(s: SlipState, grasp: GraspState) -> None:
 
 @inner_kernel
 def mean(pair: Pair) -> float:
-    """Of (left, right)."""
+    """Return the mean of (left, right)."""
     value: float = 0.5 * (pair[0] + pair[1])
     return value

@@ -64,24 +64,24 @@ class Control:
         self.events.append(("error", name, reason))
 
     def arm(self) -> None:
-        """Torque on, with the joints held where they are."""
+        """Switch torque on, with the joints held where they are."""
         self._hold_here()
         self.torque = True
         self._enter(Mode.ARMED)
 
     def disarm(self) -> None:
-        """Torque off; also the way out of a fault."""
+        """Switch torque off; also the way out of a fault."""
         self.torque = False
         self._enter(Mode.DISARMED)
 
     def stop(self) -> None:
-        """Torque off; a fault stays latched."""
+        """Switch torque off; a fault stays latched."""
         self.torque = False
         if self.mode is not Mode.FAULT:
             self._enter(Mode.DISARMED)
 
     def move(self, **angles: float) -> None:
-        """Joints to these angles [rad], ``left`` and ``right`` or one of them."""
+        """Move the joints to these angles [rad], ``left`` and ``right`` or one of them."""
         if self.mode is not Mode.MOVING:
             self._hold_here()
         for name, q in angles.items():
@@ -109,11 +109,11 @@ class Control:
         self._enter(Mode.ROTATING)
 
     def set(self, compliance: float) -> None:
-        """Angle by which the grip gives way to a torque [rad/(N·m)]."""
+        """Set the angle by which the grip gives way to a torque [rad/(N·m)]."""
         self._grip.soften(1.0 / compliance)
 
     def why_not_turn(self, angle: float) -> str:
-        """Why the held object can't be turned to ``angle`` [rad] now; empty where it can."""
+        """Return why the held object can't be turned to ``angle`` [rad] now; empty where it can."""
         if not self._pose.valid:
             return "the object's angle is not known"
         low, high = self._turns()
@@ -191,9 +191,9 @@ class Control:
             goal.force = self._force
 
     def coast(self, goal: Goal) -> None:
-        """In place of `step` while frames are late: goals stay as they are.
+        """Replace :meth:`step` while frames are late: goals stay as they are.
 
-        But for a grip's, which are torques: its joints are damped, and a turn comes to rest.
+        A grip's goals are torques: its joints are damped, and a turn comes to rest.
         """
         if goal.valid and self._gripping and self._lost == 0.0:
             self._pull(self._grip.coast(self._reading), goal)
@@ -273,7 +273,7 @@ class Control:
             goal.current[index] = abs(current)
 
     def _lose(self, dt: float, goal: Goal) -> None:
-        """Without a contact the joints hold where they are; when it stays away the grip ends."""
+        """Hold the joints where they are without a contact; end the grip when it stays away."""
         if self._lost == 0.0:
             self._hold_here()
             # A board that went blind must not make the joints press harder than they did.
@@ -288,7 +288,7 @@ class Control:
             self._rest_current = rest
 
     def _is_empty(self, dt: float) -> bool:
-        """Whether there seems to be nothing between the tips; when that stays, the hand opens.
+        """Return whether there seems to be nothing between the tips; if that lasts, the hand opens.
 
         Tips that press each other would roll off to one side. Their contacts are one, so that the
         object's width by joints and sensors is 0 up to their errors.

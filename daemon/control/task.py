@@ -43,11 +43,11 @@ class Task:
 
     @staticmethod
     def named(settings: Settings) -> Task | None:
-        """The settings' task, or None."""
+        """Return the settings' task, or None."""
         return None if settings.task.name == "none" else Task(settings)
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
-        """The command that is due at this tick, if any.
+        """Return the command that is due at this tick, if any.
 
         Raises TaskOver after a fault, when the hand was disarmed, or when a step did not come to
         its end.

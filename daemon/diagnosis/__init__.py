@@ -1,4 +1,4 @@
-"""What `softfinger doctor` looks at: one module an area, each a few functions that return findings.
+"""Checks of `softfinger doctor`: one module an area, each a few functions that return findings.
 
 Nothing here changes, stiffens or moves anything, but for `repair`, which `--fix` asks for.
 """

@@ -37,7 +37,7 @@ _OFF_RATE = 0.1  # share of the rate by which a board may be off
 
 
 def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]:
-    """Each servo of the scene; where one does not answer, what answers at every rate instead.
+    """Check each servo of the scene; where one does not answer, search every rate for what answers.
 
     ``wait`` [s] is given to each rate that is searched.
     """
@@ -78,7 +78,7 @@ def _described(servo: Examined, model: ServoModel) -> str:
 
 
 def _search(settings: Settings, model: ServoModel, wait: float) -> list[Finding]:
-    """What answers on the port at any rate that the model has, and what is to be done about it."""
+    """Search the port at every rate of the model and say how to reach what answers."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, wait, {FACTORY_ID, *servos.ids})
     if not found.servos and not found.garbled:
@@ -98,7 +98,7 @@ def _search(settings: Settings, model: ServoModel, wait: float) -> list[Finding]
 
 
 def _blame_power(examined: list[Examined]) -> list[Finding]:
-    """What is most likely where servos are missing and no other ones answer instead."""
+    """Report the likeliest cause of missing servos where no other ones answer instead."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo answers at any rate"
@@ -109,7 +109,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
 
 
 def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Finding:
-    """Whether a board sends frames of the settings' grid at their rate; ``listen`` s are heard."""
+    """Check that a board sends frames of the settings' grid at their rate, for ``listen`` [s]."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     patient = tactile.model_copy(update={"open_timeout": max(tactile.open_timeout, _PATIENCE)})

@@ -1,4 +1,4 @@
-"""Whether this machine lets a process keep a steady tick: scheduling, memory, idle states, clock.
+"""Checks that this machine can keep a steady tick: scheduling, memory, idle states, clock.
 
 All of it makes the tick worse at most, so nothing here fails; limits are this process's own, as
 the daemon started from the same shell has them.
@@ -24,7 +24,7 @@ _OLDEST = 1_700_000_000.0  # Unix s: a clock that says less was never set
 
 
 def check_machine() -> list[Finding]:
-    """Every check of this module."""
+    """Run every check of this module."""
     return [
         check_scheduling(),
         check_memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]),
@@ -38,7 +38,7 @@ def check_machine() -> list[Finding]:
 
 
 def check_scheduling() -> Finding:
-    """Whether SCHED_FIFO is allowed; it is tried for an instant, on this thread alone."""
+    """Check that SCHED_FIFO is allowed; it is tried for an instant, on this thread alone."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
@@ -64,7 +64,7 @@ def check_memory_lock(limit: int) -> Finding:
 
 
 def check_idle_states(path: Path) -> Finding:
-    """Whether the processors can be kept out of deep idle states, from which waking takes long."""
+    """Check that the processors can be kept out of deep idle states, which they leave slowly."""
     name = str(path)
     if not path.exists():
         return Finding("warn", name, "this kernel has none: wake-ups take what idle states take")
@@ -75,7 +75,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_clock_source(path: Path) -> Finding:
-    """Whether reading the time is cheap and fine enough."""
+    """Check that reading the time is cheap and fine enough."""
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     if resolution > 1e-6:
         problem = f"monotonic time has steps of {resolution * 1e6:g} µs, not ≤ 1 µs"
@@ -92,7 +92,7 @@ def check_clock_source(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Whether Unix time ``now`` [s] can be one: it stands in every published message."""
+    """Check that Unix time ``now`` [s] can be one: it stands in every published message."""
     if now >= _OLDEST:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
@@ -101,7 +101,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """How late sleeps until a deadline end [s], as the daemon's ticks would."""
+    """Return how late sleeps until a deadline end [s], as the daemon's ticks do."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UPS):
@@ -123,7 +123,7 @@ def check_wake_ups(late: list[float]) -> Finding:
 
 
 def check_kernels(settings: Settings) -> list[Finding]:
-    """Whether compiled kernels can be kept, and whether those of this scene are there."""
+    """Check that compiled kernels can be stored, and those of this scene are there."""
     try:
         folder = find_folder()
     except (OSError, RuntimeError) as error:

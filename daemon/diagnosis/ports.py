@@ -24,12 +24,12 @@ _PROC = Path("/proc")
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """(path, what it is) of every serial port of this machine, by path."""
+    """Return (path, what it is) of every serial port of this machine, by path."""
     return sorted((port.device, port.description) for port in list_ports.comports())
 
 
 def note_ports() -> Finding:
-    """The ports there are, in one line."""
+    """Return the existing ports, in one line."""
     found = [
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
@@ -37,7 +37,7 @@ def note_ports() -> Finding:
 
 
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
-    """Whether a port is there, may be opened, and nobody else has it; it is not kept open.
+    """Check that a port is there, may be opened, and nobody else has it; it is not kept open.
 
     ``key`` is the setting that names it, ``mode_of_daemon`` that of the daemon which answers
     commands here, if one does: it may have the port and shall keep it.
@@ -98,7 +98,7 @@ def _busy(path: str, mode_of_daemon: str) -> Finding:
 
 
 def _is_daemon(process: int) -> bool:
-    """Whether it was started as ``softfinger run``."""
+    """Return whether it was started as ``softfinger run``."""
     try:
         words = (_PROC / str(process) / "cmdline").read_bytes().split(b"\0")
     except OSError:
@@ -109,7 +109,7 @@ def _is_daemon(process: int) -> bool:
 
 
 def users(path: str) -> list[tuple[int, str]]:
-    """(process, its name) of all that have the port open, as far as this user may see.
+    """Return (process, its name) of all that have the port open, as far as this user may see.
 
     Who holds the other end of a pseudo-terminal is no user of it.
     """
@@ -132,7 +132,7 @@ def users(path: str) -> list[tuple[int, str]]:
 
 
 def _uses(folder: Path, device: int) -> bool:
-    """Whether the process has the device open, and does not own it as a pseudo-terminal."""
+    """Return whether the process has the device open, and does not own it as a pseudo-terminal."""
     opened = False
     for link in (folder / "fd").iterdir():
         try:
@@ -183,7 +183,7 @@ _PATIENCE = 0.5  # s for a daemon to answer
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Whether the stream's and the commands' address can be bound, and who has them if not."""
+    """Check that the stream's and the commands' address can be bound; name the holder if not."""
     return [_check(settings, "stream"), _check(settings, "commands")]
 
 
@@ -202,7 +202,7 @@ def _check(settings: Settings, section: str) -> Finding:
 
 
 def daemon_mode(address: str, keys: str = "") -> str:
-    """The mode of the daemon that answers commands at ``address``; empty when none does.
+    """Return the mode of the daemon that answers commands at ``address``; empty when none does.
 
     ``keys`` is the folder of `softfinger keys`, where the daemon wants some.
     """
@@ -215,7 +215,7 @@ def daemon_mode(address: str, keys: str = "") -> str:
 
 
 def why_not_free(address: str) -> str:
-    """Empty when the daemon could bind ``address`` (tcp or ipc); else ``in use`` or what is wrong.
+    """Return why ``address`` (tcp or ipc) can't be bound, such as ``in use``; empty if it can.
 
     It is bound for an instant, or its lock is tried, and nothing is left behind.
     """

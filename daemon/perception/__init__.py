@@ -1,1 +1,1 @@
-"""From tactile frames to contacts: calibration, estimate, and the filter between frames."""
+"""Perception, from tactile frames to contacts: calibration, estimate, and filter between frames."""

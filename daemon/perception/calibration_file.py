@@ -41,7 +41,7 @@ class _StepModel(BaseModel):
 
 
 class Sensor(_StepModel):
-    """Which sensor it is: under which finger, its label or serial number, and its grid."""
+    """Identity of a sensor: its finger, its label or serial number, and its grid."""
 
     finger: Literal["left", "right"]
     label: str
@@ -109,7 +109,7 @@ class ModulusStep(_StepModel):
     residual: Finite
 
     def material(self) -> Material:
-        """The tip's law. Raises ValueError for points that make none."""
+        """Return the tip's law. Raises ValueError for points that make none."""
         if self.strain:
             return Material.from_points(self.strain, self.stress)
         return Material.constant(self.modulus)
@@ -147,18 +147,18 @@ class Calibration(_StepModel):
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
-        """The same and the steps that were done, in one line."""
+        """Return the same and the steps that were done, in one line."""
         steps = [name for name in _STEPS if getattr(self, name) is not None]
         return f"{self.identity}: {', '.join(steps) or 'no step'}"
 
 
 def now() -> str:
-    """The present date and time as the file has it."""
+    """Return the present date and time as the file has it."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Which sensor the settings put under ``finger``; a USB port's serial number if none is set."""
+    """Return the settings' sensor under ``finger``; its USB port's serial number if none is set."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],
@@ -190,7 +190,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def calibration_for(settings: Settings, finger: int) -> Calibration | None:
-    """The settings' calibration of one finger's sensor, None where they name none.
+    """Return the settings' calibration of one finger's sensor, None where they name none.
 
     Raises CalibrationFileError when it can't be read or is another sensor's.
     """
@@ -205,7 +205,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """How the file's sensor differs from the one that is ``there``; empty: not at all."""
+    """Return how the file's sensor differs from the one that is ``there``; empty: not at all."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "no name", there.label or "no name"),
@@ -270,17 +270,17 @@ class Converter:
         return table, 1.0 / step
 
     def readings(self, counts: FloatArray) -> FloatArray:
-        """x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
+        """Return x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
 
     def pressure(self, readings: FloatArray) -> FloatArray:
-        """Pressure [Pa] of readings that noise may take below 0, where the curve goes on."""
+        """Return pressure [Pa] of readings that noise may take below 0, where the curve goes on."""
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)
         return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
     def at(self, count: int) -> FloatArray:
-        """Pressure [Pa] of each cell when it reads ``count``, a new array."""
+        """Return pressure [Pa] of each cell when it reads ``count``, a new array."""
         return self(np.full(self._out.shape, count, np.uint16)).copy()
 
     @property
@@ -301,7 +301,7 @@ class Converter:
 
 
 def least_end(ends: FloatArray) -> float:
-    """The least of the readings at which cells are full, each over its own zero.
+    """Return the least of the readings at which cells are full, each over its own zero.
 
     Cells that are nearly full without load are left out: they would make all others count as full.
     """
@@ -309,7 +309,7 @@ def least_end(ends: FloatArray) -> float:
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """What is wrong with a file whose single values are valid; empty: nothing."""
+    """Return the contradiction in a file whose single values are valid; empty if there is none."""
     sensor = calibration.sensor
     tables = {}
     if calibration.tare:

@@ -55,7 +55,7 @@ class Quantity(Record):
 
 
 class TrackedTip(Record):
-    """What the filter keeps of one tip and its joint."""
+    """State of the filter for one tip and its joint."""
 
     d: Quantity
     gain: float  # measured over modelled pressure: the frames' height
@@ -75,7 +75,7 @@ class TrackedTip(Record):
 
 
 class GraspState(Record):
-    """How the held object answers the joints at this tick: what a grip law needs."""
+    """Response of the held object to the joints at this tick, for the grip laws."""
 
     t: float  # when the joints were read [s]
     d: Pair  # displacements [m]
@@ -110,7 +110,7 @@ class Past(Record):
 
 
 class FilterState(Record):
-    """What is set once, what the filter remembers, and what it finds."""
+    """Constants, memory and results of the filter."""
 
     half_separation: float  # of the hand, in m as its other lengths
     length: float
@@ -136,7 +136,7 @@ class FilterState(Record):
 
 @inner_kernel
 def _variance(quantity: Quantity, step: float) -> float:
-    """What the last frame left, and what joints read in steps of ``step`` may miss since."""
+    """Return the last frame's variance and that of joints read since in steps of ``step``."""
     since = quantity.since
     missed = _SHARE * since
     variance: float = quantity.variance + missed * missed
@@ -165,11 +165,11 @@ def _assume_taper(f: FilterState, sense: float, angle: float, variance: float) -
 
 @inner_kernel
 def _credited(tip: TrackedTip, slow: float, way: float, shown: float, dt: float) -> float:
-    """What of a tracked joint's ``way`` the estimates have not felt yet.
+    """Return the displacement of a tracked joint that the estimates have not accounted for yet.
 
     A joint that creeps through its count comes up by a whole one at the edge; frames have seen most
-    of that on the way. Beyond the motion ``shown`` by the velocity only so much is new as may have
-    stayed below half a count of velocity since the last frame.
+    of that before. Beyond the displacement ``shown`` by the velocity only so much is new as may
+    have stayed below half a count of velocity since the last frame.
     """
     unseen = tip.unseen + slow * dt
     more = min(max(way - shown, -unseen), unseen)

@@ -52,7 +52,7 @@ class FingerModel:
 def make_models(
     settings: Settings, cache: Path | None, on_event: Callable[[str, str, str], None] | None = None
 ) -> tuple[FingerModel, FingerModel]:
-    """Both fingers' models; a finger whose tip's modulus is not calibrated has the settings' law.
+    """Make both fingers' models, by the settings' law where a tip's modulus is not calibrated.
 
     A finger that takes no part, or has no sensor, goes by the settings alone. Raises as
     `profile.factory.make_table` and `calibration_file.calibration_for`.
@@ -132,7 +132,7 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
 
 
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
-    """The sensor's cells, at the calibrated centre if there is one."""
+    """Return the sensor's cells, at the calibrated centre if there is one."""
     if settings.tip.physics == "measured" and calibration is not None and calibration.law:
         return make_grid(settings, finger, calibration.law.centre, calibration.law.rotation)
     if calibration is None or calibration.centre is None:
@@ -147,7 +147,7 @@ def make_estimator(
     live: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
 ) -> ContactEstimator | MeasuredEstimator:
-    """An estimator of its own for each finger, since it starts from its last estimate.
+    """Return an estimator of its own for each finger, since it starts from its last estimate.
 
     ``live``: cells that exist, less the settings' dead ones. With a ``calibration``
     its frames are the pressures [Pa] of a `Converter`, without one they are counts.
@@ -178,14 +178,14 @@ def make_estimator(
         noise=tactile.noise,
         method=settings.estimator.method,
         free_gain=None if free_gain == "auto" else free_gain,
-        live=alive,
+        active=alive,
         readings=Readings(saturation, threshold, quantum),
         known=uncertainty(settings, calibration),
     )
 
 
 def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertainty:
-    """What the frames don't show, by the settings or by what the calibration measured instead."""
+    """Return the uncertainties that frames don't show, by settings or calibration."""
     tactile = settings.tactile
     baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
     modulus, correlation = settings.material.modulus_error, None

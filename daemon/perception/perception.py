@@ -1,4 +1,4 @@
-"""What the hand feels: each finger's newest frame calibrated and estimated, then filtered.
+"""Perception of each finger: its newest frame calibrated and estimated, then filtered.
 
 `FingerPerception` estimates each frame once; `perception.contact_filter` carries the estimates on
 to the contacts of every tick.
@@ -83,7 +83,7 @@ class Repeats:
 
     @property
     def long(self) -> bool:
-        """They have done so for long enough to be sure."""
+        """True if the frames have repeated for long enough to be sure."""
         return self._judged and self._run >= self._enough
 
     def look(self, data: NDArray[np.uint16]) -> bool:
@@ -146,7 +146,7 @@ class FingerPerception:
         self._tare_left = _TARE_FRAMES
 
     def update(self) -> Frame | None:
-        """The newest frame, estimated, where it is a new one; None where it is not."""
+        """Return the newest frame, estimated, where it is a new one; None where it is not."""
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
@@ -169,7 +169,9 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """The newest frame's data [rows, cols] for subscribers; unit and scale are in ``facts``."""
+        """Return the newest frame's data [rows, cols] for subscribers; unit and scale are in
+        ``facts``.
+        """
         assert self.frame is not None
         assert self._readings is not None
         if not self._as_pressure:

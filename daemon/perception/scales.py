@@ -62,7 +62,7 @@ UNKNOWN = Prior()
 
 
 class Scales(Record):
-    """What is known of both fingers' scales: logarithms of moduli and gains, torques, offsets."""
+    """Scales of both fingers, logarithms of moduli, gains, torques and offsets, with covariance."""
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
@@ -98,7 +98,7 @@ def set_prior(
 
 @inner_kernel
 def begin_grip(s: Scales) -> None:
-    """A new grip: offsets are unknown again, and a little of the rest is forgotten."""
+    """Begin a new grip: offsets are unknown again, and the rest becomes a little less certain."""
     s.gripping = True
     for i in range(STATES):
         for j in range(STATES):

@@ -45,7 +45,7 @@ CURRENT_TIME = 0.1  # s for which that must stand
 
 
 class WitnessState(Record):
-    """What speaks against each finger's witnesses."""
+    """Evidence against each finger's witnesses."""
 
     miss: Pair  # of the newest frame's angle, before it was taken in or refused [rad]
     jumps: Pair  # frames that were refused in a row
@@ -57,7 +57,7 @@ class WitnessState(Record):
 
 @inner_kernel
 def forget(w: WitnessState) -> None:
-    """Nothing is held any more, or something else."""
+    """Forget the evidence: nothing is held any more, or something else."""
     w.miss[:] = 0.0
     w.jumps[:] = 0.0
     w.corrected[:] = 0.0
@@ -67,7 +67,7 @@ def forget(w: WitnessState) -> None:
 
 @inner_kernel
 def refuses(w: WitnessState, finger: int, miss: float, variance: float, speed: float) -> bool:
-    """Whether a frame's angle, ``miss`` [rad] off its prediction, is to be refused.
+    """Return whether a frame's angle, ``miss`` [rad] off its prediction, is to be refused.
 
     ``variance`` [rad²] of that; ``speed`` [rad/s]: of both joints together. The first frame of a
     real turn is refused as well: what the other tip shows is not known yet.
@@ -90,7 +90,7 @@ def refuses(w: WitnessState, finger: int, miss: float, variance: float, speed: f
 
 @inner_kernel
 def begin_holding(w: WitnessState, unexplained: Pair) -> None:
-    """From now on only loads and lies change what is felt."""
+    """Mark the grip as held: from now on only loads and faulty witnesses change what is felt."""
     for k in range(2):
         w.corrected[k] = 0.0
         w.stood[k] = unexplained[k]
@@ -107,9 +107,9 @@ def weigh_drift(
     holding: bool,
     dt: float,
 ) -> float:
-    """What a load is left to explain of a torque [N·m]: less what the joint's closing does.
+    """Return the torque [N·m] that a load remains to explain: less that of the joint's closing.
 
-    ``unexplained``: what the frames leave of the torque; ``moment`` [N·m]: what they explain;
+    ``unexplained``: torque beyond the frames' force; ``moment`` [N·m]: torque of that force;
     ``by_depth`` [N]: the moment's slope by d; ``quiet``: the joint hardly moves. Unless the grip is
     ``holding`` still, only a tip that is pressed more than its frames say is looked for.
     """
@@ -138,7 +138,7 @@ def weigh_drift(
 
 @inner_kernel
 def trusted_current(w: WitnessState, finger: int, current: float, goal: float, dt: float) -> float:
-    """The joint's current [A]: as it was read, or its ``goal`` where it is off that for long.
+    """Return joint's current [A]: as it was read, or its ``goal`` where it is off that for long.
 
     ``goal`` is 0 where no grip says what it should be.
     """

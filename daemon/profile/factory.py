@@ -24,7 +24,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
 def make_tip(settings: Settings) -> Fingertip:
-    """The fingertip. Raises SettingsError for a measured one, which each finger has of its own."""
+    """Make the fingertip. Raises SettingsError for a measured one, which each finger has itself."""
     tip = settings.tip
     if tip.physics == "measured":
         raise SettingsError(
@@ -37,12 +37,12 @@ SHALLOWEST = 0.05  # d over the radius from which a law's misfit of its points i
 
 
 def worst_force_error(material: Material) -> float:
-    """Largest relative error of F by the law's misfit of its points, from SHALLOWEST on."""
+    """Return largest relative error of F by the law's misfit of its points, from SHALLOWEST on."""
     return float(material.force_error(np.linspace(SHALLOWEST, 1.0, 20)).max())
 
 
 def law_problem(material: Material, most: float) -> str:
-    """Why a law that misses its points by more than ``most`` of F can't be used; empty: it can."""
+    """Return why a law off its points by over ``most`` of F can't be used; empty if it can."""
     found = worst_force_error(material)
     if found <= most:
         return ""
@@ -53,7 +53,7 @@ def law_problem(material: Material, most: float) -> str:
 
 
 def make_material(law: MaterialSettings) -> Material:
-    """The settings' stress-strain law. Raises SettingsError for points that are no usable law."""
+    """Make the settings' stress-strain law. Raises SettingsError for points of no usable law."""
     if law.law == "constant":
         return Material.constant(law.modulus)
     if law.law == "table_i":
@@ -71,7 +71,7 @@ def make_table(
     on_event: Callable[[str, str, str], None] | None = None,
     tip: Fingertip | None = None,
 ) -> ContactTable:
-    """The contact table, from its file in ``cache`` where one fits; ``tip``: not the settings'.
+    """Return contact table, from its file in ``cache`` where one fits; ``tip``: not the settings'.
 
     ``on_event`` takes a warning where that file can't be used. Raises SettingsError when no table
     of this material reaches the tolerance.
@@ -101,7 +101,7 @@ def make_grid(
     centre: tuple[float, float] | None = None,
     rotation: float | None = None,
 ) -> SensorGrid:
-    """The sensor's cells under one finger; ``centre`` [m] and ``rotation`` [rad] where measured."""
+    """Make the sensor's cells under one finger; ``centre`` [m], ``rotation`` [rad] if measured."""
     tactile = settings.tactile
     return SensorGrid(
         rows=tactile.rows,
@@ -114,7 +114,7 @@ def make_grid(
 
 
 def table_file(folder: Path, tip: Fingertip, material: Material, tolerance: float) -> Path:
-    """Where in ``folder`` the table of this tip, material, tolerance and version is kept."""
+    """Return where in ``folder`` the table of this tip, material, tolerance and version is kept."""
     return folder / f"contact-{table_key(tip, material, tolerance).hex()[:16]}.table"
 
 
@@ -139,7 +139,7 @@ def load_or_build(
     tolerance: float,
     warn: Callable[[str], None],
 ) -> ContactTable:
-    """The table kept in ``folder``, or built and kept there.
+    """Return the table kept in ``folder``, or built and kept there.
 
     ``warn`` takes what is wrong with a file or the folder. Raises TableError when the tolerance
     can't be met.

@@ -48,7 +48,7 @@ def checked(
     changed: Collection[str] = (),
     directory: Path | None = None,
 ) -> Settings:
-    """The settings that sections ``data`` of a profile ``name`` make, otherwise as `load`."""
+    """Return settings that sections ``data`` of a profile ``name`` make, otherwise as `load`."""
     wrong: list[str] = []
     found: list[str] = []
     try:
@@ -70,12 +70,12 @@ def checked(
 
 
 def names() -> list[str]:
-    """The profiles that come with the package."""
+    """Return the profiles that come with the package."""
     return sorted(path.stem for path in _PROFILES.glob("*.toml"))
 
 
 def find(path: Path) -> Path:
-    """The file of a profile: of a bare name the package's, else the path as it is.
+    """Return the file of a profile: of a bare name the package's, else the path as it is.
 
     Raises SettingsError for a bare name that neither is one of `names` nor a file here.
     """
@@ -137,7 +137,7 @@ def _tuples(value: Any, depth: int = 0) -> Any:
 
 
 def _sound_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
-    """Settings of the sections without errors, and the names of the others."""
+    """Return the settings of the sections without errors, and the names of the others."""
     sound: dict[str, Any] = {}
     wrong = []
     for name, field in Settings.model_fields.items():
@@ -149,7 +149,7 @@ def _sound_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
 
 
 def _plugin_problems(settings: Settings) -> Iterator[str]:
-    """What is wrong with the tables of plugins."""
+    """Yield the errors in the tables of plugins."""
     tables = settings.plugins.tables
     for each in (
         backend("servos", settings.servos.backend),

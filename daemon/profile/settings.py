@@ -69,7 +69,7 @@ Model = Annotated[str, AfterValidator(_servo_model)]
 
 
 class Section(BaseModel):
-    """What all sections share: unknown keys are errors, values are not converted, nothing changes.
+    """Base of all sections: unknown keys are errors, values are not converted, nothing changes.
 
     A whole number is accepted where a float is asked for; a string never is.
     """
@@ -78,7 +78,7 @@ class Section(BaseModel):
 
 
 class SceneSettings(Section):
-    """What takes part. A backend set to ``none`` takes the servos or the sensors out."""
+    """Parts that take part. A backend set to ``none`` takes the servos or the sensors out."""
 
     # one or two
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, max_length=2)] = ("left", "right")
@@ -179,7 +179,7 @@ class TactileSettings(Section):
 
 
 class EstimatorSettings(Section):
-    """How d and θ come from a frame.
+    """Estimation of d and θ from a frame.
 
     ``auto`` frees the gain of springs, and takes a solid tip's for known: its frames tell d by the
     force alone.
@@ -238,7 +238,7 @@ class CommandSettings(Section):
 
 
 class AccessSettings(Section):
-    """Who may subscribe and command. Addresses off this machine need keys."""
+    """Access to stream and commands. Addresses off this machine need keys."""
 
     keys: str = ""  # folder that `softfinger keys` made: both sockets take only its clients
     ipc_mode: Literal["0600", "0660", "0666"] = "0600"  # rights of an ipc address's file
@@ -308,7 +308,7 @@ class SafetySettings(Section):
 
 
 class ObjectSettings(Section):
-    """What the daemon assumes of the object."""
+    """Assumptions on the object."""
 
     width: Length = 0.040  # m between its faces
     taper: Annotated[float, Field(ge=-1.5, le=1.5)] = (
@@ -363,7 +363,7 @@ class SimulationSettings(Section):
 
 
 class TaskSettings(Section):
-    """What the daemon does by itself after start."""
+    """Task that the daemon does by itself after start."""
 
     name: Literal["none", "demo"] = "none"  # what the hand does by itself
     force: Positive = 8.0  # N, the tips' mean

@@ -22,7 +22,7 @@ _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})
 
 
 def problems(settings: Settings, wrong: Collection[str] = ()) -> list[str]:
-    """What does not fit together. ``wrong``: sections that must not be looked at."""
+    """Return the settings that contradict each other, sections named ``wrong`` aside."""
     return [
         problem
         for sections, check in _CHECKS
@@ -32,7 +32,7 @@ def problems(settings: Settings, wrong: Collection[str] = ()) -> list[str]:
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in TOML, short enough for a line and without control characters."""
+    """Return value as it stands in TOML, short enough for a line and without control characters."""
     if isinstance(value, tuple):
         text = "[" + ", ".join(shown(item) for item in value[:20]) + "]"
     elif isinstance(value, dict):
@@ -248,7 +248,7 @@ def _forces(settings: Settings) -> Iterator[str]:
 
 
 def address_problem(address: str, lacking: str) -> str:
-    """Why no socket may be bound to ``address``; empty where one may.
+    """Return why no socket may be bound to ``address``; empty where one may.
 
     Without keys only this machine's addresses may be bound; ``lacking`` says where keys would be
     named, and is empty where they are.

@@ -1,4 +1,4 @@
-"""Whether a joint's angle agrees with its velocity, and is no faster than a joint can be.
+"""Check of a joint's angle against its velocity and against the speed that a joint can have.
 
 An encoder whose zero jumps, that stands still while the joint turns or drifts while it rests, gives
 angles that contradict the velocity beside them.

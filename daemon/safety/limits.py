@@ -37,7 +37,7 @@ _DEAF = 0.3  # s
 
 
 class View:
-    """What the limits look at beside the state: the scene, and what a few of them remember."""
+    """Scene that the limits judge the state by, and the memory of a few of them."""
 
     def __init__(
         self,
@@ -86,12 +86,12 @@ class View:
             self.rise_t = math.inf
 
     def touched(self, state: State) -> bool:
-        """Both tips soundly touch an object of known angle and width."""
+        """Return whether both tips validly touch an object of known angle and width."""
         left, right = state.contacts
         return state.object.valid and _touches(left) and _touches(right)
 
     def holds(self, state: State) -> bool:
-        """They do so in a grip that has settled."""
+        """Return whether they do so in a grip that has settled."""
         return state.mode in HELD and self.touched(state)
 
 
@@ -434,7 +434,7 @@ def _tactile_silent(view: View, state: State, _: float) -> str:
 
 
 def _doubt(view: View, finger: int) -> str:
-    """Why a sensor's frames are refused, or an empty text."""
+    """Return why a sensor's frames are refused, or an empty text."""
     side, found = FINGERS[finger], view.grasp.witnesses
     if found.jumps[finger] > witnesses.JUMPS_MAX:
         jumped = math.degrees(abs(found.miss[finger]))

@@ -143,7 +143,7 @@ class Safety:
         return None
 
     def cause(self, state: State, gripping: bool = False) -> str:
-        """The first fault that stands in this state, or an empty text: what refuses a command.
+        """Return the first fault in this state, or an empty text: what refuses a command.
 
         With ``gripping`` the limits of a grip are judged, whatever the mode. Nothing is changed.
         """
@@ -158,7 +158,7 @@ class Safety:
         return ""
 
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
-        """The hand shall open before this fault takes its torque."""
+        """Return whether the hand opens before this fault takes its torque."""
         wanted = self._limits.frame_age_action == "open"
         return wanted and breach.name == "tactile.silent" and mode in GRIPPING
 

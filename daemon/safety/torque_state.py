@@ -55,14 +55,11 @@ class TorqueState:
 
     @property
     def pending(self) -> bool:
-        """Whether torque off is wanted and not confirmed."""
+        """True while torque off is requested and not confirmed."""
         return self._tried_since < math.inf
 
     def read(self, reading: Reading) -> None:
-        """As `Servos.read`; while torque off is pending it is asked for on the way.
-
-        Raises ServoError as that does.
-        """
+        """Read the servos; request a pending torque off on the way. Raises ServoError."""
         state, servos = self._state, self.servos
         state.torque_off = False
         if servos is None:
@@ -161,7 +158,7 @@ class TorqueState:
             )
 
     def _is_silent(self) -> bool:
-        """Whether nothing may be sent at this tick, so that the servos' watchdogs act."""
+        """Return whether nothing may be sent at this tick, so that the servos' watchdogs act."""
         t = self._state.t
         if t < self._silent_until:
             return True

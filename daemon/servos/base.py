@@ -1,4 +1,4 @@
-"""What every servo backend offers the loop and reports, and the one that settings name."""
+"""Interface of every servo backend to the loop, and the backend that the settings name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was found in one part of the hand or of the machine, and how to put it right.
+    """Result of a check of one device or of the machine, and how to fix it.
 
     ``FAIL`` keeps the daemon from working, ``warn`` makes it work worse, the others are well.
     """
@@ -64,7 +64,7 @@ class Servos(Protocol):
         """
 
     def torque_on(self) -> None:
-        """Torque on, verified; the goal is set to the present angle first.
+        """Switch torque on and verify it; the goal is set to the present angle first.
 
         Raises ServoError when it could not be done or not be verified: it may be on then.
         """
@@ -80,10 +80,10 @@ class Servos(Protocol):
         """Send the goal angle and the current bound of each joint."""
 
     def counters(self) -> dict[str, int]:
-        """Exchanges that went wrong since connect, by kind: ``timeouts``, ``crc``, …"""
+        """Return exchanges that went wrong since connect, by kind: ``timeouts``, ``crc``, …"""
 
     def close(self) -> None:
-        """Torque off as far as the bus allows, then close. Never raises."""
+        """Switch torque off as far as the bus allows, then close. Never raises."""
 
 
 class JointPlant(Protocol):
@@ -105,7 +105,7 @@ class JointPlant(Protocol):
         """True motor currents [A]."""
 
     def measured_current(self, joint: int) -> float:
-        """The motor current [A] of a joint as its servo measures it."""
+        """Return the motor current [A] of a joint as its servo measures it."""
 
     def advance(self, t: float) -> None:
         """Advance to time t [s]; a time that is past does nothing."""
@@ -113,7 +113,7 @@ class JointPlant(Protocol):
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
-        """Command of a joint's servo from now on.
+        """Command a joint's servo from now on.
 
         ``mode`` is 5 (current-based position: ``goal_current`` bounds the magnitude), 3 (position:
         likewise, with the model's own limit) or 0 (current: ``goal_current`` is signed).

@@ -37,11 +37,11 @@ class Registers(bytes):
     """A servo's registers from address 0 on; empty when they could not be read."""
 
     def word(self, address: int) -> int:
-        """A register of two bytes."""
+        """Return a register of two bytes."""
         return int.from_bytes(self[address : address + 2], "little")
 
     def long(self, address: int) -> int:
-        """A register of four bytes, signed."""
+        """Return a register of four bytes, signed."""
         return int.from_bytes(self[address : address + 4], "little", signed=True)
 
 
@@ -59,7 +59,7 @@ class Examined:
 
     @property
     def name(self) -> str:
-        """How reports call it."""
+        """Name in reports."""
         return servo_name(self.id, self.finger)
 
 
@@ -91,7 +91,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
 
 
 def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
-    """What is wrong with running this model in an operating mode; None when it can."""
+    """Return why this model can't run in an operating mode; None when it can."""
     if mode in model.modes:
         return None
     problem = f"an {model.name} has no {reg.MODE_NAMES[mode]} mode"
@@ -103,7 +103,7 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
 def check_servo(
     name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
 ) -> list[Finding]:
-    """What keeps a servo from being used.
+    """Return the findings that keep a servo from being used.
 
     Args:
         name: how reports call it.
@@ -179,7 +179,7 @@ def check_servo(
 def notice_servo(
     name: str, model: ServoModel, table: Registers, settings: Settings
 ) -> list[Finding]:
-    """What is worth knowing of a servo that can be used."""
+    """Return the findings on a servo that can be used."""
     servos, firmware = settings.servos, table[reg.FIRMWARE_VERSION]
     if table.word(reg.MODEL_NUMBER) != model.number:
         return []
@@ -212,7 +212,7 @@ def notice_servo(
 
 
 def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Finding | None:
-    """What is wrong with a joint's angle [rad]; None when it lies near the hand's limits.
+    """Return what is wrong with a joint's angle [rad]; None when it lies near the hand's limits.
 
     Torque on would swing such a joint back at once.
     """
@@ -225,7 +225,7 @@ def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Fin
 
 
 def latency_of(path: str) -> tuple[float, list[Finding]]:
-    """A USB adapter's latency timer [s], 0 without one; and what is wrong with it."""
+    """Return a USB adapter's latency timer [s], 0 without one; and what is wrong with it."""
     place = latency_file(path)
     try:
         milliseconds = 0 if place is None else int(place.read_text())

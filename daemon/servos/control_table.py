@@ -114,7 +114,7 @@ HARDWARE_ERRORS: Final = {
 
 
 def hardware_error_names(status: int) -> str:
-    """What the bits of the hardware error register mean, joined by commas."""
+    """Return the meanings of the hardware error register's bits, joined by commas."""
     names = [name for bit, name in HARDWARE_ERRORS.items() if status >> bit & 1]
     return ", ".join(names) or f"unknown error bits 0x{status:02X}"
 
@@ -153,7 +153,7 @@ class ServoModel:
 
     @property
     def senses_current(self) -> bool:
-        """Whether the model measures and bounds motor current."""
+        """True if the model measures and bounds motor current."""
         return self.current_unit > 0.0
 
     @property
@@ -177,12 +177,12 @@ class ServoModel:
         return (self.voltage_min + self.voltage_max) / 2.0 * VOLTAGE_UNIT
 
     def settled_temperature(self, current: float) -> float:
-        """°C that a simulated motor reaches in the long run with this current [A] through it."""
+        """Return the temperature [°C] that a simulated motor settles at with this current [A]."""
         share = current / self.stall_current
         return AMBIENT + _THERMAL_RISE * share * share
 
     def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
-        """(first address register, first data register, entries) of each indirect block."""
+        """Return (first address register, first data register, entries) of each indirect block."""
         if not self.small:
             return ((INDIRECT_ADDRESS, 224, 28), (578, 634, 28))
         if firmware <= 52:
@@ -190,11 +190,11 @@ class ServoModel:
         return ((INDIRECT_ADDRESS, 224, 28),)
 
     def fast_read(self, firmware: int) -> bool:
-        """Whether this firmware answers fast sync read and fast bulk read."""
+        """Return whether this firmware answers fast sync read and fast bulk read."""
         return firmware >= self.fast_read_firmware
 
     def highest_address(self, firmware: int) -> int:
-        """The last address of the control table."""
+        """Return the last address of the control table."""
         return max(data + entries for _, data, entries in self.indirect_blocks(firmware)) - 1
 
 
@@ -224,7 +224,7 @@ MODELS: Final = {row[0]: ServoModel(*row) for row in _MODELS}
 
 
 def by_name(name: str) -> ServoModel:
-    """The model of that name; a connector suffix (``-T``, ``-R``) is not needed.
+    """Return the model of that name; a connector suffix (``-T``, ``-R``) is not needed.
 
     Raises:
         KeyError: no such model; the message names the known ones.
@@ -237,6 +237,6 @@ def by_name(name: str) -> ServoModel:
 
 
 def name_of(number: int) -> str:
-    """The name of the model that answers a ping with ``number``; the number if it is unknown."""
+    """Return the name of the model with this ``number`` in its ping; the number if unknown."""
     names = [model.name for model in MODELS.values() if model.number == number]
     return names[0] if names else f"model number {number}"

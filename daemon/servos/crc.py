@@ -35,7 +35,7 @@ _WORDS = [struct.Struct(f">{count >> 1}H").unpack_from for count in range(_LONGE
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """CRC-16 (polynomial 0x8005, initial 0) that ends every packet."""
+    """Return CRC-16 (polynomial 0x8005, initial 0) that ends every packet."""
     table = _WORD
     count = len(data)
     if count > _LONGEST:

@@ -123,7 +123,7 @@ class DynamixelServos:
         self._line, self._torque = line, torque
 
     def _check(self, line: ServoLine, model: ServoModel) -> bool:
-        """Whether all servos answer fast sync reads; sets the joints' own limits."""
+        """Return whether all servos answer fast sync reads; sets the joints' own limits."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
         try:
@@ -230,7 +230,7 @@ class DynamixelServos:
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Whether each servo's own clock advances, and whether it holds a goal that was sent."""
+        """Check that each servo's own clock advances, and that it holds a goal that was sent."""
         start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
@@ -301,7 +301,7 @@ class DynamixelServos:
     # --- the end ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Exchanges that went wrong since connect, by kind."""
+        """Return exchanges that went wrong since connect, by kind."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,
@@ -315,7 +315,7 @@ class DynamixelServos:
         }
 
     def close(self) -> None:
-        """Torque off and verified as far as the bus allows, then close. Never raises.
+        """Switch torque off and verify it as far as the bus allows, then close. Never raises.
 
         A servo whose torque another program switched on is left as it was found.
         """

@@ -25,14 +25,14 @@ GOAL_SIZE: Final = {
 
 
 def servo_name(servo_id: int, finger: int) -> str:
-    """``servo 1 (left)``, as reports call it."""
+    """Return ``servo 1 (left)``, as reports call it."""
     return f"servo {servo_id} ({FINGERS[finger]})"
 
 
 def current_toward(
     servos: ServoSettings, goal_q: float, bound: float, q: float, dq: float
 ) -> float:
-    """Current [A], positive closing, that draws a joint to its goal: current mode's position loop.
+    """Return the current [A], positive closing, of current mode's position loop.
 
     stiffness · (goal_q − q) − damping · dq, within ± ``bound``.
     """
@@ -43,7 +43,7 @@ def current_toward(
 
 @dataclass(frozen=True, slots=True)
 class JointScale:
-    """How one joint's counts map to rad, rad/s and A.
+    """Conversion of one joint's counts to rad, rad/s and A.
 
     q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and likewise for velocity. Currents
     keep the motor's own ampere; only the sign follows the joint, so that positive closes.
@@ -57,7 +57,7 @@ class JointScale:
 
     @classmethod
     def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """The scale of joint 0 (left) or 1 (right) under the settings.
+        """Return the scale of joint 0 (left) or 1 (right) under the settings.
 
         Raises:
             KeyError: the settings name a model that is not in the table.
@@ -72,32 +72,32 @@ class JointScale:
         )
 
     def angle(self, counts: float) -> float:
-        """Joint angle [rad] of a position in counts."""
+        """Return joint angle [rad] of a position in counts."""
         return self.direction * (counts - self.zero) * self.radian
 
     def rate(self, counts: float) -> float:
-        """Joint velocity [rad/s] of a velocity in counts."""
+        """Return joint velocity [rad/s] of a velocity in counts."""
         return self.direction * counts * self.velocity
 
     def amperes(self, counts: float) -> float:
-        """Motor current [A], positive closing, of a signed current in counts."""
+        """Return motor current [A], positive closing, of a signed current in counts."""
         return self.direction * counts * self.current_unit
 
     def position_counts(self, q: float) -> int:
-        """Position in counts nearest to the joint angle q [rad], kept inside what a goal takes."""
+        """Return the count nearest to the joint angle q [rad] within a goal's range."""
         counts = self.zero + self.direction * q / self.radian
         return round(min(max(counts, -_GOAL_LIMIT), _GOAL_LIMIT))
 
     def velocity_counts(self, dq: float) -> int:
-        """Velocity in counts nearest to dq [rad/s]."""
+        """Return velocity in counts nearest to dq [rad/s]."""
         return round(self.direction * dq / self.velocity)
 
     def current_counts(self, current: float) -> int:
-        """Signed current in counts nearest to a motor current [A] that is positive closing."""
+        """Return the signed current in counts nearest to a motor current [A], positive closing."""
         return round(self.direction * current / self.current_unit) if self.current_unit else 0
 
     def bound_counts(self, current: float) -> int:
-        """Counts of a bound on the current's magnitude [A], rounded down so that it stays one."""
+        """Return the counts of a bound on the current's magnitude [A], rounded down."""
         return int(abs(current) / self.current_unit + 1e-9) if self.current_unit else 0
 
 
@@ -118,11 +118,11 @@ class Joint:
 
     @property
     def name(self) -> str:
-        """How reports call its servo."""
+        """Name of its servo in reports."""
         return servo_name(self.id, self.finger)
 
     def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
-        """A goal [rad, A] as the registers of this mode hold it."""
+        """Return a goal [rad, A] as the registers of this mode hold it."""
         scale = self.scale
         if mode == reg.POSITION_MODE:
             low, high = self.ends
@@ -135,7 +135,7 @@ class Joint:
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:
-    """A goal in counts as the registers of this mode hold it."""
+    """Return a goal in counts as the registers of this mode hold it."""
     if mode == reg.POSITION_MODE:
         return _POSITION.pack(position)
     if mode == reg.CURRENT_MODE:
@@ -144,7 +144,7 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """The goal that a servo holds; ``table`` has its registers from ``start`` on."""
+    """Return the goal that a servo holds; ``table`` has its registers from ``start`` on."""
     current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
     position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:

@@ -27,7 +27,7 @@ _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Where the kernel keeps a USB adapter's latency timer [ms]; None where it has none."""
+    """Return where the kernel keeps a USB adapter's latency timer [ms]; None where it has none."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
@@ -133,7 +133,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
 
 
 def bring_it(path: str) -> str:
-    """What brings a port that is not there: outside /dev it is an emulated hand's."""
+    """Return advice for a port that does not exist: outside /dev it is an emulated hand's."""
     return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
 
 

@@ -56,7 +56,7 @@ _ERROR = 0x7F  # of a servo's error byte; the bit above is the alert
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A whole packet: stuffed, and closed with the CRC."""
+    """Return a whole packet: stuffed, and closed with the CRC."""
     body = bytes((instruction,)) + parameters
     if _HEADER in body:
         body = body.replace(_HEADER, _STUFFED)
@@ -77,11 +77,11 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
     @property
     def damaged(self) -> int:
-        """How often bytes came that were no whole reply."""
+        """Number of times that bytes came that were no whole reply."""
         return self.crc_errors + self.torn + self.skipped_bytes
 
     def updateCRC(self, crc_accum: int, data_blk_ptr: Sequence[int], data_blk_size: int) -> int:
-        """The SDK's name for :func:`crc16`."""
+        """Compute :func:`crc16` under the SDK's name."""
         return crc16(bytes(data_blk_ptr[:data_blk_size]), crc_accum)
 
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
@@ -116,7 +116,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 return [0] * length, result, packet[8]
 
     def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
-        """The next status packet, unstuffed, and the result code.
+        """Return the next status packet, unstuffed, and the result code.
 
         A fast reply is not stuffed and comes from the broadcast ID. A damaged packet ends the
         wait at once: what was lost does not come again.
@@ -271,7 +271,7 @@ class ServoLine:
         self.handler = handler or PacketHandler()
 
     def ping(self, servo_id: int, tries: int = TRIES) -> int | None:
-        """The servo's model number, None when it does not answer."""
+        """Return the servo's model number, None when it does not answer."""
         for _ in range(tries):
             number, result, _ = self.handler.ping(self.port, servo_id)
             if result == COMM_SUCCESS:
@@ -279,7 +279,7 @@ class ServoLine:
         return None
 
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
-        """(model number, firmware) of every servo that answers a broadcast ping within ``wait`` s.
+        """Return (model number, firmware) of each servo that answers a ping within ``wait`` [s].
 
         Servos answer one after the other in the order of their IDs; 253 of them need 0.8 s.
         """
@@ -294,7 +294,7 @@ class ServoLine:
         return found
 
     def read(self, servo_id: int, address: int, length: int) -> bytes | None:
-        """A span of registers, None when no sound answer came."""
+        """Return a span of registers, None when no sound answer came."""
         for _ in range(TRIES):
             data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
             if result == COMM_SUCCESS:
@@ -326,7 +326,7 @@ class ServoLine:
 def open_line(
     path: str, baud: int, reply_timeout: float = UNHURRIED, low_latency: bool = True
 ) -> Iterator[ServoLine]:
-    """A line on a port of its own, closed at the end. Raises ServoError when it can't be opened."""
+    """Yield a line on its own port, closed at the end. Raises ServoError if it can't be opened."""
     port = SerialPort(path, baud, reply_timeout, low_latency)
     port.openPort()
     try:

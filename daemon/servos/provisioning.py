@@ -82,7 +82,7 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Every servo on the port, at each of the rates, ``wait`` s for each; changes nothing.
+    """Search the port for servos at each of the rates, ``wait`` s for each; changes nothing.
 
     Rates that the adapter has not are skipped. Where damaged bytes came, ``ids`` are asked one by
     one.
@@ -111,7 +111,7 @@ def search(
 
 
 def is_garbled(line: ServoLine, servo_id: int) -> bool:
-    """Whether several servos answer to this ID at once, as far as their registers differ.
+    """Return whether several servos answer to this ID at once, as far as their registers differ.
 
     Supply voltage, position and running time do, a reply of a ping does not.
     """
@@ -140,7 +140,7 @@ class Change:
 
     @property
     def name(self) -> str:
-        """How reports call it afterwards."""
+        """Name in reports afterwards."""
         return servo_name(self.id, self.finger)
 
     def __str__(self) -> str:
@@ -162,7 +162,7 @@ class Plan:
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Which servo is which, of those found at ``rates``.
+    """Assign the servos found at ``rates`` to the joints.
 
     A servo of the settings' model that has a missing servo's ID, at another rate, is that servo.
     Failing that, a single servo that is no finger's is the single missing one. Whatever is garbled
@@ -249,7 +249,7 @@ def provision(settings: Settings, search_time: float = SEARCH_TIME) -> list[Find
 
 
 def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
-    """Why servos that are still missing are not known."""
+    """Return why servos that are still missing are not known."""
     if found.garbled:
         return [Finding("warn", "servos", str(each), ALONE) for each in found.garbled]
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
@@ -296,7 +296,7 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
 def _set_up(
     line: ServoLine, servo_id: int, name: str, mode: int | None, result: list[Finding]
 ) -> None:
-    """Everything but ID and rate."""
+    """Write all settings but ID and rate."""
 
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))

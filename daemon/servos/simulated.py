@@ -22,7 +22,7 @@ class HandPlant(JointPlant, Protocol):
     """The joints of the simulated hand, which knows of the servos' watchdog."""
 
     def hold_torque_until(self, t: float) -> None:
-        """Torque ends by itself at time t [s]."""
+        """Hold torque until time t [s], when it ends by itself."""
 
 
 class SimulatedServos:
@@ -95,7 +95,7 @@ class SimulatedServos:
             reading.voltage[joint] = self._model.supply
 
     def torque_on(self) -> None:
-        """Torque on, with the goal at the present count and no current until a goal is written."""
+        """Switch torque on, the goal at the present count, no current until a goal is written."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -106,7 +106,7 @@ class SimulatedServos:
         self._switch(True)
 
     def torque_off(self, reading: Reading) -> bool:
-        """Torque off, which is certain here, and a reading."""
+        """Switch torque off, which is certain here, and return a reading."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -139,11 +139,11 @@ class SimulatedServos:
         self._drive()
 
     def counters(self) -> dict[str, int]:
-        """``timeouts`` and ``crc`` stay 0; ``watchdog`` counts how often torque went off by it."""
+        """Return ``timeouts`` and ``crc``, always 0, and ``watchdog``: its torque stops."""
         return {"timeouts": 0, "crc": 0, "watchdog": self._trips}
 
     def close(self) -> None:
-        """Torque off."""
+        """Switch torque off."""
         if self._connected:
             self._exchange()
             self._switch(False)

@@ -62,7 +62,7 @@ class Torque:
     # --- on and off ------------------------------------------------------------------------------
 
     def on(self) -> None:
-        """Torque on at the present angle, with no current yet.
+        """Switch torque on at the present angle, with no current yet.
 
         Raises:
             ServoError: it could not be done or not be verified, and may be on.
@@ -105,7 +105,7 @@ class Torque:
                 group.send([b"\x00"] * len(group.ids))
 
     def confirmed_off(self) -> None:
-        """The servos have confirmed that torque is off: their watchdogs have nothing to stop."""
+        """Note that the servos have confirmed torque off: their watchdogs have nothing to stop."""
         if self.may_be_on:
             self._watchdog_off.send([b"\x00"] * len(self._joints))
         self.may_be_on = False
@@ -165,8 +165,9 @@ class Torque:
     # --- while it is on --------------------------------------------------------------------------
 
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
-        """Whether a servo holds a goal that was sent lately; ``table`` has its registers from
-        ``start`` on. True while torque was not switched on here.
+        """Return whether a servo holds a goal sent lately, or torque was not switched on here.
+
+        ``table`` has its registers from ``start`` on.
 
         Raises:
             ServoError: its bus watchdog has stopped it, or is no longer armed.

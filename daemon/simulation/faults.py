@@ -54,19 +54,19 @@ class FaultSource:
 
     @property
     def active(self) -> bool:
-        """Whether anything may happen to replies."""
+        """True if replies may be lost or damaged."""
         rates = self.rates
         return bool(rates.drop or rates.late or rates.truncate or rates.corrupt or rates.duplicate)
 
     def loses(self, reads: bool) -> bool:
-        """Whether the next instruction reaches no servo; ``reads``: it asks for a reading."""
+        """Draw whether the next instruction reaches no servo; ``reads``: it asks for a reading."""
         rates = self.rates
         if rates.lose and self._random.random() < rates.lose:
             return True
         return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
-        """What comes of a reply: (extra delay [s], bytes), none when it was dropped."""
+        """Return (extra delay [s], bytes) of a spoilt reply, none when it was dropped."""
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
@@ -87,7 +87,7 @@ class FaultError(SoftfingerError, ValueError):
 
 
 class FaultEvent(NamedTuple):
-    """What happens to one part of the hand."""
+    """Fault or load of one device or object at an instant."""
 
     after: float  # s
     part: str  # ``servos``, ``object``, or a finger: its board, or what it measures
@@ -105,7 +105,7 @@ class _Form(NamedTuple):
     sided: bool = False  # a finger may be named
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
-        """Whether a word may be of this form."""
+        """Return whether a word may be of this form."""
         optional = self.value.startswith("[")
         return (
             kind in self.kinds
@@ -114,7 +114,7 @@ class _Form(NamedTuple):
         )
 
     def bounds(self, kind: str) -> tuple[float, float]:
-        """Least and greatest value."""
+        """Return the least and the greatest value."""
         if kind in MEASUREMENT_FAULTS:
             return MEASUREMENT_FAULTS[kind][1:]
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
@@ -135,7 +135,7 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
-    """Faults from words of text, in time's order, and as they were given where they start at once.
+    """Parse faults from words of text, in time's order, then in the given one.
 
     - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` for both
       boards, with ``left:`` or ``right:`` before it for one; see :class:`TactileBoard`.

@@ -54,7 +54,7 @@ class _Ramp:
 
 
 class MeasurementFaults:
-    """Those of one finger: its tactile sensor, and the present current of its servo."""
+    """Faults of one finger's tactile sensor and of its servo's present current."""
 
     def __init__(self) -> None:
         self._ramps: dict[str, _Ramp] = {}
@@ -93,7 +93,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """What shifts ``count`` values by so many places, between them linearly: [count, count]."""
+    """Return the matrix [count, count] that shifts ``count`` values by so many cells, linearly."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

@@ -17,10 +17,10 @@ class TactileSensor(Protocol):
         """Open the sensor and wait for a first good frame. Raises TactileError if none comes."""
 
     def latest(self) -> Frame | None:
-        """The newest complete frame, None before the first; the same object until a newer one."""
+        """Return the newest complete frame, the same object until a newer one; None before any."""
 
     def counters(self) -> dict[str, int]:
-        """What went by or went wrong since open: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
+        """Return counts since open: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
 
     def close(self) -> None:
         """Stop reading and close. Never raises."""

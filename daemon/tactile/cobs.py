@@ -56,7 +56,7 @@ _BLOCK = 254  # bytes that a COBS code can announce
 
 
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
-    """One frame on the wire: counts [rows, cols], its number, the board's time ``t`` [s].
+    """Encode one frame for the wire: counts [rows, cols], its number, the board's time ``t`` [s].
 
     The reference for firmware. Raises ValueError for other types of counts.
     """
@@ -76,7 +76,7 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
 
 
 def longest_frame(rows: int, cols: int) -> int:
-    """Bytes on the wire of a uint16 frame at most, with the delimiter."""
+    """Return the most bytes of a uint16 frame on the wire, with the delimiter."""
     message = _HEADER.size + 2 * rows * cols + _CRC.size
     return message + 1 + message // _BLOCK + 1
 
@@ -110,7 +110,7 @@ _CRCS = np.array(
 
 @kernel
 def crc16(message: NDArray[np.uint8], size: int) -> int:
-    """The CRC of the first ``size`` bytes, 16 at a time: `binascii.crc_hqx` takes five times it."""
+    """Return the CRC of the first ``size`` bytes, 16 at a time: five times as fast as `crc_hqx`."""
     crc = np.uint16(_CRC_START)
     whole = size - size % 16
     for k in range(0, whole, 16):
@@ -138,7 +138,7 @@ class CobsDecoder(DelimitedDecoder):
         self._wraps = 0  # of the board's clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """As :meth:`DelimitedDecoder.parse`, with the board's own number and time."""
+        """Parse as :meth:`DelimitedDecoder.parse` does, with the board's own number and time."""
         if len(packet) >= self.longest:
             self._reason = f"packets of {len(packet)} bytes"
             return None
@@ -173,7 +173,7 @@ class CobsDecoder(DelimitedDecoder):
         return Decoded(counts.reshape(rows, cols), t, steps, t_sensor)
 
     def counters(self) -> dict[str, int]:
-        """Besides the usual ones ``bad_crc``, and ``missed``: frames that never came."""
+        """Return the usual counters, ``bad_crc``, and ``missed``: frames that never came."""
         return {**super().counters(), "bad_crc": self._bad_crc, "missed": self._missed}
 
 

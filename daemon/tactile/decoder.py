@@ -1,4 +1,4 @@
-"""From a serial board's bytes to frames: the interface of every framing and what framings share.
+"""Decoders from a serial board's bytes to frames: the interface of framings and their common code.
 
 A decoder is pure and incremental: no port, no clock, no thread.
 """
@@ -49,15 +49,15 @@ class Decoder(ABC):
 
     @abstractmethod
     def diagnosis(self) -> str:
-        """What is wrong with a stream that gives no frames, in one line."""
+        """Return what is wrong with a stream that gives no frames, in one line."""
 
     @property
     def pending(self) -> bool:
-        """Whether ``settle`` may yield a frame: a whole one waits for the bytes after it."""
+        """True if ``settle`` may yield a frame: a whole one waits for the bytes after it."""
         return False
 
     def settle(self) -> Decoded | None:
-        """The pending frame, once the line has been quiet since the last byte."""
+        """Return the pending frame, once the line has been quiet since the last byte."""
         return None
 
     @property
@@ -73,7 +73,7 @@ class Decoder(ABC):
         return behind > _LOST_AFTER * self.frame_bytes
 
     def counters(self) -> dict[str, int]:
-        """``frames``, ``resyncs`` (losses of the frames' place), ``skipped_bytes``; and others."""
+        """Return ``frames``, ``resyncs`` (lost synchronisations), ``skipped_bytes``, and others."""
         return {
             "frames": self._frames,
             "resyncs": self._resyncs,
@@ -101,7 +101,7 @@ class DelimitedDecoder(Decoder):
 
     @abstractmethod
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """The frame of a packet without its delimiter; None, with ``_reason`` set, if it is none.
+        """Return the frame of a packet without its delimiter; None, with ``_reason`` set, if none.
 
         ``t`` [s] is when its last byte was read.
         """

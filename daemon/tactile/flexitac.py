@@ -67,7 +67,7 @@ class FlexiTacDecoder(Decoder):
         return newest
 
     def settle(self) -> Decoded | None:
-        """As :meth:`Decoder.settle`; None while the counts could hide a marker."""
+        """Settle as :meth:`Decoder.settle` does; None while the counts could hide a marker."""
         return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
@@ -94,7 +94,7 @@ class FlexiTacDecoder(Decoder):
         return spacing - len(MARKER) if spacing not in (0, self.frame_bytes) else 0
 
     def counters(self) -> dict[str, int]:
-        """Besides the usual ones ``ambiguous``: searches that no place of the marker decided."""
+        """Return the usual counters and ``ambiguous``: searches that found no certain marker."""
         return {**super().counters(), "ambiguous": self._ambiguous}
 
     def diagnosis(self) -> str:
@@ -136,7 +136,7 @@ class FlexiTacDecoder(Decoder):
             self._skip(stride)
 
     def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
-        """Is the marker at the buffer's start the frames', and no other ``AA 55`` as good?
+        """Decide if the marker at the buffer's start is the frames', and no other as good.
 
         Level by level, one frame further each, so that the answer depends on the stream alone and
         not on how it was cut into pieces.

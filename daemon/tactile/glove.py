@@ -44,7 +44,7 @@ class GloveDecoder(DelimitedDecoder):
 
 
 def bits_of(full_count: int) -> int:
-    """Bits in each half of a count, by the largest count of the board."""
+    """Return bits in each half of a count, by the largest count of the board."""
     return _BITS + 1 if 1 << 2 * _BITS <= full_count < 1 << 2 * (_BITS + 1) else _BITS
 
 

@@ -147,18 +147,18 @@ class GivenFrames:
         self.live = live
 
     def open(self) -> None:
-        """Nothing to open."""
+        """Do nothing: there is no port."""
 
     def latest(self) -> Frame | None:
-        """The frame that was set last."""
+        """Return the frame that was set last."""
         return self.frame
 
     def counters(self) -> dict[str, int]:
-        """None: nothing can go wrong."""
+        """Return no counts: nothing can go wrong."""
         return {}
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: there is no port."""
 
 
 class ReplayTactile:
@@ -204,7 +204,7 @@ class ReplayTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """The newest frame that is due, None when not open."""
+        """Return the newest frame that is due, None when not open."""
         now = self._clock.now() + 1e-9  # a frame due now counts as come
         if now < self._due:
             return self._frame
@@ -222,7 +222,7 @@ class ReplayTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """``frames`` that were due since open; ``resyncs`` and ``skipped_bytes`` stay 0."""
+        """Return ``frames`` that were due since open; ``resyncs`` and ``skipped_bytes`` stay 0."""
         frames = 0 if self._frame is None else self._frame.seq
         return {"frames": frames, "resyncs": 0, "skipped_bytes": 0}
 

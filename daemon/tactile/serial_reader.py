@@ -30,7 +30,7 @@ _LONGEST_WAIT = 2e-3  # s; bounds what a wrong guess of the missing bytes can de
 
 
 class SensorClock:
-    """From a board's clock to ours: frames are late by varying times, never early.
+    """Conversion of a board's clock to ours: frames are late by varying times, never early.
 
     So the smallest recent delay is the offset, and t_sample doesn't jitter with the port. The
     offset may rise by 200 ppm, more than two quartzes differ; a jump of more than a second is a
@@ -45,7 +45,9 @@ class SensorClock:
         self._t = -math.inf
 
     def arrival(self, t_sensor: float, t: float) -> float:
-        """When the frame of ``t_sensor`` [s], read at ``t`` [s], would have come undelayed [s]."""
+        """Return when the frame of ``t_sensor`` [s], read at ``t`` [s], would have come undelayed
+        [s].
+        """
         offset = t - t_sensor
         risen = self._offset + self._DRIFT * (t - self._t)
         self._offset = offset if abs(offset - risen) > self._JUMP else min(offset, risen)
@@ -91,7 +93,7 @@ class SerialReader:
         self._stop: tuple[int, int] | None = None
 
     def make_decoder(self) -> Decoder:
-        """A fresh decoder of the board's framing, for each time the port is opened."""
+        """Return a fresh decoder of the board's framing, for each time the port is opened."""
         raise NotImplementedError
 
     def open(self) -> None:
@@ -120,11 +122,11 @@ class SerialReader:
             raise TactileError(f"{self._path}: {trouble}")
 
     def latest(self) -> Frame | None:
-        """The newest complete frame, the same object until a newer came; None before the first."""
+        """Return the newest complete frame, the same object until a newer one; None before any."""
         return self._latest
 
     def counters(self) -> dict[str, int]:
-        """``bytes`` read, the framing's own counters, and ``port_lost``: 1 until it is reopened."""
+        """Return ``bytes`` read, the framing's counters, ``port_lost``: 1 until reopened."""
         return {
             "bytes": self._bytes,
             "port_lost": int(self._port_lost),
@@ -133,7 +135,7 @@ class SerialReader:
 
     @property
     def error(self) -> str:
-        """Why no more frames come (port lost, stream unreadable); empty while they do."""
+        """Reason why no more frames come (port lost, stream unreadable); empty while they do."""
         return self._error
 
     def close(self) -> None:
@@ -204,7 +206,7 @@ class SerialReader:
 
     @property
     def _patience(self) -> float | None:
-        """How long to wait for an answer to a request [s]; None for boards that send unasked."""
+        """Time to wait for an answer to a request [s]; None for boards that send unasked."""
         if not self.request:
             return None
         return self._decoder.frame_bytes * self._byte_time + _PATIENCE

@@ -1,4 +1,4 @@
-"""What a sensor's calibration and a tip's test presses tell: curves, centre, modulus, laws.
+"""Calibration of sensors and tips: curves, centre, modulus and laws from frames and test presses.
 
 Numbers alone: files and steps are in `tools.calibration`.
 """

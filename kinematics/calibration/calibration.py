@@ -35,7 +35,7 @@ _EXPONENTS = (0.3, 3.0)
 _RESTLESS = 8.0  # times the usual noise
 _FEW_CELLS = 4  # may be faulty
 _BINS = 24  # of strain
-_LEAST_TILT = math.radians(3.0)  # tilts that differ by less show no direction
+_TILT_MIN = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
 _LAGS = 8  # cells over which noise may be correlated
 _SEEN = 4.0  # standard errors
@@ -63,7 +63,7 @@ class Tare:
 
 
 def tare(frames: ArrayLike) -> Tare:
-    """The zero of each cell from unloaded frames [n, rows, cols].
+    """Return the zero of each cell from unloaded frames [n, rows, cols].
 
     Raises CalibrationError when some cells vary far more than most: something presses meanwhile.
     """
@@ -80,19 +80,19 @@ def tare(frames: ArrayLike) -> Tare:
 
 
 def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
-    """``correlation`` and ``drift`` of a :class:`Tare`, from unloaded frames [n, rows, cols].
+    """Return ``correlation`` and ``drift`` of a :class:`Tare` from unloaded frames [n, rows, cols].
 
     What is within four standard errors of none counts as none.
     """
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
-    spread = noise.std(axis=0)
-    rests = (spread > 0.0) & (spread <= _RESTLESS * np.median(spread))  # not dead or faulty
+    std = noise.std(axis=0)
+    rests = (std > 0.0) & (std <= _RESTLESS * np.median(std))  # not dead or faulty
     noise *= rests
     common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
     noise -= common[:, None, None] * rests
     own = float(noise.var())
-    noise /= np.where(rests, spread, 1.0)
+    noise /= np.where(rests, std, 1.0)
     shape = rows + _LAGS, cols + _LAGS
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
@@ -127,7 +127,7 @@ class Equilibration:
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
-    """Gains from frames [n, rows, cols] under each of several uniform pressures.
+    """Return gains from frames [n, rows, cols] under each of several uniform pressures.
 
     Least squares of each cell's readings against the mean of all live ones. Cells that respond by
     less than a fifth of the median are dead. Raises CalibrationError when nothing presses.
@@ -139,16 +139,16 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     typical = float(np.median(response))
     if not typical > 0.0:
         raise CalibrationError("equilibrate: most cells read nothing above their zero")
-    live = response > DEAD * typical
-    target = np.array([reading[live].mean() for reading in readings])
+    active = response > DEAD * typical
+    target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
         raise CalibrationError("equilibrate: a pressure reads nothing above the zero")
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.tensordot(target, readings, 1) / (readings**2).sum(axis=0)
-    gain = np.where(live, gain, 0.0)
+    gain = np.where(active, gain, 0.0)
     relative = target[:, None]
-    before = readings[:, live] / relative - 1.0
-    after = readings[:, live] * gain[live] / relative - 1.0
+    before = readings[:, active] / relative - 1.0
+    after = readings[:, active] * gain[active] / relative - 1.0
     return Equilibration(gain, _rms(before), _rms(after))
 
 
@@ -168,7 +168,7 @@ class SensorCurve:
 def fit_curve(
     kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float
 ) -> SensorCurve:
-    """The curve whose pressure over all cells makes the known forces.
+    """Return the curve whose pressure over all cells makes the known forces.
 
     ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
     the contact (see :func:`cleared`); ``force`` [n] N; ``area`` of a cell [m²]; ``full`` the
@@ -238,7 +238,7 @@ def _power(
 
 
 def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Readings [rows, cols], means of so many frames, with those within 4 σ of zero put to 0.
+    """Set those of the mean readings [rows, cols] of so many frames to 0 that are within 4 σ of it.
 
     Clipped noise has a positive mean, which over all the cells would weigh as much as a contact.
     """
@@ -247,7 +247,7 @@ def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
 
 
 def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
-    """Mean counts of many frames as they would be if noise didn't end at 0, over such a zero.
+    """Return the mean counts of many frames as they would be if noise did not end at 0.
 
     ``zero`` and ``noise`` are a tare's mean counts and their standard deviation. Of max(x + n, 0)
     with Gaussian n both rise with x, and so does their ratio, which tells what n is.
@@ -256,11 +256,11 @@ def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray
     above = 0.5 * (1.0 + np.array([math.erf(each) for each in z / math.sqrt(2.0)]))
     density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
     ended = z * above + density
-    spread = np.sqrt((z * z + 1.0) * above + z * density - ended * ended)
-    rest = float(np.median(zero))
-    if not 0.0 < rest < _ENDED * noise:
+    std = np.sqrt((z * z + 1.0) * above + z * density - ended * ended)
+    level = float(np.median(zero))
+    if not 0.0 < level < _ENDED * noise:
         return means - zero
-    sigma = rest / float(np.interp(rest / noise, ended / spread, ended))
+    sigma = level / float(np.interp(level / noise, ended / std, ended))
 
     def whole(counts: FloatArray) -> FloatArray:
         near = np.minimum(counts / sigma, z[-1])
@@ -292,9 +292,9 @@ def fit_centre(
     material: Material,
     grid: SensorGrid,
     noise: float,
-    live: NDArray[np.bool_] | None = None,
+    active: NDArray[np.bool_] | None = None,
 ) -> Centre:
-    """Centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
+    """Return centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
 
     ``frames`` [n, rows, cols] Pa. The pressure's centroid stands at centre + (a − d/3)·n, so both
     follow linearly from the estimated centroids; the estimate's own centre is brought along. A
@@ -307,25 +307,25 @@ def fit_centre(
     s = np.sin(np.asarray(theta, np.float64))
     if s.shape != (len(stack),):
         raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
-    tilted = float(np.ptp(s)) > math.sin(_LEAST_TILT)
+    tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
     if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT):
         raise CalibrationError(
-            f"centre: the tilts differ by less than {math.degrees(_LEAST_TILT):g}°, so that tilt "
+            f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so that tilt "
             "can't be separated from place; press upright alone, or upright and tilted further"
         )
     if tip.physics == "solid":
-        used = np.broadcast_to(True if live is None else live, stack.shape)
+        used = np.broadcast_to(True if active is None else active, stack.shape)
         force = stack.sum(axis=(1, 2)) * math.prod(grid.pitches)
         presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
-        found, moved, std = fit_place(presses, tip, material, grid, tilted)
+        found, step, std = fit_place(presses, tip, material, grid, tilted)
         # A press is as upright as it can be told to be: a turn is like a shift by half of it.
         std = math.hypot(std, 0.5 * tip.radius * _UPRIGHT / math.sqrt(3.0 * len(s)))
-        return Centre(found.centre, found.rotation if tilted else None, 1.0, moved, std)
+        return Centre(found.centre, found.rotation if tilted else None, 1.0, step, std)
     centre, rotation, scale, residual, std = grid.centre, None, 1.0, 0.0, 0.0
     for _ in range(4):
         at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)
-        estimator = ContactEstimator(tip, material, at, noise, free_gain=True, live=live)
-        points, arms, stray = np.empty((len(s), 2)), np.empty(len(s)), np.empty(len(s))
+        estimator = ContactEstimator(tip, material, at, noise, free_gain=True, active=active)
+        points, arms, scatter = np.empty((len(s), 2)), np.empty(len(s)), np.empty(len(s))
         for k, frame in enumerate(stack):
             estimate = estimator(frame)
             if not (estimate.contact and estimate.valid):
@@ -334,7 +334,7 @@ def fit_centre(
             normal = math.sin(estimate.tilt_x), math.sin(estimate.tilt_y)
             points[k] = np.array(centre) + arms[k] * np.array(normal)
             # A press is as upright as it can be told to be.
-            stray[k] = arms[k] * math.hypot(estimate.tilt_x_std, _UPRIGHT / math.sqrt(3.0))
+            scatter[k] = arms[k] * math.hypot(estimate.tilt_x_std, _UPRIGHT / math.sqrt(3.0))
         rows = np.ones((len(s), 1))
         if tilted:
             rows = np.stack([np.ones(len(s)), arms * s], axis=1)
@@ -344,7 +344,7 @@ def fit_centre(
         residual = math.sqrt(2.0) * _rms(misses)
         freedom = 2 * (len(s) - rows.shape[1])
         each = math.sqrt(float((misses**2).sum()) / freedom) if freedom else 0.0
-        each = max(each, float(stray.max()))
+        each = max(each, float(scatter.max()))
         std = each * math.sqrt(float(np.linalg.inv(rows.T @ rows)[0, 0]))
         if tilted:
             # The finger's x axis in the sensor's: (cos, −sin) of the rotation.
@@ -370,7 +370,7 @@ def fit_modulus(
     free_offset: bool = True,
     tip: Fingertip | None = None,
 ) -> Modulus:
-    """A constant modulus from a compression run: √(F cos θ/π) is a line in d of slope √E.
+    """Fit a constant modulus to a compression run: √(F cos θ/π) is a line in d of slope √E.
 
     ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. ``free_offset``: the run's own
     zero of d is fitted too. A solid ``tip`` has its own force law. Raises CalibrationError for too
@@ -417,7 +417,7 @@ def fit_law(
     grid: SensorGrid,
     used: NDArray[np.bool_] | None = None,
 ) -> MeasuredLaw:
-    """σ(ε) from a compression run: each cell under the tip is a measured point of it.
+    """Return σ(ε) from a compression run: each cell under the tip is a measured point of it.
 
     ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
     out dead and saturated cells. A cell's strain is the model's, averaged over it; points are the

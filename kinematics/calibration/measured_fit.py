@@ -47,12 +47,12 @@ class PressSums:
     frames: Sequence[FloatArray]
     pressures: FloatArray
     rest: FloatArray
-    live: NDArray[np.bool_]
+    active: NDArray[np.bool_]
     gain: float = 1.0
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """The law of a tip of ``radius``, whose place on the ``grid`` is found along.
+    """Return the law of a tip of ``radius``, whose place on the ``grid`` is found along.
 
     Raises CurvesError.
     """
@@ -69,13 +69,13 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
             f"found {len(d)} presses of {len(np.unique(d))} depths, {tilted.sum()} of them tilted; "
             f"expected at least {_FEWEST} of 3 depths, upright ones, and 2 tilted by 5° or more"
         )
-    frames = [each for each, kept in zip(presses.frames, used, strict=True) if kept]
+    frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
     centre, rotation = _place(
-        _sums(frames, sum_weights(first, radius, presses.live), presses.rest), theta
+        _sums(frames, sum_weights(first, radius, presses.active), presses.rest), theta
     )
     placed = replace(grid, centre=centre, rotation=rotation)
-    weights = sum_weights(placed, radius, presses.live)
+    weights = sum_weights(placed, radius, presses.active)
     sums = _sums(frames, weights, presses.rest)
     noise = _noise(frames, weights)
     force = presses.gain * (presses.pressures[used].reshape(len(d), -1) @ weights[0])
@@ -88,12 +88,12 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     def curve(
         y: FloatArray, sigma: FloatArray, powers: Sequence[int], times: FloatArray, name: str
     ) -> Curve:
-        def sound(found: FloatArray) -> bool:
+        def valid(found: FloatArray) -> bool:
             if name == "lever":
                 found = np.concatenate([np.zeros((1, SQUARES)), found[:-1]])  # t · lever rises
             return name == "extent" or rises(found, root, square)
 
-        best = _best((t, q, times), y, np.hypot(sigma, _STAGE * np.abs(y)), powers, squares, sound)
+        best = _best((t, q, times), y, np.hypot(sigma, _STAGE * np.abs(y)), powers, squares, valid)
         if best is None:
             raise CurvesError(f"no smooth curve that rises goes through the presses' {name}")
         return tuple(map(tuple, best.tolist()))
@@ -128,8 +128,8 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
         ]
     )
     missed = [
-        _beyond(misses[k] / sums[0], scatter[m] / sums[0], _STAGE * least)
-        for k, m, least in ((0, 0, 1.0), (1, 0, 1.0), (2, 1, radius), (3, 2, radius))
+        _beyond(misses[k] / sums[0], scatter[m] / sums[0], _STAGE * smallest)
+        for k, m, smallest in ((0, 0, 1.0), (1, 0, 1.0), (2, 1, radius), (3, 2, radius))
     ]
     force_error, lever_error = max(missed[:2]), max(missed[2:])
     if max(force_error, lever_error / radius) > _POOR:
@@ -140,9 +140,9 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     return replace(law, force_error=force_error, lever_error=lever_error)
 
 
-def _beyond(misses: FloatArray, noise: FloatArray, least: float) -> float:
+def _beyond(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
     """Standard deviation of what misses beyond its noise; those that are least noisy count most."""
-    weight = 1.0 / (noise**2 + least**2)
+    weight = 1.0 / (noise**2 + smallest**2)
     return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
 
 
@@ -172,16 +172,16 @@ def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], fl
 
 
 def _best(
-    places: tuple[FloatArray, FloatArray, FloatArray],
+    points: tuple[FloatArray, FloatArray, FloatArray],
     y: FloatArray,
     sigma: FloatArray,
     powers: Sequence[int],
     squares: int,
-    sound: Callable[[FloatArray], bool],
+    valid: Callable[[FloatArray], bool],
 ) -> FloatArray | None:
-    """The curve of least χ² + n log presses among the sound ones; y = times · curve(t, q)."""
-    t, q, times = places
-    best, least = None, math.inf
+    """The curve of least χ² + n log presses among the valid ones; y = times · curve(t, q)."""
+    t, q, times = points
+    best, smallest = None, math.inf
     for count in range(1, len(powers) + 1):
         for chosen in itertools.combinations(powers, count):
             for wide in range(1, squares + 1):
@@ -195,6 +195,6 @@ def _best(
                 )
                 made = np.zeros((POWERS, SQUARES))
                 made[tuple(np.transpose(terms))] = found
-                if cost < least and sound(made):
-                    best, least = made, cost
+                if cost < smallest and valid(made):
+                    best, smallest = made, cost
     return best

@@ -1,4 +1,4 @@
-"""What presses at known depths and tilts tell of a tip: its physics, its modulus, its place.
+"""Fit of a tip's physics, modulus and place to presses at known depths and tilts.
 
 Least squares over all cells of all frames, for whichever tip, by the forward model alone.
 """
@@ -23,7 +23,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _UNIT = Material.constant(1.0)
 _STEP = 1e-5  # m of a derivative
 _SHIFT = 2e-4  # m of one by the place: cells at the rim change by the points that are in it
-_TURN = 1e-4  # rad
+_ROTATION_STEP = 1e-4  # rad
 _TURNS = 8  # rotations that are tried first
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _NARROW = 4e-3  # of ν
@@ -46,7 +46,7 @@ class Presses:
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT
     ) -> FloatArray:
-        """The frames of such presses by the model, for a modulus of 1, [cells that are used]."""
+        """Return the model's frames of these presses for a modulus of 1, [used cells]."""
         made = [
             grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
@@ -56,13 +56,13 @@ class Presses:
 
 @dataclass(frozen=True)
 class TipFit:
-    """How well one kind of tip explains the presses.
+    """Fit of one kind of tip to the presses.
 
     ``law`` is that of its material for a modulus of 1 at no strain. ``modulus`` [Pa] and the run's
     zero of d ``offset`` [m] are fitted, and a solid tip's ν; ``chi2`` is the squared misfit a cell
     over the noise's. What is left when the estimator takes this tip: rms errors of d [m], θ [rad]
-    and of the force against the sensor's sum, over the rms force; ``valid`` is the share of frames
-    whose estimate can be used, and they are over those.
+    and of the force against the sensor's sum, over the rms force; ``valid`` is the fraction of
+    frames whose estimate can be used, and they are over those.
     """
 
     tip: Fingertip
@@ -86,19 +86,19 @@ def _scaled(law: Material, factor: float) -> Material:
 
 
 def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT) -> TipFit:
-    """Modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
+    """Return modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
         shape = presses.of(tip, grid, presses.d - offset, law)
         slope = (presses.of(tip, grid, presses.d - offset + _STEP, law) - shape) / _STEP
         columns = np.stack([shape, -slope], axis=1)
-        modulus, moved = np.linalg.lstsq(columns, readings, rcond=None)[0]
-        step = float(np.clip(moved / modulus, -5e-4, 5e-4))
+        modulus, shift = np.linalg.lstsq(columns, readings, rcond=None)[0]
+        step = float(np.clip(shift / modulus, -5e-4, 5e-4))
         if abs(step) < 1e-7:
             break
         offset += step
-    misfit = readings - columns @ np.array([modulus, moved])
+    misfit = readings - columns @ np.array([modulus, shift])
     freedom = max(len(readings) - 2, 1)
     chi2 = float(misfit @ misfit) / (presses.noise**2 * freedom)
     return TipFit(tip, float(modulus), offset, chi2, law=law)
@@ -108,10 +108,10 @@ def compare_tips(
     presses: Presses,
     radius: float,
     grid: SensorGrid,
-    live: NDArray[np.bool_],
+    active: NDArray[np.bool_],
     material: Material = _UNIT,
 ) -> list[TipFit]:
-    """Springs, and solid rubber on either base at its best ν: the best explanation first.
+    """Fit springs, and solid rubber on either base at its best ν; return the best fit first.
 
     With the face frictionless, and on the better base sticking. Springs of a constant modulus, and
     of the ``material``'s law where that is another one.
@@ -124,7 +124,9 @@ def compare_tips(
     both = [_best_poisson(presses, tip, grid) for tip in (bonded, replace(bonded, base="lying"))]
     better = min(both, key=lambda fit: fit.chi2).tip
     fits += [*both, _best_poisson(presses, replace(better, face="sticking"), grid)]
-    return sorted((_judged(presses, each, grid, live) for each in fits), key=lambda fit: fit.chi2)
+    return sorted(
+        (_with_errors(presses, each, grid, active) for each in fits), key=lambda fit: fit.chi2
+    )
 
 
 def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
@@ -144,10 +146,12 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     return min([*inner, at(low), at(high)], key=lambda fit: fit.chi2)
 
 
-def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bool_]) -> TipFit:
+def _with_errors(
+    presses: Presses, fit: TipFit, grid: SensorGrid, active: NDArray[np.bool_]
+) -> TipFit:
     """The fit with what the estimator leaves."""
     table = ContactTable.build(fit.tip, fit.material)
-    estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, live=live)
+    estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, active=active)
     area = math.prod(grid.pitches)
     errors = []
     for frame, used, d, theta in zip(
@@ -159,8 +163,8 @@ def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bo
         tilt = math.asin(min(math.hypot(math.sin(found.tilt_x), math.sin(found.tilt_y)), 1.0))
         force = found.gain * float(table(found.d, tilt).force)
         measured = float(frame[used].sum()) * area
-        turned = math.hypot(found.tilt_x - theta, found.tilt_y)
-        errors.append([found.d - d, turned, force - measured, measured])
+        tilt_error = math.hypot(found.tilt_x - theta, found.tilt_y)
+        errors.append([found.d - d, tilt_error, force - measured, measured])
     if not errors:
         return fit
     d_error, theta_error, off, forces = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -174,10 +178,9 @@ def _judged(presses: Presses, fit: TipFit, grid: SensorGrid, live: NDArray[np.bo
 
 
 def fit_place(
-    presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, turned: bool
+    presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, rotate: bool
 ) -> tuple[SensorGrid, float, float]:
-    """The grid with the tip's centre, and rotation if ``turned``; the last step [m]; the centre's
-    standard deviation [m] by what the fit leaves.
+    """Fit the tip's centre, rotation if ``rotate``; return grid, last step [m], centre's std [m].
 
     Gauss-Newton on place, rotation and each press' own depth, begun at ``presses.d``; the tilts are
     known. For a tip whose centroid hardly moves with tilt, so that only the frames' shape tells.
@@ -188,13 +191,13 @@ def fit_place(
     def misfit(tried: SensorGrid) -> float:
         return float(np.linalg.norm(presses.of(tip, tried, depths) - readings))
 
-    if turned:
+    if rotate:
         turns = 2.0 * math.pi * np.arange(_TURNS) / _TURNS
         grid = min((replace(grid, rotation=float(each)) for each in turns), key=misfit)
     owner = np.broadcast_to(
         np.arange(len(depths))[:, None, None], presses.used.shape
     )[presses.used]  # fmt: skip
-    moved = math.inf
+    shift = math.inf
     for _ in range(12):
         now = presses.of(tip, grid, depths)
         by_depth = (presses.of(tip, grid, depths + _STEP) - now) / _STEP
@@ -204,28 +207,31 @@ def fit_place(
             (replace(grid, centre=(x + _SHIFT, y)), _SHIFT),
             (replace(grid, centre=(x, y + _SHIFT)), _SHIFT),
         ]
-        if turned:
-            tried = [*tried, (replace(grid, rotation=grid.rotation + _TURN), _TURN)]
+        if rotate:
+            tried = [
+                *tried,
+                (replace(grid, rotation=grid.rotation + _ROTATION_STEP), _ROTATION_STEP),
+            ]
         columns += [(presses.of(tip, each, depths) - now) / step for each, step in tried]
         jacobian = np.stack(columns, axis=1)
         found = np.linalg.lstsq(jacobian, readings - now, rcond=None)[0]
         step, place = found[: len(depths)], found[len(depths) :]
         depths = np.clip(depths + step, 0.3 * depths, 0.95 * tip.radius)
-        moved = math.hypot(*np.clip(place[:2], -2e-3, 2e-3))
-        rotation = grid.rotation + (float(np.clip(place[2], -0.5, 0.5)) if turned else 0.0)
+        shift = math.hypot(*np.clip(place[:2], -2e-3, 2e-3))
+        rotation = grid.rotation + (float(np.clip(place[2], -0.5, 0.5)) if rotate else 0.0)
         x_step, y_step = np.clip(place[:2], -2e-3, 2e-3).tolist()
         grid = replace(grid, centre=(x + x_step, y + y_step), rotation=rotation)
-        if moved < 1e-7:
+        if shift < 1e-7:
             break
     variance = float(((readings - now) ** 2).mean())
     x = len(depths)
     std = math.sqrt(variance * float(np.linalg.inv(jacobian.T @ jacobian)[x, x]))
-    turn = (grid.rotation + math.pi) % (2.0 * math.pi) - math.pi
-    return replace(grid, rotation=turn), moved, std
+    rotation = (grid.rotation + math.pi) % (2.0 * math.pi) - math.pi
+    return replace(grid, rotation=rotation), shift, std
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """d [m] of an upright tip by its ``force`` [N], from the table."""
+    """Return d [m] of an upright tip by its ``force`` [N], from the table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
 
@@ -233,7 +239,7 @@ def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> Flo
 def modulus_by_force(
     d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip, free_offset: bool
 ) -> tuple[float, float, FloatArray]:
-    """E [Pa], the zero of d [m] if free, and the fit's forces [n], by least relative squares."""
+    """Fit E [Pa] and, if free, the zero of d [m] by least relative squares; the forces [n], too."""
     unit, offset = ContactTable.build(tip, _UNIT), 0.0
     modulus = 0.0
     for _ in range(30):

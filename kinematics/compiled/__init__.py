@@ -1,4 +1,4 @@
-"""How kernels are compiled and kept, and the SIMD and memory helpers they share.
+"""Compilation and storage of kernels, and the SIMD and memory helpers they share.
 
 Nothing here knows what a kernel computes.
 """

@@ -1,22 +1,21 @@
-"""How Numba compiles kernels and keeps them; this module alone uses its private parts.
+"""Compile kernels with Numba and store them; the only module that uses Numba's private parts.
 
-It is imported with versions of Numba that it was tested with; with others `plain` has its place.
-`KernelCompiler` has the passes that kernels need,
-and doesn't ask the same thing twice: left out are the passes for closures, `with`, parallel loops,
-branches on constants (LLVM's part) and the listing of types, which filled the cache. What an
-operation makes of its arguments' types, and the size of LLVM's types, are remembered: at each place
-in the source Numba looks through dozens of candidates for the one, and has LLVM parse a module for
-the other.
+It is imported with the versions of Numba it was tested with; with others `plain` replaces it.
+`KernelCompiler` runs the passes that kernels need and no others: passes for closures, `with`,
+parallel loops, branches on constants (LLVM removes those) and the listing of types, which filled
+the cache, are left out. It remembers the result types of operations and the sizes of LLVM's types:
+for each operation in the source Numba would search dozens of candidates, and for each size have
+LLVM parse a module.
 
-`BitcodeKernel`s, which only kernels call, are compiled to LLVM's bitcode alone, never to machine
-code. Numba compiles every function that a kernel calls as if Python might call it, too: optimised
-with all it calls, made into machine code, wrapped twice, kept in the cache. Their callers take the
-bitcode and do all that again. Here the bitcode is all there is, which takes a third off the time of
-compiling and leaves a quarter of the cache.
+`BitcodeKernel`s, which only kernels call, are compiled to LLVM bitcode alone, never to machine
+code. Numba compiles every function that a kernel calls as if Python might call it, too: it is
+optimised with its callees, made into machine code, wrapped twice and cached, and its callers then
+link the bitcode and repeat the work. Bitcode alone takes a third off the compile time and leaves a
+quarter of the cache.
 
-`KernelCache` keeps of a kernel its machine code, and nothing that compiles. Numba keeps bitcode as
-well, for kernels that call this one; here they compile it anew. And to load a kernel Numba first
-imports all that it could compile: a third of a second, 50 MB.
+`KernelCache` stores a kernel's machine code without bitcode, which kernels that call this one would
+need; they compile it again. To load a kernel Numba first imports all that it could compile: a third
+of a second, 50 MB; this cache does not.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ _SIZES: dict[Any, int] = {}  # of LLVM's types [bytes]
 
 
 class KernelCompiler(CompilerBase):
-    """From a kernel's source to machine code."""
+    """Compiler of one kernel, from source to machine code."""
 
     lowering: ClassVar[Any] = NativeLowering
 
@@ -81,7 +80,7 @@ class KernelCompiler(CompilerBase):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """The passes, in their order."""
+        """Return the passes, in their order."""
         # Under `if blur is None` nothing has a type unless it is: pruned, and again what follows.
         nones = types.none in self.state.args
         passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
@@ -171,7 +170,7 @@ class BitcodeKernel(plain.InnerKernel):
 
     @property
     def _numba_type_(self) -> Any:
-        """By this Numba knows what a compiled caller means."""
+        """Numba's type of the kernel, which a compiled caller asks for."""
         return self.dispatcher._numba_type_
 
 
@@ -235,22 +234,22 @@ class KernelFolder:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelFolder | None:
-        """None where there is no folder: then nothing is kept."""
+        """Return the locator, or None where there is no folder: then nothing is stored."""
         return None if kernel_folder() is None else cls(function, file)
 
     def get_cache_path(self) -> str:
-        """The one folder."""
+        """Return the one folder."""
         return str(kernel_folder())
 
     def ensure_cache_path(self) -> None:
-        """Nothing to do: `kernel_folder` has made and checked it."""
+        """Do nothing: `kernel_folder` has made and checked it."""
 
     def get_source_stamp(self) -> str:
-        """The kernel's own file; what the folder's name covers is the same by its being there."""
+        """Return the digest of the kernel's own file; the folder's name covers the others."""
         return hashlib.sha256(text(Path(self._py_file))).hexdigest()
 
     def get_disambiguator(self) -> str:
-        """Tells apart kernels of the same name in modules of the same name."""
+        """Return a text that differs for kernels of the same name in modules of the same name."""
         file = Path(self._py_file)
         inside = file.is_relative_to(ROOT)
         place = file.relative_to(ROOT).parent if inside else file.parent
@@ -263,7 +262,7 @@ class _MachineCode(CompileResultCacheImpl):
     _locator_classes: Any = (KernelFolder,)
 
     def reduce(self, cres: Any) -> Any:
-        """Instead of the bitcode the names of what it defines, by which Numba finds it."""
+        """Replace the bitcode by the names of what it defines, by which Numba finds it."""
         (name, kind, (code, bitcode)), *rest = super().reduce(cres)
         module = _llvm.parse_bitcode(bitcode)
         defined = (*module.functions, *module.global_variables)
@@ -273,12 +272,12 @@ class _MachineCode(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """Where Numba looks for a kernel. Raises RuntimeError where there is no folder."""
+    """Numba's cache with machine code alone. Raises RuntimeError where there is no folder."""
 
     _impl_class = _MachineCode
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """As Numba does, without importing first all that it can compile."""
+        """Load an overload without importing first all that Numba can compile."""
         _add_symbols()
         return self._load_overload(sig, target_context)
 

@@ -48,12 +48,12 @@ def kernel(function: Function) -> Function:
 
 
 def inner_kernel(function: Function) -> Function:
-    """As :func:`kernel`, for what only kernels call. A call from Python raises TypeError."""
+    """Compile ``function`` for kernels alone; a call from Python raises TypeError."""
     return _inner(function)
 
 
 def fast_inner_kernel(function: Function) -> Function:
-    """As :func:`inner_kernel`, with sums reordered and fused so that they run in SIMD lanes.
+    """Compile an :func:`inner_kernel` whose sums may be reordered and fused to run in SIMD lanes.
 
     For finite numbers only: NaN and infinity have no defined result there.
     """
@@ -61,10 +61,10 @@ def fast_inner_kernel(function: Function) -> Function:
 
 
 def inlined_kernel(function: Function) -> Function:
-    """As :func:`inner_kernel`, but a part of every caller, and products and sums may be fused.
+    """Compile an :func:`inner_kernel` into each of its callers; products and sums may be fused.
 
     For the innermost functions of a hot path, where a call costs as much as the work. Its code is
-    there again in each caller, so it should be short.
+    repeated in each caller, so it should be short.
     """
     return _inner(function, fastmath={"contract"}, forceinline=True)
 

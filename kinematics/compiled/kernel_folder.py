@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept between runs: one folder for one state of sources and compiler.
+"""Folder of compiled kernels between runs: one for each state of sources and compiler.
 
 The folder's name is a digest of every source that a kernel of this package may depend on, of
 Python, Numba, llvmlite and NumPy, and of the processor, so nothing compiled from something else is
@@ -28,7 +28,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-_KEPT = 4  # folders of other sources or compilers that stay: other checkouts, the last release
+_FOLDERS_MAX = (
+    4  # folders of other sources or compilers that stay: other checkouts, the last release
+)
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -38,7 +40,7 @@ _IMPORT = re.compile(
 
 @cache
 def kernel_folder() -> Path | None:
-    """This state's folder, made when absent; None, with a warning, where there can be none."""
+    """Return this state's folder, made when absent; warn and return None if that fails."""
     try:
         return find_folder()
     except (OSError, RuntimeError) as error:
@@ -52,7 +54,7 @@ def kernel_folder() -> Path | None:
 
 
 def find_folder() -> Path:
-    """This state's folder in NUMBA_CACHE_DIR, where that is set, or in the user's cache directory.
+    """Return this state's folder in NUMBA_CACHE_DIR if set, else in the user's cache directory.
 
     Raises as :func:`own_folder`, and RuntimeError where there is no home.
     """
@@ -70,7 +72,7 @@ def find_folder() -> Path:
 
 
 def user_cache() -> Path:
-    """The user's cache directory of this program. Raises RuntimeError where there is no home."""
+    """Return this program's cache directory of the user. Raises RuntimeError without a home."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
 
@@ -107,13 +109,13 @@ def _prune(base: Path, current: Path) -> None:
         if _FOLDER.fullmatch(each.name) and each != current and not each.is_symlink()
     ]
     others.sort(key=lambda each: each.lstat().st_mtime, reverse=True)
-    for old in others[_KEPT:]:
+    for old in others[_FOLDERS_MAX:]:
         shutil.rmtree(old, ignore_errors=True)
 
 
 @cache
 def digest() -> str:
-    """A name for this state of sources, Python, Numba, llvmlite, NumPy and processor."""
+    """Return a name for this state of sources, Python, Numba, llvmlite, NumPy and processor."""
     state = hashlib.sha256()
     packages = (numba.__version__, llvmlite.__version__, np.__version__)
     versions = (sys.version, *packages, platform.machine())
@@ -130,7 +132,7 @@ def digest() -> str:
 
 @cache
 def kernel_sources() -> tuple[Path, ...]:
-    """Every module of ours with a kernel in it, and all that these import, however they do."""
+    """Return every module of ours with a kernel in it, and all that these import."""
     files = (each for name in _PACKAGES for each in (ROOT / name).rglob("*.py"))
     waiting = [file for file in files if _DECORATED.search(text(file))]
     seen: set[Path] = set()
@@ -164,5 +166,5 @@ def _files(name: str) -> tuple[Path, ...]:
 
 @cache
 def text(path: Path) -> bytes:
-    """A source, read once."""
+    """Return a file's source, read once."""
     return path.read_bytes()

@@ -85,8 +85,8 @@ class _Views(dict[str, Any]):
         self._one = one
 
     def __missing__(self, name: str) -> Any:
-        part = self._one[name][:1]
-        view = part.reshape(part.shape[1:])
+        field = self._one[name][:1]
+        view = field.reshape(field.shape[1:])
         inner = getattr(self._kind, name).inner
         if inner is not None:
             view = inner(view.reshape(1)) if view.ndim == 0 else _Many(inner, view)
@@ -115,7 +115,7 @@ class _Scalar:
         record._fields[self._name][()] = value
 
 
-class _Part:
+class _Compound:
     def __init__(self, name: str, inner: Any) -> None:
         self._name = name
         self.inner = inner
@@ -130,7 +130,7 @@ class _Part:
 
 
 def _field(name: str, inner: Any, shape: tuple[int, ...]) -> Any:
-    return _Scalar(name) if inner is None and not shape else _Part(name, inner)
+    return _Scalar(name) if inner is None and not shape else _Compound(name, inner)
 
 
 def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:

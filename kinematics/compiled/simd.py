@@ -51,7 +51,7 @@ def _fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
     return builder.call(function, [a, b, c])
 
 
-def _spread(builder: Any, value: Any) -> Any:
+def _broadcast(builder: Any, value: Any) -> Any:
     """A vector of the one value."""
     undefined = ir.Constant(_VECTOR, ir.Undefined)
     single = builder.insert_element(undefined, value, ir.Constant(_INDEX, 0))
@@ -66,7 +66,7 @@ def _polynomials(context: Any, data: Any, at: Any, shape: Any, x: Any, y: Any) -
     def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         start, at, _, x, y = arguments
         fma = partial(_fma, builder)
-        xs, ys = _spread(builder, x), _spread(builder, y)
+        xs, ys = _broadcast(builder, x), _broadcast(builder, y)
         pointer = builder.bitcast(builder.gep(start, [at]), _VECTOR.as_pointer())
         # All powers of y are independent, and the machine may work on them before y is known.
         rows = []
@@ -121,10 +121,10 @@ def _weighted(
         total = cast(Any, cgutils).alloca_once_value(builder, builder.load(place, align=8))
         with cast(Any, cgutils).for_range(builder, count) as loop:
             weight = builder.load(builder.gep(weights, [builder.add(first, loop.index)]))
-            moved = builder.add(at, builder.mul(stride, loop.index))
-            row = builder.bitcast(builder.gep(source, [moved]), _VECTOR.as_pointer())
+            offset = builder.add(at, builder.mul(stride, loop.index))
+            row = builder.bitcast(builder.gep(source, [offset]), _VECTOR.as_pointer())
             value = builder.load(row, align=8)
-            more = _fma(builder, _spread(builder, weight), value, builder.load(total))
+            more = _fma(builder, _broadcast(builder, weight), value, builder.load(total))
             builder.store(more, total)
         builder.store(builder.load(total), place, align=8)
         return codegen.get_dummy_value()

@@ -75,7 +75,7 @@ class Fingertip:
         object.__setattr__(self, "radius", radius)
 
     def theta_limit(self, d: ArrayLike) -> FloatArray:
-        """Largest |θ| [rad] at displacement d [m], asin((a − d)/a); π/2 for d ≤ 0, 0 for d ≥ a."""
+        """Return the largest |θ| [rad] at d [m], asin((a − d)/a); π/2 for d ≤ 0, 0 for d ≥ a."""
         shape, (depth,) = flatten(d)
         out = np.empty_like(depth)
         _limits(self.radius, depth, out)
@@ -99,7 +99,7 @@ _closed: Any = Closed
 
 @inner_kernel
 def theta_limit(radius: float, d: float) -> float:
-    """asin((a − d)/a) [rad], clamped to [0, π/2]; NaN for NaN."""
+    """Return asin((a − d)/a) [rad], clamped to [0, π/2]; NaN for NaN."""
     if d <= 0.0:
         return HALF_PI
     if d >= radius:
@@ -113,7 +113,7 @@ def theta_limit(radius: float, d: float) -> float:
 def closed_form(
     modulus: float, d: float, theta: float
 ) -> tuple[float, float, float, float, float, float]:
-    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ) of a constant modulus E [Pa]; zeros for d ≤ 0.
+    """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ) of a constant modulus E [Pa]; zeros for d ≤ 0.
 
     Free of the radius. Not clamped: past the limit of θ it continues the formulas, and NaN stays.
     """
@@ -122,8 +122,8 @@ def closed_form(
         return zero, zero, zero, zero, zero, zero
     inverse = 1.0 / math.cos(theta)
     slope = math.sin(theta) * inverse
-    push = math.pi * modulus * d
-    force_d = 2.0 * push * inverse
+    force_by_d = math.pi * modulus * d
+    force_d = 2.0 * force_by_d * inverse
     force = 0.5 * d * force_d
     energy_d = force * inverse
     energy = energy_d * d * (1.0 / 3.0)
@@ -153,7 +153,7 @@ _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 @_quiet
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
-    """Force, energy and first partials of a constant ``modulus`` [Pa]; d [m], θ [rad] broadcast.
+    """Return force, energy and partials of a constant ``modulus`` [Pa]; d [m], θ [rad] broadcast.
 
     Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
     """

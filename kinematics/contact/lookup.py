@@ -42,7 +42,7 @@ VERSION = 3.0
 OCTAVES = 3  # of h above the corner
 SLAB_BITS = 3  # 2^3 slabs to an octave
 LOWEST = 0.5**OCTAVES  # h where the corner begins
-LEAST = 0.5**54  # less than any h but 0
+H_MIN = 0.5**54  # less than any h but 0
 
 # The forms of a table, as numbers in SHAPES: the closed form, and slabs by rising degree.
 CLOSED = 0
@@ -60,7 +60,7 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above 
 
 
 class TableHeader(Record):
-    """What a table's array starts with."""
+    """Head of a table's array."""
 
     format: float  # VERSION
     form: float  # CLOSED, or one of SLABS
@@ -75,7 +75,7 @@ class TableHeader(Record):
 
 
 def header_of(data: FloatArray) -> TableHeader:
-    """The header of a table's array."""
+    """Return the header of a table's array."""
     size = TableHeader.dtype.itemsize // data.itemsize
     return TableHeader(data[:size].view(TableHeader.dtype))
 
@@ -95,11 +95,11 @@ header: Callable[[Pointer], TableHeader] = cast(Any, intrinsic)(_header)
 
 
 class TableError(SoftfingerError):
-    """A table can't be built to the tolerance, or a file holds no sound table of this kind."""
+    """A table can't be built to the tolerance, or a file holds no valid table of this kind."""
 
 
 def aligned(size: int) -> FloatArray:
-    """Zeros, float64 [size], starting at a cache line so that vector loads do not straddle two."""
+    """Return zeros, float64 [size], from a cache line on: vector loads don't straddle two."""
     room = np.zeros(size + 8)
     skip = (-room.ctypes.data % 64) // 8
     return room[skip : skip + size]
@@ -120,8 +120,8 @@ def _near_sine_cosine(theta: float) -> tuple[float, float]:
     )
     q += z4 * (2.087614632409855e-09 - z * 1.1382636028190913e-11)
     half = 0.5 * z
-    most = 1.0 - half
-    return theta + theta * z * p, most + (((1.0 - most) - half) + z2 * q)
+    leading = 1.0 - half
+    return theta + theta * z * p, leading + (((1.0 - leading) - half) + z2 * q)
 
 
 @inlined_kernel
@@ -138,20 +138,20 @@ def _sine_cosine(theta: float) -> tuple[float, float]:
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Number of the slab of h in (LOWEST, 1], and h's place in it from −1 to 1.
+    """Number of the slab of h in (LOWEST, 1], and h's position in it from −1 to 1.
 
-    From the float's own bits: its exponent is the octave, its mantissa the slab and the place. A
+    From the float's own bits: its exponent is the octave, its mantissa the slab and the position. A
     slab has its upper end, not its lower one.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
-    place = 2.0 * float(np.int64(fraction).view(np.float64)) - 3.0
-    return number >> (_MANTISSA - SLAB_BITS), place
+    position = 2.0 * float(np.int64(fraction).view(np.float64)) - 3.0
+    return number >> (_MANTISSA - SLAB_BITS), position
 
 
 @inlined_kernel
 def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
-    """The five ratios above the corner. The numbers of shapes are literals."""
+    """Return the five ratios above the corner. The numbers of shapes are literals."""
     i, x = _slab(h)
     y = 2.0 * y - 1.0
     if form == 1:
@@ -165,7 +165,7 @@ def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
 
 @inner_kernel
 def from_corner(p: Pointer, h: float, y: float) -> Ratios:
-    """The five ratios A + B log h below the lowest octave."""
+    """Evaluate the five ratios A + B log h below the lowest octave."""
     y *= CORNER_PIECES
     j = min(int(y), CORNER_PIECES - 1)
     y = 2.0 * (y - j) - 1.0
@@ -174,7 +174,7 @@ def from_corner(p: Pointer, h: float, y: float) -> Ratios:
     a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 4, x, y)
     b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 4, x, y)
     # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
-    scale = math.log(max(h, LEAST))
+    scale = math.log(max(h, H_MIN))
     return (
         a_f + scale * b_f,
         a_u + scale * b_u,
@@ -202,15 +202,15 @@ def _ratios(
 
 @inlined_kernel
 def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: bool) -> Six:
-    """What :func:`lookup` gives, in the domain."""
+    """Evaluate :func:`lookup` inside the domain."""
     form = int(header(p).form)
     if form == CLOSED:
         inverse = 1.0 / c
         slope = s * inverse
-        push = math.pi * header(p).modulus * d * inverse
-        force = push * d
+        force_by_d = math.pi * header(p).modulus * d * inverse
+        force = force_by_d * d
         energy = force * inverse * d * (1.0 / 3.0)
-        force_d = 2.0 * push
+        force_d = 2.0 * force_by_d
         return (
             force,
             energy,
@@ -222,13 +222,13 @@ def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: 
         )
     inverse, (r_f, r_u, r_fd, r_ft, r_ut) = _ratios(p, form, h, s, c, gap)
     slope = s * inverse
-    push = math.pi * header(p).modulus * d * inverse
-    force = push * d
+    force_by_d = math.pi * header(p).modulus * d * inverse
+    force = force_by_d * d
     energy = force * inverse * d * (1.0 / 3.0)
     return (
         force * r_f,
         energy * r_u,
-        2.0 * push * r_fd,
+        2.0 * force_by_d * r_fd,
         force * slope * r_ft,
         force * r_f * inverse,
         2.0 * energy * slope * r_ut,
@@ -257,7 +257,7 @@ def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, fl
 
 @inlined_kernel
 def lookup_at(p: Pointer, d: float, theta: float) -> Six:
-    """:func:`lookup` in the table whose :func:`~compiled.simd.address` is ``p``.
+    """Evaluate :func:`lookup` in the table whose :func:`~compiled.simd.address` is ``p``.
 
     For kernels that call often: an array argument costs a reference count at each call.
     """
@@ -277,10 +277,10 @@ def lookup_at(p: Pointer, d: float, theta: float) -> Six:
 
 
 @inlined_kernel
-def push_at(
+def normal_at(
     p: Pointer, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
 ) -> Triple:
-    """N = ∂U/∂d in the domain, ∂N/∂d and ∂N/∂θ, for ``forces``: F, ∂F/∂d and ∂F/∂θ there."""
+    """Return N = ∂U/∂d in the domain, ∂N/∂d and ∂N/∂θ, for ``forces``: F, ∂F/∂d and ∂F/∂θ there."""
     force, force_d, force_theta = forces
     more = force_theta + force * tangent
     return force * inverse_cosine, force_d * inverse_cosine, more * inverse_cosine
@@ -288,7 +288,7 @@ def push_at(
 
 @kernel
 def lookup(data: FloatArray, d: float, theta: float) -> Six:
-    """(F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
+    """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
 
     Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
     gives NaN out.
@@ -297,12 +297,12 @@ def lookup(data: FloatArray, d: float, theta: float) -> Six:
 
 
 @inlined_kernel
-def stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
-    """∂F/∂d [N/m] of an upright tip at d = ``reach`` [m]; ``scale`` is 2πE [Pa].
+def stiffness_ahead(p: Pointer, scale: float, depth: float) -> float:
+    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m]; ``scale`` is 2πE [Pa].
 
     E is the modulus at no strain.
     """
-    return scale * reach
+    return scale * depth
 
 
 @inlined_kernel
@@ -333,13 +333,13 @@ def lookups(
     out: FloatArray,
     inside: NDArray[np.bool_],
 ) -> None:
-    """:func:`lookup` at each of d and θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
+    """Evaluate :func:`lookup` at each d, θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
 
     In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
     """
     p = address(data)
     form = int(header(p).form)
-    push = math.pi * header(p).modulus
+    force_by_d = math.pi * header(p).modulus
     work = np.empty(4 * _BLOCK)
     for start in range(0, d.shape[0], _BLOCK):
         stop = min(start + _BLOCK, d.shape[0])
@@ -356,7 +356,7 @@ def lookups(
                 r_f, r_u, r_fd, r_ft, r_ut = from_slab(p, form, work[k - start + _BLOCK], y)
             inverse = work[k - start + 2 * _BLOCK]
             slope = work[k - start + 3 * _BLOCK]
-            force_d = 2.0 * push * d[k] * inverse
+            force_d = 2.0 * force_by_d * d[k] * inverse
             force = 0.5 * force_d * d[k]
             energy_d = force * inverse
             energy = energy_d * d[k] * (1.0 / 3.0)

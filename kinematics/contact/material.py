@@ -37,7 +37,7 @@ _PIECES = 8
 
 @inner_kernel
 def stress_at(law: FloatArray, strain: float) -> float:
-    """σ(ε) [Pa] from ``law`` [pieces, order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
+    """Return σ(ε) [Pa] of ``law`` [pieces, order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
     if strain <= 0.0:
         return 0.0
     pieces, order = law.shape
@@ -94,7 +94,7 @@ class Material:
 
     @classmethod
     def constant(cls, modulus: float) -> Material:
-        """Hooke's law of modulus E [Pa]. Raises MaterialError unless E is positive and finite."""
+        """Return Hooke's law of modulus E [Pa]. Raises MaterialError unless finite and > 0."""
         value = float(modulus)
         if not (value > 0.0 and math.isfinite(value)):
             raise MaterialError(f"the modulus must be positive and finite, not {modulus!r}")
@@ -103,7 +103,7 @@ class Material:
     @classmethod
     @cache
     def table_i(cls) -> Material:
-        """The measured polyurethane of the paper's Table I, as a smooth law.
+        """Return the measured polyurethane of the paper's Table I, as a smooth law.
 
         The paper's numbers are slopes of the stress-strain curve ('Young's modulus, which
         corresponds to the slope'), so they are taken as the tangent modulus dσ/dε: 0.135 MPa (the
@@ -115,7 +115,7 @@ class Material:
 
     @classmethod
     def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
-        """A smooth monotone law near measured points of strain (a ratio) and stress [Pa].
+        """Fit a smooth monotone law to measured points of strain (a ratio) and stress [Pa].
 
         The origin belongs to every curve and need not be given. Points beyond strain 1 are not
         used; short of it the curve goes on with its last slope. ``misfits`` [2, n] are the points'
@@ -136,16 +136,16 @@ class Material:
         """The law's largest distance from the points that it was made from [Pa]; 0 without."""
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
-    def force_error(self, share: ArrayLike) -> FloatArray:
-        """Relative error of F, upright, by the law's misfit, at displacements over the radius.
+    def force_error(self, ratio: ArrayLike) -> FloatArray:
+        """Return F's relative error, upright, by the law's misfit, over displacements by radius.
 
         F/(2π h²) = ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d: the misfits, between the
-        points on straight lines from 0 at no strain, against the law. ``share`` in (0, 1].
+        points on straight lines from 0 at no strain, against the law. ``ratio`` in (0, 1].
         """
-        shares = np.asarray(share, np.float64)
+        ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
-            return np.zeros(shares.shape)
-        ends = np.minimum(shares[..., None], 0.999)
+            return np.zeros(ratios.shape)
+        ends = np.minimum(ratios[..., None], 0.999)
         strain = ends * (np.arange(200) + 0.5) / 200
         weight = (1.0 - strain) ** -3
         x, misses = np.concatenate([np.zeros((2, 1)), self.misfits], axis=1)
@@ -163,15 +163,15 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, continued linearly beyond 1, NaN for NaN."""
+        """Return σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, linear beyond 1, NaN for NaN."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
-        """w(ε) = ∫₀^ε σ [J/m³], shape of ``strain``; 0 for ε ≤ 0, NaN for NaN."""
+        """Return w(ε) = ∫₀^ε σ [J/m³], shape of ``strain``; 0 for ε ≤ 0, NaN for NaN."""
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
-        """What the quadrature needs of the law over E₀: float64 [7, pieces, order].
+        """Expand the law over E₀ for the quadrature: float64 [7, pieces, order].
 
         With S = σ/ε, W = 2w/ε², T = dσ/dε, each 1 at ε = 0, and X_1 = (X − X(0))/ε,
         X_2 = (X_1 − X_1(0))/ε: the rows are S_1, W_1, T_1, S_2, S_2′, T_2, T_2′. They are

@@ -1,4 +1,4 @@
-"""From measured points to smooth monotone stress-strain laws, and to a modulus.
+"""Fit of smooth monotone stress-strain laws, and of a modulus, to measured points.
 
 The tangent modulus is a Bernstein polynomial on [0, 1] with positive coefficients, which makes it
 positive everywhere; the coefficients come from least squares under that bound.
@@ -71,7 +71,7 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
 
 
 def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], FloatArray]:
-    """Coefficients c_1, c_2, … of σ(ε) [Pa], and [2, n] the points' strains and misfits [Pa].
+    """Return c_1, c_2, … of σ(ε) [Pa], and [2, n] the points' strains and misfits [Pa].
 
     The lowest degree is taken that comes about as near to the points as any. Beyond the last point
     the law goes on about straight.
@@ -146,7 +146,7 @@ def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
 
 
 def nonnegative(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Least squares under x ≥ 0 by the active-set method of Lawson and Hanson."""
+    """Solve least squares under x ≥ 0 by the active-set method of Lawson and Hanson."""
     count = matrix.shape[1]
     x = np.zeros(count)
     free = np.zeros(count, dtype=np.bool_)

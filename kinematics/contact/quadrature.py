@@ -6,7 +6,7 @@ Springs stand on the base plane and the face of the object cuts the spherical ca
 
 In coordinates t = n·P and the angle φ about the normal n, dx dy = z dt dφ (lengths over a). What is
 integrated is the ratio of each quantity to its closed form for a constant modulus E₀, which is 1
-plus a part that the material's nonlinearity makes; so nothing cancels when d → 0.
+plus a term that the material's nonlinearity makes; so nothing cancels when d → 0.
 
 The integral over φ is made exact: with ε dφ = (t − h)/(p cos θ) dχ, p = √(t² − sin² θ), ε is linear
 in cos χ and a polynomial law needs few nodes. The integral over t runs in y = √(t − sin θ), where
@@ -39,20 +39,20 @@ _DEEPEST = 2.0**-14  # where grading stops, over the singular point's own scale
 
 
 def gauss_rule(nodes: int = _NODES) -> FloatArray:
-    """Gauss-Legendre points and weights on [0, 1], float64 [2, nodes]."""
+    """Return Gauss-Legendre points and weights on [0, 1], float64 [2, nodes]."""
     points, weights = leggauss(nodes)
     return np.ascontiguousarray(np.stack([0.5 * (points + 1.0), 0.5 * weights]))
 
 
 def circle_rule(degree: int) -> FloatArray:
-    """cos χ and sin² χ, float64 [2, m]: equal weights, exact for a law of this ``degree``."""
+    """Return cos χ and sin² χ, float64 [2, m]: equal weights, exact for laws to this ``degree``."""
     count = max(1, degree // 2 + 1)
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
 
 
 def nodes_for(degree: int) -> int:
-    """Gauss points a piece for a law of this ``degree``."""
+    """Return Gauss points a piece for a law of this ``degree``."""
     return _NODES if degree <= 8 else _MORE_NODES
 
 
@@ -69,17 +69,17 @@ def _horner(table: FloatArray, row: int, piece: int, u: float) -> float:
 def ratios(
     gauss: FloatArray,
     circle: FloatArray,
-    parts: FloatArray,
+    polynomials: FloatArray,
     delta: float,
     h: float,
     s: float,
     c: float,
 ) -> tuple[float, float, float, float, float]:
-    """Ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
+    """Return ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
 
     gauss: [2, n] points and weights on [0, 1]. circle: [2, m] cos χ and sin² χ of the equidistant
-    angles. parts: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it so
-    that both keep their digits; s = |sin θ| ≤ h, c = cos θ.
+    angles. polynomials: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it
+    so that both keep their digits; s = |sin θ| ≤ h, c = cos θ.
     """
     # h − s without cancellation: near 1, by h² − s² = c² − ρ².
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
@@ -92,9 +92,9 @@ def ratios(
         c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
     span = delta / (y0 + y1)  # y1 − y0
-    pieces = parts.shape[1]
-    first_s = parts[0, 0, 0]
-    first_t = parts[2, 0, 0]
+    pieces = polynomials.shape[1]
+    first_s = polynomials[0, 0, 0]
+    first_t = polynomials[2, 0, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
     # Poles lie at y = 0, unless y0 = 0, and at y² = −2 sin θ; there are none when h = 0.
@@ -120,23 +120,23 @@ def ratios(
             p2 = y * y * (t + s)
             p = math.sqrt(p2)
             mean = q * t / p2
-            swing = q * s * math.sqrt(r2) / (c * p2)
+            amplitude = q * s * math.sqrt(r2) / (c * p2)
             a_s1 = 0.0
             a_w1 = 0.0
             a_t1 = 0.0
             a_s2 = 0.0
             a_t2 = 0.0
             for j in range(count):
-                strain = mean + swing * circle[0, j]
+                strain = mean + amplitude * circle[0, j]
                 u = min(max(strain, 0.0), 1.0) * pieces
                 k = min(int(u), pieces - 1)
                 u -= k
-                a_s1 += _horner(parts, 0, k, u)
-                a_w1 += _horner(parts, 1, k, u)
-                a_t1 += _horner(parts, 2, k, u)
-                bend = circle[1, j] * t * q / p2
-                a_s2 += _horner(parts, 3, k, u) + bend * _horner(parts, 4, k, u)
-                a_t2 += _horner(parts, 5, k, u) + bend * _horner(parts, 6, k, u)
+                a_s1 += _horner(polynomials, 0, k, u)
+                a_w1 += _horner(polynomials, 1, k, u)
+                a_t1 += _horner(polynomials, 2, k, u)
+                curvature = circle[1, j] * t * q / p2
+                a_s2 += _horner(polynomials, 3, k, u) + curvature * _horner(polynomials, 4, k, u)
+                a_t2 += _horner(polynomials, 5, k, u) + curvature * _horner(polynomials, 6, k, u)
             a_s1 /= count
             a_w1 /= count
             a_t1 /= count
@@ -147,10 +147,10 @@ def ratios(
             sum_f += scale * v * v * a_s1
             sum_u += scale * v * v * v * a_w1
             sum_fd += scale * v * a_t1
-            lever = r2 * c / (t * c + p)
+            middle = r2 * c / (t * c + p)
             across = q * r2 / p2
-            sum_ft += scale * v * (q * a_t1 + first_t * lever + across * a_t2)
-            sum_ut += scale * v * v * (q * a_s1 + first_s * lever + across * a_s2)
+            sum_ft += scale * v * (q * a_t1 + first_t * middle + across * a_t2)
+            sum_ut += scale * v * v * (q * a_s1 + first_s * middle + across * a_s2)
         low = high
     return (
         1.0 + 2.0 * delta * sum_f,
@@ -165,24 +165,24 @@ def ratios(
 def ratios_at(
     gauss: FloatArray,
     circle: FloatArray,
-    parts: FloatArray,
+    polynomials: FloatArray,
     delta: FloatArray,
     h: FloatArray,
     s: FloatArray,
     c: FloatArray,
     out: FloatArray,
 ) -> None:
-    """:func:`ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
+    """Evaluate :func:`ratios` at each of δ, h, s and c [n] into ``out`` [5, n]."""
     for i in range(delta.shape[0]):
         (out[0, i], out[1, i], out[2, i], out[3, i], out[4, i]) = ratios(
-            gauss, circle, parts, delta[i], h[i], s[i], c[i]
+            gauss, circle, polynomials, delta[i], h[i], s[i], c[i]
         )
 
 
 def integrate(
     tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike, nodes: int | None = None
 ) -> Closed:
-    """Force, energy and first partials of any material by integration, to 1e-14 relative.
+    """Return force, energy and first partials of any material by integration, to 1e-14 relative.
 
     d [m] and θ [rad] broadcast. Zeros for d ≤ 0; NaN outside the domain d ≤ a, |θ| ≤ θ's limit.
     ``nodes`` is the number of Gauss points a piece, chosen by the law's degree when not given.

@@ -45,7 +45,7 @@ class SolidData:
     square: float  # largest sin² θ
     energy: FloatArray  # g, and its partials by t, t twice, sin² θ, and both [5, i, j]
     harmonics: NDArray[np.int64]  # m of each mode [k]; 0 of the first
-    shares: FloatArray  # q [k, i, j]
+    ratios: FloatArray  # q [k, i, j]
     stick: FloatArray  # q_0, and its partials by t and sin² θ [3, i, j]
     edges: FloatArray  # of the rings in r/a [rings + 1]
     modes: FloatArray  # B [k, rings], means over the rings
@@ -55,48 +55,48 @@ class SolidData:
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """The data of a solid ``tip``'s ν, base and face."""
+    """Return the data of a solid ``tip``'s ν, base and face."""
     block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
-        kept: dict[str, Any] = {
+        stored: dict[str, Any] = {
             name.removeprefix(f"{block}."): file[name]
             for name in file.files
             if "." not in name or name.startswith(f"{block}.")
         }
-    low, high = kept["nu_range"]
+    low, high = stored["nu_range"]
     at = (2.0 * tip.poisson - low - high) / (high - low)
 
     def by_poisson(coefficients: FloatArray) -> FloatArray:
         return np.asarray(chebyshev.chebval(at, np.moveaxis(coefficients, -1, 0)))
 
-    root = float(kept["s_max"])
+    root = float(stored["s_max"])
     # 1 + t P with t = root/2 (1 + x); 2 x T_i = T_(i−1) + T_(i+1).
-    more = 0.5 * root * np.pad(by_poisson(kept["energy"]), ((0, 1), (0, 0)))
+    more = 0.5 * root * np.pad(by_poisson(stored["energy"]), ((0, 1), (0, 0)))
     ratio = more.copy()
     ratio[:-1] += 0.5 * more[1:]
     ratio[1:] += 0.5 * more[:-1]
     ratio[1] += 0.5 * more[0]
     ratio[0, 0] += 1.0
-    square = float(np.sin(kept["theta_max"]) ** 2)
+    square = float(np.sin(stored["theta_max"]) ** 2)
     energy = powers(ratio * 8.0 / (15.0 * (1.0 - tip.poisson**2)))
-    shares = np.stack([powers(by_poisson(each)) for each in kept["coef"]])
-    stick = shares[0]
+    ratios = np.stack([powers(by_poisson(each)) for each in stored["coef"]])
+    stick = ratios[0]
     return SolidData(
         root,
         square,
         with_partials(energy, root, square),
-        kept["m"].astype(np.int64),
-        shares,
+        stored["m"].astype(np.int64),
+        ratios,
         np.stack([stick, 2.0 / root * _slope(stick), 2.0 / square * _slope(stick.T).T]),
-        kept["ring_edges"],
-        kept["basis"],
-        by_poisson(kept["shear"]),
-        float(kept["force_error"]),
+        stored["ring_edges"],
+        stored["basis"],
+        by_poisson(stored["shear"]),
+        float(stored["force_error"]),
     )
 
 
 def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
-    """g [i, j] and its partials, as `SolidData.energy` has them."""
+    """Return g [i, j] and its partials, as `SolidData.energy` has them."""
     by_t = 2.0 / root * _slope(energy)
     by_square = 2.0 / square * _slope(energy.T).T
     by_both = 2.0 / square * _slope(by_t.T).T
@@ -104,7 +104,7 @@ def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
 
 
 def powers(terms: FloatArray) -> FloatArray:
-    """Chebyshev coefficients [i, j] as those of powers."""
+    """Return Chebyshev coefficients [i, j] as those of powers."""
     left, right = (
         np.array([np.pad(chebyshev.cheb2poly(row), (0, n))[:n] for row in np.eye(n)])
         for n in terms.shape

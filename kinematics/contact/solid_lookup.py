@@ -27,7 +27,7 @@ from softfinger.kinematics.compiled.simd import (
     polynomials,
 )
 from softfinger.kinematics.contact.closed_form import HALF_PI, Fingertip
-from softfinger.kinematics.contact.lookup import Six, Triple, lookup_at, push_at, stiffness_ahead
+from softfinger.kinematics.contact.lookup import Six, Triple, lookup_at, normal_at, stiffness_ahead
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
@@ -59,7 +59,7 @@ class SolidTable(Record):
 
 
 def solid_table(tip: Fingertip, material: Material) -> SolidTable:
-    """The table of a solid ``tip``, or of a measured one, whose material says nothing.
+    """Return the table of a solid ``tip``, or of a measured one, whose material says nothing.
 
     Raises MaterialError unless a solid tip's is linear.
     """
@@ -78,7 +78,7 @@ def solid_table(tip: Fingertip, material: Material) -> SolidTable:
 
 
 def _measured_table(law: TipCurves) -> SolidTable:
-    """That of measured curves, for a modulus of 1 Pa."""
+    """Return the table of measured curves, for a modulus of 1 Pa."""
     energy = with_partials(law.energy(), law.root, law.square)
     table = _table(law.radius, law.root, law.square, energy)
     table.modulus = 1.0
@@ -121,7 +121,7 @@ solid_at: Callable[[Pointer], SolidTable] = cast(Any, intrinsic)(_record)
 
 @inlined_kernel
 def energy_lanes(table: SolidTable, t: float, square: float) -> Lanes:
-    """g(t, sin² θ), ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ."""
+    """Return g(t, sin² θ), ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ."""
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
     lanes: Lanes = polynomials(address(table.coefficients), 0, 5, x, y)
@@ -141,7 +141,7 @@ def _held(table: SolidTable, t: float, square: float) -> Triple:
 
 @inner_kernel
 def _solid_lookup_at(p: Pointer, d: float, theta: float) -> Six:
-    """As `lookup.lookup_at`; where |θ| is beyond the data, the energy stays with θ, d being kept.
+    """Evaluate `lookup.lookup_at`; with |θ| beyond the data the energy stays with θ at fixed d.
 
     The partials are those of that energy, and the force goes on with cos θ.
     """
@@ -164,34 +164,34 @@ def _solid_lookup_at(p: Pointer, d: float, theta: float) -> Six:
     a = table.radius
     size = table.modulus * a * a * t * t * t
     depth = a * t * t
-    push = size * (2.5 * g + 0.5 * t * g_t)
+    normal = size * (2.5 * g + 0.5 * t * g_t)
     stiffness = 0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
-    push_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
+    normal_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
     held, held_t, held_s = _held(table, t, square)
     return (
-        c * push * held,
+        c * normal * held,
         size * depth * g,
-        c * (stiffness * held + push * held_t * 0.5 / (a * t)),
-        (c * push_theta - s * push) * held + c * push * chain * held_s,
-        push,
+        c * (stiffness * held + normal * held_t * 0.5 / (a * t)),
+        (c * normal_theta - s * normal) * held + c * normal * chain * held_s,
+        normal,
         chain * size * depth * g_s,
         inside,
     )
 
 
 @inner_kernel
-def _solid_stiffness_ahead(p: Pointer, scale: float, reach: float) -> float:
-    """As `lookup.stiffness_ahead`: Hertz's ∂N/∂d at d = ``reach``."""
+def _solid_stiffness_ahead(p: Pointer, scale: float, depth: float) -> float:
+    """Evaluate `lookup.stiffness_ahead`: Hertz's ∂N/∂d at d = ``depth``."""
     table = solid_at(p)
     stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
-    return stiffness * math.sqrt(reach * table.radius)
+    return stiffness * math.sqrt(depth * table.radius)
 
 
 @inner_kernel
-def _solid_push_at(
+def _solid_normal_at(
     p: Pointer, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
 ) -> Triple:
-    """As `lookup.push_at`."""
+    """Evaluate `lookup.normal_at`."""
     table = solid_at(p)
     if not table.sticks:
         force, force_d, force_theta = forces
@@ -215,7 +215,7 @@ def _solid_push_at(
 def solid_lookups(
     tables: Records[SolidTable], d: FloatArray, theta: FloatArray, out: FloatArray, inside: Any
 ) -> None:
-    """As `lookup.lookups`."""
+    """Evaluate `lookup.lookups`."""
     p = address(tables)
     for k in range(d.shape[0]):
         out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
@@ -228,5 +228,5 @@ def _is_solid(start: Any) -> bool:
 
 
 cast(Any, lookup_at).also(_solid_lookup_at, _is_solid)
-cast(Any, push_at).also(_solid_push_at, _is_solid)
+cast(Any, normal_at).also(_solid_normal_at, _is_solid)
 cast(Any, stiffness_ahead).also(_solid_stiffness_ahead, _is_solid)

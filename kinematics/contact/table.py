@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 class ContactForces(NamedTuple):
-    """What a table returns: arrays of the broadcast shape of d and θ, plain numbers for floats."""
+    """Values of a table: arrays of the broadcast shape of d and θ, plain numbers for floats."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
@@ -114,7 +114,7 @@ class ContactTable:
         return cls(build(tip, material, tolerance))
 
     def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
-        """The table with its key and checksum, for :meth:`from_bytes` to read again."""
+        """Return the table with its key and checksum, for :meth:`from_bytes` to read again."""
         key = table_key(tip, material, self.tolerance)
         body: bytes = key + struct.pack("<Q", self.data.size) + self.data.astype("<f8").tobytes()
         return _MAGIC + hashlib.sha256(body).digest() + body
@@ -123,7 +123,7 @@ class ContactTable:
     def from_bytes(
         cls, content: bytes, tip: Fingertip, material: Material, tolerance: float = 1e-9
     ) -> ContactTable:
-        """The table of this tip, material and tolerance that this version made ``content`` of.
+        """Read the table of this tip, material and tolerance that this version made ``content`` of.
 
         Raises TableError when it is damaged, belongs to another table or is none.
         """
@@ -209,7 +209,7 @@ class ContactTable:
 
 
 def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:
-    """What a saved table is for: SHA-256 of tip, material, tolerance and the code's version."""
+    """Return SHA-256 of a saved table's tip, material and tolerance and the code's version."""
     law = [str(value) for value in material.coefficients]
     text = repr((VERSION, _sources(), tip.radius.hex(), law, float(tolerance).hex()))
     return hashlib.sha256(text.encode()).digest()

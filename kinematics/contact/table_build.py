@@ -1,4 +1,4 @@
-"""How contact tables are fitted to the reference integrals, chosen by degree, with their error.
+"""Fit of contact tables to the reference integrals, chosen by degree, with certified error.
 
 A table's error is bounded piece by piece, over the whole domain with its edges: by the sum of the
 Chebyshev coefficients that the piece leaves out, what lies beyond them, and rounding. What it rests
@@ -25,7 +25,7 @@ from softfinger.kinematics.contact.lookup import (
     CLOSED,
     CORNER_PIECES,
     CORNER_SHAPE,
-    LEAST,
+    H_MIN,
     LOWEST,
     OCTAVES,
     SLAB_BITS,
@@ -53,7 +53,10 @@ _CORNER_OCTAVES = (-OCTAVES, -4, -6, -9, -14, -24, -54)  # pieces of log₂ h; n
 _CORNER_NODES = 14  # in each of them
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
 # Of the slabs over h, from LOWEST to 1.
-_EDGES = [LOWEST, *(LOWEST * 2.0**k * (1.0 + part) for k in range(OCTAVES) for part in _SLAB_ENDS)]
+_EDGES = [
+    LOWEST,
+    *(LOWEST * 2.0**k * (1.0 + piece) for k in range(OCTAVES) for piece in _SLAB_ENDS),
+]
 
 
 class _Worst(NamedTuple):
@@ -71,12 +74,12 @@ class LawTerms:
     material: Material
     gauss: FloatArray
     circle: FloatArray
-    parts: FloatArray
+    polynomials: FloatArray
     modulus: float
 
     @classmethod
     def of(cls, material: Material) -> LawTerms:
-        """Rules and expansions for ``material``."""
+        """Return rules and expansions for ``material``."""
         return cls(
             material,
             gauss_rule(nodes_for(material.degree)),
@@ -87,7 +90,7 @@ class LawTerms:
 
 
 def build(tip: Fingertip, material: Material, tolerance: float) -> FloatArray:
-    """The array of the table of least degree within ``tolerance``; see ContactTable.build."""
+    """Build the table of least degree within ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
     law = LawTerms.of(material)
@@ -127,23 +130,23 @@ def _filled(data: FloatArray, law: LawTerms, form: int) -> Iterator[_Worst]:
     columns = SHAPES[form]
     # More than needed in each direction, for what is left out.
     rows, width = columns[0] + _MORE_ROWS, len(columns) + _MORE_COLUMNS
-    kept = np.zeros((rows, width), dtype=np.bool_)
+    mask = np.zeros((rows, width), dtype=np.bool_)
     for j, count in enumerate(columns):
-        kept[:count, j] = True
+        mask[:count, j] = True
     x, y = _nodes(rows)[0], 0.5 * (_nodes(width)[0] + 1.0)
     at = START
     for low, high in pairwise(_EDGES):
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
         values = _ratios_at(law, h[:, None], y[None, :])
         terms = _terms(values)
-        numbers = _powers(terms * kept, columns)
+        numbers = _powers(terms * mask, columns)
         data[at : at + numbers.size] = numbers
         at += numbers.size
-        rounding = _rounding(terms * kept, (high + low) / (high - low), 1, low)
-        yield _bound(values, terms * ~kept, rounding, h, y)
+        rounding = _rounding(terms * mask, (high + low) / (high - low), 1, low)
+        yield _bound(values, terms * ~mask, rounding, h, y)
     for j in range(CORNER_PIECES):
         fitted = _corner(law, j)
-        numbers = np.concatenate([_powers(part, SHAPES[CORNER_SHAPE]) for part in fitted])
+        numbers = np.concatenate([_powers(piece, SHAPES[CORNER_SHAPE]) for piece in fitted])
         data[at : at + numbers.size] = numbers
         at += numbers.size
         yield from _corner_bounds(law, j, fitted)
@@ -162,11 +165,11 @@ def _bound(
     everywhere = _dense(len(h)) @ _terms(values) @ _dense(len(y)).T
     size = np.abs(everywhere)
     size[3] = np.maximum(size[3], size[0])
-    least = 0.99 * size.min(axis=(1, 2))
+    smallest = 0.99 * size.min(axis=(1, 2))
     each = np.abs(lost)
     beyond = each[:, -2:].sum(axis=(1, 2)) + each[:, :, -2:].sum(axis=(1, 2))
     total = each.sum(axis=(1, 2)) + 2.0 * beyond + rounding
-    bounds = total / least
+    bounds = total / smallest
     k = int(np.argmax(bounds))
     here = np.abs(_dense(len(h)) @ lost[k] @ _dense(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
@@ -186,8 +189,8 @@ def _rounding(terms: FloatArray, steep: float, y_pieces: int, low: float) -> Flo
     powers = np.abs(_to_powers(len(i))), np.abs(_to_powers(len(j)))
     sums = 32.0 * np.einsum("ai,bj,kij->k", *powers, size, optimize=True)
     by_h = 2.0 * (steep + 1.0) * (i**2 * size).sum(axis=(1, 2))
-    bend = (2.0 * y_pieces) ** 2 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
-    total: FloatArray = np.finfo(float).eps * (sums + by_h + 2.0 * bend / low**2)
+    second = (2.0 * y_pieces) ** 2 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
+    total: FloatArray = np.finfo(float).eps * (sums + by_h + 2.0 * second / low**2)
     return total
 
 
@@ -230,8 +233,8 @@ def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
 
 def _tilt(at: _Worst) -> float:
     """θ [rad] at h and y."""
-    rest = 1.0 - (at.h * at.y) ** 2
-    return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / rest), 1.0))
+    complement = 1.0 - (at.h * at.y) ** 2
+    return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / complement), 1.0))
 
 
 def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
@@ -239,11 +242,13 @@ def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
     # 1 − u² with u = h y, written so that nothing cancels when h and y near 1.
-    rest = (1.0 - y + delta * y) * (1.0 + h * y)
-    c = np.sqrt(delta * (1.0 + h) / rest)
-    s = h * np.sqrt((1.0 - y) * (1.0 + y) / rest)
+    complement = (1.0 - y + delta * y) * (1.0 + h * y)
+    c = np.sqrt(delta * (1.0 + h) / complement)
+    s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)
     out = np.empty((LANES, h.size))
-    ratios_at(law.gauss, law.circle, law.parts, delta.ravel(), h.ravel(), s.ravel(), c.ravel(), out)
+    ratios_at(
+        law.gauss, law.circle, law.polynomials, delta.ravel(), h.ravel(), s.ravel(), c.ravel(), out
+    )
     return out.reshape(LANES, *h.shape)
 
 
@@ -278,24 +283,24 @@ def _corner_bounds(law: LawTerms, piece: int, fitted: FloatArray) -> Iterator[_W
     """
     rows, columns = fitted.shape[2:]
     x, y = _nodes(_CORNER_NODES)[0], _nodes(columns + _MORE_COLUMNS)[0]
-    places = (piece + 0.5 * (y + 1.0)) / CORNER_PIECES
+    ys = (piece + 0.5 * (y + 1.0)) / CORNER_PIECES
     in_y = chebyshev.chebvander(y, columns - 1)
     for high, low in pairwise(_CORNER_OCTAVES):
         h = 2.0 ** (0.5 * (high + low) + 0.5 * (high - low) * x)
-        values = _ratios_at(law, h[:, None], places[None, :])
+        values = _ratios_at(law, h[:, None], ys[None, :])
         in_h = chebyshev.chebvander(2.0 * h / LOWEST - 1.0, rows - 1)
         ours = np.einsum("xi,pkij,yj->pkxy", in_h, fitted, in_y, optimize=True)
         lost = _terms(values - ours[0] - np.log(h)[:, None] * ours[1])
         rounding = _rounding(fitted[0], 1.0, CORNER_PIECES, 1.0)
         rounding -= low * math.log(2.0) * _rounding(fitted[1], 1.0, CORNER_PIECES, 1.0)
-        yield _bound(values, lost, rounding, h, places)
+        yield _bound(values, lost, rounding, h, ys)
     if piece == 0:
         # At d = a the kernel takes h = LEAST in the logarithm, and θ and y are 0.
         one = np.ones((1, 1))
         exact = _ratios_at(law, 0.0 * one, 0.0 * one)[:3, 0, 0]
         ends = (-1.0) ** np.arange(rows), (-1.0) ** np.arange(columns)
         a, b = np.einsum("i,pkij,j->pk", ends[0], fitted, ends[1], optimize=True)
-        lost = np.abs(a + math.log(LEAST) * b)[:3] - exact
+        lost = np.abs(a + math.log(H_MIN) * b)[:3] - exact
         yield _Worst(float(np.max(np.abs(lost) / exact)) + ROUNDING, 0.0, 0.0)
 
 

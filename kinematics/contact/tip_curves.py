@@ -79,12 +79,12 @@ class TipCurves:
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:
-        """One of the curves at d [m] and θ [rad]; they broadcast."""
+        """Return one of the curves at d [m] and θ [rad]; they broadcast."""
         t, q = np.sqrt(np.asarray(d) / self.radius), np.sin(theta) ** 2
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 
     def energy(self) -> FloatArray:
-        """g of U = a³ t⁵ g(t, q) [Pa], by powers of 2 t/root − 1 and 2 q/square − 1, [i, j]."""
+        """Return g of U = a³ t⁵ g(t, q) [Pa] in powers of 2 t/root − 1, 2 q/square − 1: [i, j]."""
         powers = np.arange(POWERS - FIRST)
         g = np.array(self.push)[FIRST:] * (2.0 / (5.0 + powers))[:, None] / self.radius**2
         return np.asarray(
@@ -100,7 +100,7 @@ def _shifted(count: int, end: float) -> FloatArray:
 
 
 def rises(curve: ArrayLike, root: float, square: float) -> bool:
-    """Whether the curve is above 0 and rises with t all over (0, root] × [0, square]."""
+    """Return whether the curve is above 0 and rises with t all over (0, root] × [0, square]."""
     t, q = np.meshgrid(np.linspace(0.0, root, 41), np.linspace(0.0, square, 9), indexing="ij")
     values = _value(t, q, np.asarray(curve))
     return bool((np.diff(values, axis=0) > 0.0).all() and (values[0] >= 0.0).all())

@@ -1,4 +1,4 @@
-"""From one frame of pressures to the contact under it: displacement, tilts, gain, covariance.
+"""Estimation of a contact from one frame of pressures: displacement, tilts, gain, covariance.
 
 The estimator's stages, mostly kernels, and the calibration that uses it; `estimator` is public.
 """

@@ -14,42 +14,45 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.estimation.state import Moments, Reach
+from softfinger.kinematics.estimation.state import Moments, Region
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid
 
 # Planes, float64 [PLANES, rows · cols]: the tip's height √(a² − x² − y²) over the cell's centre, or
 # over its nearest corner where the centre lies beyond the rim, and −∞ for a cell that is dead or
-# out of reach; the centre's x and y.
+# outside the region; the centre's x and y.
 HEIGHT, X, Y = range(3)
 PLANES = 3
 
 
-def cell_centres(grid: Grid, live: NDArray[np.bool_], reach: float, found: Reach) -> FloatArray:
-    """The planes of a grid whose ``live`` cells [rows, cols] are marked; fills in ``found``.
+def cell_centres(
+    grid: Grid, active: NDArray[np.bool_], radius: float, region: Region
+) -> FloatArray:
+    """Return the planes of a grid with the mask ``active`` [rows, cols]; fill in ``region``.
 
-    A cell is in reach when the disc of radius ``reach`` [m] round the tip's centre touches it.
+    A cell is in the region when the disc of radius ``radius`` [m] round the tip's centre touches
+    it.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
-    rows, cols = live.shape
+    rows, cols = active.shape
     x, y = np.meshgrid(
         grid.x + pitch_x * (np.arange(cols) + 0.5), grid.y + pitch_y * (np.arange(rows) + 0.5)
     )
     nearest_x = np.maximum(np.abs(x) - 0.5 * pitch_x, 0.0)
     nearest_y = np.maximum(np.abs(y) - 0.5 * pitch_y, 0.0)
-    touched = nearest_x**2 + nearest_y**2 < reach * reach
+    touched = nearest_x**2 + nearest_y**2 < radius * radius
     near = np.maximum(a * a - nearest_x**2 - nearest_y**2, 0.0)
     inside = a * a - x * x - y * y
     height = np.sqrt(np.where(inside > 0.0, inside, near))
     reached = np.flatnonzero(touched.any(axis=1))
     if len(reached):
-        found.first, found.last = int(reached[0]) * cols, (int(reached[-1]) + 1) * cols
-    found.number = int(np.count_nonzero(touched & live))
-    return np.stack([np.where(touched & live, height, -math.inf), x, y]).reshape(PLANES, -1)
+        region.first, region.last = int(reached[0]) * cols, (int(reached[-1]) + 1) * cols
+    region.number = int(np.count_nonzero(touched & active))
+    return np.stack([np.where(touched & active, height, -math.inf), x, y]).reshape(PLANES, -1)
 
 
 @fast_inner_kernel
 def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[float, float, float]:
-    """Σ p (not finite where a cell is not), Σ p² and the largest p, at least 0, of first..last."""
+    """Return Σ p (not finite where a cell is not), Σ p² and the largest p ≥ 0, of first..last."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -66,14 +69,14 @@ def totals(frame: Pointer, height: Pointer, first: int, last: int) -> tuple[floa
 
 @fast_inner_kernel
 def sums_above(
-    m: Moments, reach: Reach, frame: Pointer, centres: Pointer, size: int, level: float
+    m: Moments, region: Region, frame: Pointer, centres: Pointer, size: int, level: float
 ) -> None:
-    """Σ p, Σ p x, Σ p y and the number of the cells in reach with p above ``level``, into ``m``.
+    """Sum p, p x, p y and the number of the cells in the region with p above ``level``, into ``m``.
 
     ``size`` is that of a plane.
     """
     total = sum_x = sum_y = number = 0.0
-    for k in range(reach.first, reach.last):
+    for k in range(region.first, region.last):
         value = frame[k]
         counts = (centres[k] >= 0.0) & (value > level)
         value = value if counts else 0.0
@@ -91,7 +94,7 @@ def sums_above(
 def sums_inside(
     m: Moments, frame: Pointer, centres: Pointer, size: int, first: int, last: int
 ) -> None:
-    """Σ p, Σ p x, Σ p y, Σ p (x² + y²), cells first..last whose centre ``m.face`` has pressed."""
+    """Sum p, p x, p y, p (x² + y²) of cells first..last whose centre ``m.face`` has pressed."""
     u = m.face.u
     v = m.face.v
     w = m.face.w
@@ -118,7 +121,7 @@ def sums_inside(
 
 @fast_inner_kernel
 def _any_reads(frame: Pointer, start: int, level: float) -> bool:
-    """Whether one of 64 cells does, in reach or not: half of the memory."""
+    """Return whether one of 64 cells reads ``level``, in the region or not: half of the memory."""
     found = False
     for k in range(start, start + 64):
         found |= frame[k] >= level
@@ -143,7 +146,7 @@ def _any_of_8(frame: Pointer, height: Pointer, start: int, level: float) -> bool
 
 @fast_inner_kernel
 def next_above(frame: Pointer, height: Pointer, start: int, last: int, level: float) -> int:
-    """The first cell in start..last that reads ``level`` or more; ``last`` if there is none."""
+    """Return the first cell in start..last that reads ``level`` or more; ``last`` if none does."""
     while start + 64 <= last and not (
         _any_reads(frame, start, level) and _any_of_64(frame, height, start, level)
     ):

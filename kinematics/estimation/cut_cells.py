@@ -18,8 +18,8 @@ from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.state import (
     ALONG_X,
     ALONG_Y,
+    FRACTION,
     PLAIN,
-    SHARE,
     VARIANCE,
     WEIGHT,
     EstimatorState,
@@ -58,8 +58,8 @@ def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> Non
     sum_square = strips.sum_square
     # Whole lanes: what is left of earlier strips in the last ones does no harm.
     count = (strips.count + 7) & ~7
-    stretch = 1.0 + v * v
-    e = 1.0 / stretch
+    norm2 = 1.0 + v * v
+    e = 1.0 / norm2
     a2 = grid.radius * grid.radius
     n = (2, 4, 5)[level]  # lines
     for k in range(count):
@@ -70,13 +70,13 @@ def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> Non
         sum_square[k] = 0.0
     for line in range(n):
         node = GAUSS_NODES[n, line]
-        share = GAUSS_WEIGHTS[n, line]
+        weight = GAUSS_WEIGHTS[n, line]
         for k in range(count):
             y = start[k] + length[k] * node
             x0 = cell_x[k]
             rim = a2 - y * y
             q = u - w * y
-            root = math.sqrt(max(stretch * rim - q * q, 0.0))
+            root = math.sqrt(max(norm2 * rim - q * q, 0.0))
             # A root under the base plane is no edge: there the rim is.
             edge = math.sqrt(max(rim, 0.0))
             near = (v * q - root) * e
@@ -87,18 +87,18 @@ def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> Non
             across = max(min(far, x0 + pitch_x) - near, 0.0)
             left[k] = near
             width[k] = across
-            area[k] += share * length[k] * across
+            area[k] += weight * length[k] * across
         if level == FINEST:
-            _add_to_the_rim(strips, count, face, a2, node, share)
+            _add_to_the_rim(strips, count, face, a2, node, weight)
             continue
-        for part in range(level + 1):
-            portion = 1.0 / (level + 1)
-            begin = part * portion
+        for section in range(level + 1):
+            section_width = 1.0 / (level + 1)
+            begin = section * section_width
             for k in range(count):
                 y = start[k] + length[k] * node
                 rim = a2 - y * y
                 q = u - w * y
-                across = portion * width[k]
+                across = section_width * width[k]
                 near = left[k] + begin * width[k]
                 xa = near + across * NEAR
                 xb = near + across * FAR
@@ -109,7 +109,7 @@ def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> Non
                 gb = gb if q > v * xb else 0.0
                 face_a = (q - v * xa) * ga
                 face_b = (q - v * xb) * gb
-                half = 0.5 * share * length[k] * across
+                half = 0.5 * weight * length[k] * across
                 sum_g[k] += half * (ga + gb)
                 sum_x[k] += half * (xa * ga + xb * gb)
                 sum_y[k] += half * y * (ga + gb)
@@ -118,7 +118,7 @@ def _integrate_strips(strips: Strips, level: int, face: Face, grid: Grid) -> Non
 
 @fast_inner_kernel
 def _add_to_the_rim(
-    strips: Strips, count: int, face: Face, a2: float, node: float, share: float
+    strips: Strips, count: int, face: Face, a2: float, node: float, line_weight: float
 ) -> None:
     """One line of each strip, by three Gauss points over s = √(R − x), the rim at x = ±R.
 
@@ -129,10 +129,10 @@ def _add_to_the_rim(
         rim = a2 - y * y
         q = face.u - face.w * y
         # Mirrored where the rim is on the left.
-        turned = 1.0 - 2.0 * strips.side[k]
+        sign = 1.0 - 2.0 * strips.side[k]
         edge = math.sqrt(max(rim, 1e-9 * a2))
-        from_rim = edge - turned * strips.left[k]
-        across = turned * strips.width[k]
+        from_rim = edge - sign * strips.left[k]
+        across = sign * strips.width[k]
         far = math.sqrt(max(from_rim, 0.0))
         near = math.sqrt(max(from_rim - across, 0.0))
         low = max(min(near, far), 1e-4 * edge)
@@ -141,23 +141,23 @@ def _add_to_the_rim(
         for point in range(3):
             s = low + span * GAUSS_NODES[3, point]
             x = edge - s * s
-            height = q - face.v * turned * x
+            height = q - face.v * sign * x
             g = 1.0 / (s * math.sqrt(max(edge + x, 1e-6 * edge)))
             g = g if height > 0.0 else 0.0
             weight = GAUSS_WEIGHTS[3, point] * s * g
             total += weight
             along += weight * x
             square += weight * g * height * height
-        half = 2.0 * share * strips.length[k] * span
+        half = 2.0 * line_weight * strips.length[k] * span
         strips.sum_g[k] += half * total
-        strips.sum_x[k] += half * turned * along
+        strips.sum_x[k] += half * sign * along
         strips.sum_y[k] += half * y * total
         strips.sum_square[k] += half * square
 
 
 @inner_kernel
 def flush(state: EstimatorState, level: int, packed: Pointer) -> None:
-    """Sum the strips of one level's cut cells into the cells' places in ``packed``; empties it."""
+    """Sum the strips of one level's cut cells into the cells' entries in ``packed``; empties it."""
     strips = state.strips[level]
     grid = state.model
     face = state.fit.face
@@ -174,10 +174,10 @@ def flush(state: EstimatorState, level: int, packed: Pointer) -> None:
             g_y += strips.sum_y[strip]
             square += strips.sum_square[strip]
             strip += 1
-        place = strips.places[k]
-        share = area * whole
+        index = strips.indices[k]
+        fraction = area * whole
         variance = 0.0
-        if share > 1e-9:
+        if fraction > 1e-9:
             per_area = 1.0 / area
             g *= per_area
             g_x *= per_area
@@ -186,19 +186,19 @@ def flush(state: EstimatorState, level: int, packed: Pointer) -> None:
             # The strain's variance is that of the face's height times g.
             variance = square * per_area - height * height
         else:
-            share = g = g_x = g_y = 0.0
-            packed[WEIGHT * size + place] = 0.0
-        packed[SHARE * size + place] = share
-        packed[PLAIN * size + place] = g
-        packed[ALONG_X * size + place] = g_x
-        packed[ALONG_Y * size + place] = g_y
-        packed[VARIANCE * size + place] = variance
+            fraction = g = g_x = g_y = 0.0
+            packed[WEIGHT * size + index] = 0.0
+        packed[FRACTION * size + index] = fraction
+        packed[PLAIN * size + index] = g
+        packed[ALONG_X * size + index] = g_x
+        packed[ALONG_Y * size + index] = g_y
+        packed[VARIANCE * size + index] = variance
     strips.count = 0
     strips.owners = 0
 
 
 @inner_kernel
-def push_strips(
+def append_strips(
     strips: Strips,
     x0: float,
     start: float,
@@ -223,7 +223,7 @@ def push_strips(
     b1, b3 = min(b1, b3), max(b1, b3)
     b1, b2 = min(b1, b2), max(b1, b2)
     side = 1.0 if x0 < 0.0 else 0.0
-    least = 1e-6 * height
+    length_min = 1e-6 * height
     count = strips.count
     for end in (b0, b1, b2, b3, stop):
         strips.start[count] = start
@@ -231,7 +231,7 @@ def push_strips(
         strips.cell_x[count] = x0
         strips.side[count] = side
         # Written anyway, and kept if it's worth it: no branch that can't be foreseen.
-        kept = end - start > least
-        count += 1 if kept else 0
-        start = end if kept else start
+        counts = end - start > length_min
+        count += 1 if counts else 0
+        start = end if counts else start
     strips.count = count

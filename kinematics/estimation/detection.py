@@ -1,8 +1,7 @@
-"""Whether anything presses on a pressure grid, cheaply, and whether it can be one contact.
+"""Cheap test of a frame: does anything press on the grid, and can it be one contact?
 
-Cells that read high alone, as no contact can make them, are found and left out.
-
-Kernels that look at readings and noise alone; no displacement or tilt comes from here.
+Kernels on readings and noise alone, without displacement or tilt. Cells that read high alone, as no
+contact can make them, are found and masked.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.cell_centres import next_above, totals
 from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState
-from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
+from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
 from softfinger.kinematics.sensing.footprint import (
     Grid,
     band_columns,
@@ -28,10 +27,10 @@ _STRONG = 6.0  # noise: above it the largest cell is looked at first
 
 @inner_kernel
 def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float:
-    """How far the 5 × 5 cells round the cell ``at``, itself left out, stand above noise 1.
+    """Return how far the 5 × 5 cells round the cell ``at``, itself left out, stand above noise 1.
 
     Weights (1, 2, 2, 2, 1) both ways; the sum over its standard deviation. ``height`` is the plane
-    of :mod:`estimation.cell_centres`: cells that are dead or out of reach don't count.
+    of :mod:`estimation.cell_centres`: cells that are dead or outside the region don't count.
     """
     cols = grid.cols
     i = at // cols
@@ -50,46 +49,46 @@ def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float
 
 @inner_kernel
 def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
-    """Cheap test of the frame, into ``state.signal``.
+    """Test the frame for a contact, cheaply, into ``state.signal``.
 
     A contact is a cell of ``peak_level`` · noise or more whose neighbours' weighted sum, itself
-    left out, passes ``patch_level`` standard deviations: one outlier alone is none. At levels 3
-    and 4.9 white noise passes for one in 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 of the frames of 788
-    cells, a cell and its neighbours being independent; d = 0.2 mm under 0.2 % of the modulus as
-    noise is seen in 99.98 %, measured over 150 000 frames, all azimuths, tilts up to 30° and places
+    left out, passes ``patch_level`` standard deviations: one outlier alone is none. At levels 3 and
+    4.9 white noise passes for one in 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 of the frames of 788 cells, a
+    cell and its neighbours being independent; d = 0.2 mm under 0.2 % of the modulus as noise is
+    seen in 99.98 %, measured over 150 000 frames, all azimuths, tilts up to 30° and positions
     between the cells.
     """
     signal = state.signal
     grid = state.grid
-    last = state.reach.last
-    total, energy, peak = totals(frame, height, state.reach.first, last)
+    last = state.region.last
+    total, energy, peak = totals(frame, height, state.region.first, last)
     signal.finite = math.isfinite(total) and math.isfinite(peak)
     signal.peak = peak
-    signal.mean = total / max(float(state.reach.number), 1.0)
+    signal.mean = total / max(float(state.region.number), 1.0)
     signal.energy = energy
     contact = False
-    place = -1
+    cell = -1
     level = state.options.peak_level * signal.noise
     patch = signal.patch_level * signal.noise
     if signal.finite and peak >= level:
         if peak > _STRONG * signal.noise:
-            place = next_above(frame, height, state.reach.first, last, peak)
-            contact = neighbourhood(frame, height, grid, place) > patch
-        at = last if contact else next_above(frame, height, state.reach.first, last, level)
+            cell = next_above(frame, height, state.region.first, last, peak)
+            contact = neighbourhood(frame, height, grid, cell) > patch
+        at = last if contact else next_above(frame, height, state.region.first, last, level)
         while at < last:
-            place = at if frame[at] == peak else place
+            cell = at if frame[at] == peak else cell
             contact = contact or neighbourhood(frame, height, grid, at) > patch
             at = next_above(frame, height, at + 1, last, level)
     signal.contact = contact
-    signal.row = place // grid.cols if place >= 0 else -1
-    signal.col = place - signal.row * grid.cols if place >= 0 else -1
+    signal.row = cell // grid.cols if cell >= 0 else -1
+    signal.col = cell - signal.row * grid.cols if cell >= 0 else -1
 
 
 @inner_kernel
 def presses_outside(
     solid: SolidFit | None, state: EstimatorState, frame: Pointer, height: Pointer, level: float
 ) -> bool:
-    """Whether a cell of ``level`` or more, and not it alone, lies two cells off the footprint.
+    """Return whether cells of ``level`` or more, not one alone, lie two cells off the footprint.
 
     Three standard deviations of the blur are added to the two cells. ``level`` is in the frame's
     unit; the neighbours' weighted mean must reach a third of it.
@@ -105,7 +104,7 @@ def presses_outside(
     face = state.around
     set_face(face, a, a - math.sqrt(a * a - rho * rho), state.estimate.n_x, state.estimate.n_y)
     set_extremes(face, a)
-    for i in range(state.reach.first // cols, state.reach.last // cols):
+    for i in range(state.region.first // cols, state.region.last // cols):
         y0 = grid.y + i * grid.pitch_y
         y1 = y0 + grid.pitch_y
         below = line_span(face.u, face.v, face.w, a, y0)
@@ -128,7 +127,7 @@ _DEAD = 1e3  # m below: no face is ever there
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
-    """Whether the largest cell stands alone as no contact can.
+    """Return whether the largest cell stands alone as no contact can.
 
     A contact about as wide as a cell could press ``signal.confined`` at most: a wider one never has
     a cell that stands at twice its neighbours.
@@ -154,7 +153,7 @@ def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
 
 @inner_kernel
 def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, height: Pointer) -> int:
-    """The number of outliers; ``state.signal`` is what :func:`activity` finds without them.
+    """Return the number of outliers; ``state.signal`` is what :func:`activity` finds without them.
 
     They are marked dead until :func:`restore_outliers`.
     """
@@ -168,10 +167,10 @@ def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, heig
         and rejected < OUTLIERS_MAX
         and _is_outlier(state, frame, height)
     ):
-        cells[(signal.row * CELL_PLANES + LIVE) * cols + signal.col] = 0.0
+        cells[(signal.row * CELL_PLANES + ACTIVE) * cols + signal.col] = 0.0
         at = signal.row * cols + signal.col
         height[at] -= _DEAD
-        state.reach.number -= 1
+        state.region.number -= 1
         state.outliers[rejected] = at
         rejected += 1
         activity(state, frame, height)
@@ -185,6 +184,6 @@ def restore_outliers(state: EstimatorState, rejected: int, cells: Pointer, heigh
     for k in range(rejected):
         at = state.outliers[k]
         row = at // cols
-        cells[(row * CELL_PLANES + LIVE) * cols + at - row * cols] = 1.0
+        cells[(row * CELL_PLANES + ACTIVE) * cols + at - row * cols] = 1.0
         height[at] += _DEAD
-        state.reach.number += 1
+        state.region.number += 1

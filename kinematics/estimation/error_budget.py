@@ -39,12 +39,12 @@ _DEEPEST = 0.75  # of the radius: the end of the table over d
 _NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 _PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
 _FEW = 48.0  # cells within which nothing is smooth or rough
-# What the fit makes of a motion besides its straight answer, as shares of d and of the gain by the
-# square of the motion in depth over d and of the turn, and by that of the turn times d/a in any
-# direction: measured over the envelope, with shifts of 1 kPa, of 0.5 mm, of 1 % of the pitch and
-# 5 % of the modulus.
+# What the fit makes of a motion besides its straight answer, as fractions of d and of the gain by
+# the square of the motion in depth over d and of the turn, and by that of the turn times d/a in any
+# direction: measured over the envelope, with shifts of 1 kPa, of 0.5 mm, of 1 % of the pitch and 5
+# % of the modulus.
 _D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
-_D_BY_TURN, _GAIN_BY_TURN, _REST = 0.8, 2.0, 1.6
+_D_BY_ROTATION, _GAIN_BY_ROTATION, _BY_ROTATION_AT_DEPTH = 0.8, 2.0, 1.6
 _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
 
 
@@ -86,11 +86,11 @@ def set_errors(state: EstimatorState, known: Uncertainty, law: float) -> None:
     budget.baseline, budget.centre, budget.pitch = known.baseline, known.centre, known.pitch
     budget.modulus = 0.0 if state.options.free_gain else known.modulus
     budget.systematic = max(budget.shift, known.centre, known.pitch, budget.modulus) > 0.0
-    budget.sharing = 1.0
+    budget.cells_per_sample = 1.0
     if known.correlation is not None and known.correlation.size > 1:
         rho = both_ways(known.correlation)
         budget.correlated = True
-        budget.sharing = float((rho**2).sum())
+        budget.cells_per_sample = float((rho**2).sum())
         budget.along = float(known.correlation[0, 1]) if known.correlation.shape[1] > 1 else 0.0
 
 
@@ -106,16 +106,16 @@ def set_budget(
     norm = float(np.sqrt((weights**2).sum()))
     if budget.correlated:
         rho = both_ways(known.correlation)
-        _set_inflation(budget, rho, grid, tip, options.free_gain)
+        _set_variance_factor(budget, rho, grid, tip, options.free_gain)
         with_centre = float((weights * _fitted(rho, 5)).sum())
-        spread = float(quadratic(weights, rho)) - with_centre**2
-        level = (level * math.sqrt(max(spread, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
+        variance = float(quadratic(weights, rho)) - with_centre**2
+        level = (level * math.sqrt(max(variance, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
     # A shift of twice the baseline's standard deviation is no contact.
     options.patch_level = level + 2.0 * known.baseline / options.noise * weights.sum() / norm
 
 
 def both_ways(correlation: FloatArray | None) -> FloatArray:
-    """The correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
+    """Return the correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
     assert correlation is not None
     rows, cols = correlation.shape
     return np.asarray(
@@ -135,7 +135,7 @@ def _fitted(rho: FloatArray, size: int) -> FloatArray:
 
 
 def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
-    """Σ over pairs of cells of field · ρ · field, for one field [rows, cols] or several […, n]."""
+    """Return Σ over pairs of cells of field · ρ · field, for fields [rows, cols] or […, n]."""
     several = fields.reshape(*fields.shape[:2], -1)
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
     kernel = np.zeros(shape)
@@ -148,7 +148,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     return np.asarray(out if fields.ndim == 3 else out[0, 0])
 
 
-def _set_inflation(
+def _set_variance_factor(
     budget: Budget, rho: FloatArray, grid: SensorGrid, tip: Fingertip, free: bool
 ) -> None:
     """K = L⁻¹ JᵀCJ L⁻ᵀ over d, J by (gain, u, v, w) at no tilt, JᵀJ = LLᵀ, C the correlation.
@@ -174,11 +174,11 @@ def _set_inflation(
         white = np.einsum("xyi,xyj->ij", jacobian, jacobian)
         inverse = np.linalg.inv(np.linalg.cholesky(white))
         first = 4 - len(columns)
-        budget.inflation[k, first:, first:] = inverse @ quadratic(jacobian, rho) @ inverse.T
+        budget.variance_factor[k, first:, first:] = inverse @ quadratic(jacobian, rho) @ inverse.T
 
 
 @inner_kernel
-def colour(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
+def correlate(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
     """Make ``fit.inverse`` the covariance under correlated noise of variance 1; the trace of K."""
     fit = state.fit
     budget = state.budget
@@ -187,19 +187,21 @@ def colour(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
     t = min(max(t, 0.0), DEPTHS - 1.001)
     k = int(t)
     t -= k
-    kept = budget.kept
+    work = budget.work
     trace = 0.0
     for i in range(first, 4):
         for j in range(first, 4):
-            kept[i, j] = (1.0 - t) * budget.inflation[k, i, j] + t * budget.inflation[k + 1, i, j]
-        trace += kept[i, i]
+            work[i, j] = (1.0 - t) * budget.variance_factor[k, i, j] + t * budget.variance_factor[
+                k + 1, i, j
+            ]
+        trace += work[i, i]
     # (JᵀJ)⁻¹ = AᵀA with A = lower · scale.
     half = fit.matrix
     for i in range(first, 4):
         for j in range(first, 4):
             value = 0.0
             for m in range(j, 4):
-                value += kept[i, m] * fit.lower[m, j]
+                value += work[i, m] * fit.lower[m, j]
             half[i, j] = value * fit.scale[j]
     for i in range(first, 4):
         for j in range(first, 4):
@@ -214,7 +216,7 @@ def colour(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
 def smooth_misfit(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer
 ) -> tuple[float, float]:
-    """Σ over neighbours in the packed cells of the product of their residuals [Pa²]; their number.
+    """Return Σ over neighbouring packed cells of the product of residuals [Pa²], and their number.
 
     Noise of single cells adds nothing to it on average, what is smooth over the footprint all.
     """
@@ -239,10 +241,10 @@ def smooth_misfit(
 
 
 @inner_kernel
-def hidden_misfit(
+def undetected_misfit(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, beyond: float
 ) -> float:
-    """Square sum [Pa²] of what the model leaves smoothly over the footprint; 0 within the noise.
+    """Return the square sum [Pa²] of misfit smooth over the footprint; 0 within the noise.
 
     ``beyond`` [Pa²] is all that it leaves beyond what is expected: in a footprint of few cells no
     part of that can be told from smooth.
@@ -252,14 +254,14 @@ def hidden_misfit(
     # What the last step takes off is not in the packed cells yet.
     total -= number * variance * state.budget.along + state.fit.decrement
     total = beyond if number < _FEW else min(total, beyond)
-    if total <= _SURE * variance * math.sqrt(number * state.budget.sharing):
+    if total <= _SURE * variance * math.sqrt(number * state.budget.cells_per_sample):
         return 0.0
     return total
 
 
 @fast_inner_kernel
-def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
-    """Jᵀq and qᵀq of the patterns q: a shift of all cells, of the tip in x and in y, the pitch."""
+def project_shared_errors(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
+    """Set Jᵀq and qᵀq of shared errors q: a shift of all cells, the tip's x and y, the pitch."""
     face = state.fit.face
     u = face.u
     v = face.v
@@ -269,11 +271,11 @@ def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> 
     xx_cell = state.model.pitch_x * state.model.pitch_x / 3.0
     yy_cell = state.model.pitch_y * state.model.pitch_y / 3.0
     size = state.model.rows * state.model.cols
-    answers = address(state.budget.answers)
+    responses = address(state.budget.responses)
     squares = address(state.budget.squares)
     for column in range(4):
         plane = column * size  # STRESS, BY_U, BY_V, BY_W stand first
-        shift = along_x = along_y = stretch = 0.0
+        shift = along_x = along_y = scaling = 0.0
         n = xx = yy = ss = 0.0
         for k in range(state.fit.count):
             g = packed[BY_U * size + k]
@@ -293,15 +295,15 @@ def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> 
             shift += own * whole
             along_x += own * by_x
             along_y += own * by_y
-            stretch += own * by_pitch
+            scaling += own * by_pitch
             n += whole
             xx += by_x * by_x
             yy += by_y * by_y
             ss += by_pitch * by_pitch
-        answers[4 * column] = shift
-        answers[4 * column + 1] = along_x
-        answers[4 * column + 2] = along_y
-        answers[4 * column + 3] = stretch
+        responses[4 * column] = shift
+        responses[4 * column + 1] = along_x
+        responses[4 * column + 2] = along_y
+        responses[4 * column + 3] = scaling
         squares[0] = n
         squares[1] = xx
         squares[2] = yy
@@ -309,36 +311,38 @@ def patterns(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> 
 
 
 @inner_kernel
-def bend(solid: SolidFit | None, state: EstimatorState, d: float, out: Matrix) -> None:
-    """Add to ``out`` what a motion ``budget.moved`` is off the straight answer for its size."""
+def add_second_order(solid: SolidFit | None, state: EstimatorState, d: float, out: Matrix) -> None:
+    """Add the second-order error of the shift ``budget.displacement`` to the covariance ``out``."""
     fit = state.fit
-    moved = state.budget.moved
+    displacement = state.budget.displacement
     gain = fit.gain
     u = fit.face.u
     v = fit.face.v
     w = fit.face.w
     n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    deeper = n_z * (u * n_z * n_z * (v * moved[2] + w * moved[3]) - moved[1]) / d
+    deeper = (
+        n_z * (u * n_z * n_z * (v * displacement[2] + w * displacement[3]) - displacement[1]) / d
+    )
     square = min(deeper * deeper, 1.0)
-    turned = min(moved[2] * moved[2] + moved[3] * moved[3], 1.0)
-    by_turn = _D_BY_TURN * d * turned
-    rest = _REST * turned * d / state.grid.radius
-    out[1, 1] += (_D_BY_DEPTH * d * square) ** 2 + by_turn * by_turn + (rest * d) ** 2
-    out[2, 2] += rest * rest
-    out[3, 3] += rest * rest
+    rotated = min(displacement[2] * displacement[2] + displacement[3] * displacement[3], 1.0)
+    d_by_rotation = _D_BY_ROTATION * d * rotated
+    tilted = _BY_ROTATION_AT_DEPTH * rotated * d / state.grid.radius
+    out[1, 1] += (_D_BY_DEPTH * d * square) ** 2 + d_by_rotation * d_by_rotation + (tilted * d) ** 2
+    out[2, 2] += tilted * tilted
+    out[3, 3] += tilted * tilted
     if state.options.free_gain:
-        gain_by_turn = _GAIN_BY_TURN * gain * turned
-        out[0, 0] += (_GAIN_BY_DEPTH * gain * square) ** 2 + gain_by_turn * gain_by_turn
-        out[0, 0] += (rest * gain) ** 2
-        out[0, 1] += by_turn * gain_by_turn
-        out[1, 0] += by_turn * gain_by_turn
+        gain_by_rotation = _GAIN_BY_ROTATION * gain * rotated
+        out[0, 0] += (_GAIN_BY_DEPTH * gain * square) ** 2 + gain_by_rotation * gain_by_rotation
+        out[0, 0] += (tilted * gain) ** 2
+        out[0, 1] += d_by_rotation * gain_by_rotation
+        out[1, 0] += d_by_rotation * gain_by_rotation
 
 
 @inner_kernel
 def systematic(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, d: float, out: Matrix
 ) -> float:
-    """Covariance of (gain, u, v, w) by what all frames share, into ``out``.
+    """Compute the covariance of (gain, u, v, w) by what all frames share, into ``out``.
 
     ``fit.inverse`` is that of white noise of variance 1 [Pa²]. Returns the square sum [Pa²] that
     the fit leaves of it where each is twice its standard deviation.
@@ -346,29 +350,29 @@ def systematic(
     fit = state.fit
     budget = state.budget
     gain = fit.gain
-    patterns(solid, state, packed)
+    project_shared_errors(solid, state, packed)
     factor = (1.0, -gain, gain, gain)
     sizes = (budget.shift, gain * budget.centre, gain * budget.centre, gain * budget.pitch)
-    moved = budget.moved
+    displacement = budget.displacement
     out[:] = 0.0
-    left = 0.0
+    remaining = 0.0
     for source in range(5):
         # The pattern of the modulus is the pressure itself.
         size = sizes[source] if source < 4 else gain * budget.modulus
         square = budget.squares[source] if source < 4 else fit.sums.normal[0]
-        left += size * size * square
+        remaining += size * size * square
         for i in range(4):
-            moved[i] = 0.0
+            displacement[i] = 0.0
         for j in range(4):
-            answer = budget.answers[j, source] if source < 4 else fit.sums.normal[j]
-            answer *= factor[j] * size
+            response = budget.responses[j, source] if source < 4 else fit.sums.normal[j]
+            response *= factor[j] * size
             for i in range(4):
-                moved[i] += fit.inverse[i, j] * answer
+                displacement[i] += fit.inverse[i, j] * response
         for j in range(4):
-            answer = budget.answers[j, source] if source < 4 else fit.sums.normal[j]
-            left -= moved[j] * answer * factor[j] * size
+            response = budget.responses[j, source] if source < 4 else fit.sums.normal[j]
+            remaining -= displacement[j] * response * factor[j] * size
         for i in range(4):
             for j in range(4):
-                out[i, j] += moved[i] * moved[j]
-        bend(solid, state, d, out)
-    return 4.0 * max(left, 0.0)
+                out[i, j] += displacement[i] * displacement[j]
+        add_second_order(solid, state, d, out)
+    return 4.0 * max(remaining, 0.0)

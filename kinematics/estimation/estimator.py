@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.simd import STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.blurred_cells import parts_to_fit, weights
+from softfinger.kinematics.estimation.blurred_cells import pieces_to_fit, weights
 from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
 from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
@@ -26,14 +26,14 @@ from softfinger.kinematics.estimation.moments import moment_ratios
 from softfinger.kinematics.estimation.solid_budget import set_solid_budget
 from softfinger.kinematics.estimation.solid_fit import lay_out_solid, within_rim
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
-from softfinger.kinematics.sensing.cell_integrals import LIVE, cell_integrals
+from softfinger.kinematics.sensing.cell_integrals import ACTIVE, cell_integrals
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
 @dataclass(slots=True)
 class ContactEstimate:
-    """What one frame says about the contact; SI units, angles in rad.
+    """Estimate of the contact in one frame; SI units, angles in rad.
 
     ``contact``: something presses. ``valid`` promises one contact that the model describes: the
     fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
@@ -47,7 +47,7 @@ class ContactEstimate:
 
     ``covariance`` is of (d, tilt_x, tilt_y, gain), ``systematic`` the part of it that all frames
     share and averaging does not lessen; a fixed gain has a zero row, and without contact all is
-    zero. ``chi2`` is the misfit's square a cell over the noise's, ``explained`` the share of the
+    zero. ``chi2`` is the misfit's square a cell over the noise's, ``r_squared`` the fraction of the
     frame's squared pressure that the model accounts for; both are 0 where nothing was fitted.
     ``misfit``: χ² is beyond what the noise makes once in 3.5 million frames, so that the model does
     not describe the contact well, or the noise is larger than given.
@@ -60,7 +60,7 @@ class ContactEstimate:
     tilt_y: float = 0.0
     gain: float = 1.0
     chi2: float = 0.0
-    explained: float = 0.0
+    r_squared: float = 0.0
     peak: float = 0.0  # largest cell [Pa]
     cells: int = 0  # cells in the fit
     iterations: int = 0
@@ -69,7 +69,7 @@ class ContactEstimate:
     misfit: bool = False
     shear_x: float = 0.0  # force along the face [N], which a solid tip's base feels
     shear_y: float = 0.0
-    sharing: float = 1.0  # cells for each whose noise is independent
+    cells_per_sample: float = 1.0  # cells for each whose noise is independent
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
@@ -100,7 +100,7 @@ _FULL = {
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """How a board's readings end. Raises ValueError for values out of their range.
+    """Range of a board's readings. Raises ValueError for values out of their range.
 
     ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; None: an
     integer type's largest value. ``threshold`` is the smallest count the board sends, 0 stands for
@@ -123,7 +123,9 @@ _TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iterati
 _ITERATIONS = 20
 PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
 PATCH_LEVEL = 4.9
-_EXPLAINED_MIN = 0.8  # share of the frame's squared pressure below which an estimate is not valid
+_R_SQUARED_MIN = (
+    0.8  # fraction of the frame's squared pressure below which an estimate is not valid
+)
 
 
 class ContactEstimator:
@@ -132,11 +134,11 @@ class ContactEstimator:
     Takes the tip, its material, the grid, and ``noise``, a cell's standard deviation [Pa].
     ``method`` is "ml" (maximum likelihood) or "moments". ``free_gain`` also estimates measured over
     modelled pressure, by default for a tip of springs alone: a solid tip's frame hardly changes its
-    shape with d, which then shows in the force only. Otherwise it is 1. ``live`` [rows, cols] bool
-    masks dead cells. ``readings`` says where the board's readings end. ``known`` are the sensor's
-    other uncertainties, none by default: they widen the covariance, and make the activity test as
-    much less sensitive. A material's own ``fit_error`` counts among them. The
-    fit goes up to a tilt of 71.57° (tan 3), and no further.
+    shape with d, which then shows in the force only. Otherwise it is 1. ``active`` [rows, cols]
+    bool masks dead cells. ``readings`` says where the board's readings end. ``known`` are the
+    sensor's other uncertainties, none by default: they widen the covariance, and make the activity
+    test as much less sensitive. A material's own ``fit_error`` counts among them. The fit goes up
+    to a tilt of 71.57° (tan 3), and no further.
 
     Raises ValueError for arguments out of their range.
     """
@@ -150,7 +152,7 @@ class ContactEstimator:
         *,
         method: Literal["ml", "moments"] = "ml",
         free_gain: bool | None = None,
-        live: NDArray[np.bool_] | None = None,
+        active: NDArray[np.bool_] | None = None,
         readings: Readings | None = None,
         known: Uncertainty | None = None,
     ) -> None:
@@ -160,18 +162,18 @@ class ContactEstimator:
             raise ValueError(f"method must be 'ml' or 'moments', got {method!r}")
         if tip.physics == "solid" and method == "moments":
             raise ValueError("method must be 'ml' for a solid tip: its moments hardly show d and θ")
-        if live is not None and np.shape(live) != grid.shape:
-            raise ValueError(f"live must have shape {grid.shape}, got {np.shape(live)}")
+        if active is not None and np.shape(active) != grid.shape:
+            raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
         self.grid = grid
         self._full = math.nan  # of the last frame's type
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()
-        alive = np.ones(grid.shape, np.bool_) if live is None else np.asarray(live, dtype=bool)
+        alive = np.ones(grid.shape, np.bool_) if active is None else np.asarray(active, dtype=bool)
         # For compiled callers: the memory of `frame_pipeline.estimate_frame`, …
         state = self.state = EstimatorState()
-        self.arena: tuple[FloatArray, IntArray | None, Any]  # … and what it takes last
+        self.scratch: tuple[FloatArray, IntArray | None, Any]  # … and what it takes last
         options = self._options = state.options
         options.noise = noise
         options.saturation = math.inf
@@ -183,25 +185,25 @@ class ContactEstimator:
         options.moments_only = method == "moments"
         options.peak_level = PEAK_LEVEL
         options.patch_level = PATCH_LEVEL
-        options.explained_min = _EXPLAINED_MIN
+        options.r_squared_min = _R_SQUARED_MIN
         options.modulus = material.reference_modulus
         options.blur = grid.blur
         options.rotation = grid.rotation
         if tip.physics == "solid":
             alive = alive & within_rim(grid, tip, known)
-            arena, places, solid = lay_out_solid(state, grid, tip, alive, material)
-            set_solid_budget(state, solid, known, grid, tip, places, material.fit_error)
-            self.arena = arena, places, solid.array
+            scratch, indices, solid = lay_out_solid(state, grid, tip, alive, material)
+            set_solid_budget(state, solid, known, grid, tip, indices, material.fit_error)
+            self.scratch = scratch, indices, solid.array
         else:
             set_law(state.law, material.law)
             state.moments.ratios = moment_ratios(tip, material)
             set_budget(state, known, grid, tip, material.fit_error)
-            self.arena = *_lay_out(state, grid, tip, alive), None
+            self.scratch = *_lay_out(state, grid, tip, alive), None
         self._estimate: Any = state.estimate.array
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
         self._last = ContactEstimate(
-            sharing=state.budget.sharing,
+            cells_per_sample=state.budget.cells_per_sample,
             covariance=state.estimate.covariance,
             systematic=state.estimate.systematic,
         )
@@ -227,8 +229,8 @@ class ContactEstimator:
         Frames as for :meth:`update`. Raises ValueError for a wrong shape or type.
         """
         estimate = self.state.estimate
-        kept, seq, last = self._estimate.copy(), self._seq, self._last
-        self._last = ContactEstimate(sharing=self.state.budget.sharing)
+        before, seq, last = self._estimate.copy(), self._seq, self._last
+        self._last = ContactEstimate(cells_per_sample=self.state.budget.cells_per_sample)
         try:
             estimate.warm = False
             found = self.update(frame, pascal_per_count)
@@ -236,7 +238,7 @@ class ContactEstimator:
             found.systematic[:] = estimate.systematic
             return found
         finally:
-            self._estimate[:], self._seq, self._last = kept, seq, last
+            self._estimate[:], self._seq, self._last = before, seq, last
 
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
@@ -269,7 +271,7 @@ class ContactEstimator:
             self._frame,
             float(pascal_per_count),
             float(step),
-            *self.arena,
+            *self.scratch,
         )
         result = self._last
         # The record's fields in their order: read at once, a tenth of the time of one by one.
@@ -279,7 +281,7 @@ class ContactEstimator:
             result.chi2,
             result.tilt_x,
             result.tilt_y,
-            result.explained,
+            result.r_squared,
             result.peak,
             result.cells,
             result.iterations,
@@ -293,8 +295,8 @@ class ContactEstimator:
             *_,
         ) = self._estimate.item()
         # By Wilson-Hilferty, 5 σ.
-        spread = 2.0 / (9.0 * max(result.cells / result.sharing - 4, 1))
-        result.misfit = result.chi2 > (1.0 - spread + 5.0 * math.sqrt(spread)) ** 3
+        variance = 2.0 / (9.0 * max(result.cells / result.cells_per_sample - 4, 1))
+        result.misfit = result.chi2 > (1.0 - variance + 5.0 * math.sqrt(variance)) ** 3
         self._seq = seq
         return result
 
@@ -306,43 +308,43 @@ class ContactEstimator:
 
 @lru_cache(maxsize=4)
 def _integrals(grid: SensorGrid, tip: Fingertip) -> FloatArray:
-    """Of a grid's cells under a tip: two fingers' are mostly the same."""
+    """Integrate a grid's cells under a tip; cached, since two fingers' are mostly the same."""
     return cell_integrals(grid.on(tip))
 
 
 def _lay_out(
-    state: EstimatorState, grid: SensorGrid, tip: Fingertip, live: NDArray[np.bool_]
+    state: EstimatorState, grid: SensorGrid, tip: Fingertip, active: NDArray[np.bool_]
 ) -> tuple[FloatArray, IntArray | None]:
-    """The arena of a grid, and scratch for the places of a blurred one's parts; see `state`."""
+    """The scratch of a grid, and indices of a blurred one's pieces; see `state`."""
     geometry = grid.on(tip)
     state.grid.assign(geometry)
     state.model.assign(geometry)
-    centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
+    centres = cell_centres(geometry, active, tip.radius + 3.0 * grid.blur, state.region)
     cells = _integrals(grid, tip).copy()
     # A blur reaches cells that no contact is looked for in; whatever they read, it's not used.
-    cells[:, LIVE] = (centres[HEIGHT] >= 0.0).reshape(grid.shape)
+    cells[:, ACTIVE] = (centres[HEIGHT] >= 0.0).reshape(grid.shape)
     arrays = {"centres": centres, "cells": cells}
-    places = None
+    indices = None
     if grid.blur > 0.0:
         pitch_x, pitch_y = grid.pitches
-        number = parts_to_fit(grid.blur / pitch_x), parts_to_fit(grid.blur / pitch_y)
+        number = pieces_to_fit(grid.blur / pitch_x), pieces_to_fit(grid.blur / pitch_y)
         (across, along), finer = grid.finer(number)
-        parts = _integrals(finer, tip).copy()
-        parts[:, LIVE] = 1.0
+        pieces = _integrals(finer, tip).copy()
+        pieces[:, ACTIVE] = 1.0
         model, blur = state.model, state.blur
         model.rows, model.cols = finer.shape
         model.pitch_x, model.pitch_y = pitch_x / number[0], pitch_y / number[1]
         model.x = geometry.x - len(across) // 2 * model.pitch_x
         model.y = geometry.y - len(along) // 2 * model.pitch_y
-        # By the remainder of a part's column first.
+        # By the remainder of a piece's column first.
         across = weights(across, number[0]).reshape(-1, number[0]).T
         along = weights(along, number[1])
-        blur.parts_x, blur.parts_y = number
+        blur.pieces_x, blur.pieces_y = number
         blur.weights_x, blur.weights_y = across.shape[1], len(along)
         blur.width = number[0] * (grid.cols + 2 * STRIDE) + across.size
         fine, half = np.zeros((finer.rows + 1, blur.width)), np.zeros(blur.width)
-        arrays |= {"parts": parts, "across": across, "along": along, "fine": fine, "half": half}
-        places = np.zeros(finer.rows * finer.cols, dtype=np.int64)
+        arrays |= {"pieces": pieces, "across": across, "along": along, "fine": fine, "half": half}
+        indices = np.zeros(finer.rows * finer.cols, dtype=np.int64)
     rows, cols = state.model.rows, state.model.cols
     arrays["columns"], arrays["lines"] = np.zeros(2 * (cols + 1)), np.zeros(2 * (rows + 1))
     arrays["packed"] = np.zeros(PLANES * rows * cols)
@@ -350,4 +352,4 @@ def _lay_out(
     for name, array in arrays.items():
         setattr(state.at, name, start)
         start += array.size
-    return np.concatenate([array.ravel() for array in arrays.values()]), places
+    return np.concatenate([array.ravel() for array in arrays.values()]), indices

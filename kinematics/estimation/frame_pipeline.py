@@ -16,7 +16,13 @@ from softfinger.kinematics.estimation.detection import (
     restore_outliers,
     without_outliers,
 )
-from softfinger.kinematics.estimation.gauss_newton import energy_of, fit, judge, linearise, solve
+from softfinger.kinematics.estimation.gauss_newton import (
+    check_fit,
+    energy_of,
+    fit,
+    linearise,
+    solve,
+)
 from softfinger.kinematics.estimation.moments import start, track
 from softfinger.kinematics.estimation.solid_projection import SolidFit, presses, solid_kernel
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
@@ -29,8 +35,8 @@ D_MAX = 0.75  # of the radius
 # What a misfit smooth over the footprint may hide of d, over d: as much as a disc's curved face
 # does, which the covariance covers; hardly anything with a gain that is far from 1, where both say
 # that this is another tip, and the covariance doesn't cover it.
-HIDDEN_MAX = 0.6
-HIDDEN_MAX_FAR = 0.03
+UNDETECTED_MAX = 0.6
+UNDETECTED_MAX_FAR = 0.03
 GAIN_FAR = 2.0
 SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
 
@@ -40,18 +46,18 @@ def _by_moments(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray | None,
+    scratch: Pointer,
+    indices: IntArray | None,
 ) -> bool:
     """Moments from the last estimate, or from the frame alone if that fails."""
-    if not (state.estimate.warm and track(state, frame, further(arena, state.at.centres))):
-        start(solid, state, frame, arena, places)
-    return _judge_moments(state, frame, arena, places)
+    if not (state.estimate.warm and track(state, frame, further(scratch, state.at.centres))):
+        start(solid, state, frame, scratch, indices)
+    return _check_moments(state, frame, scratch, indices)
 
 
 @solid_kernel(_by_moments)
 def _without_moments(
-    solid: SolidFit, state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray
+    solid: SolidFit, state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray
 ) -> bool:
     return False
 
@@ -61,8 +67,8 @@ def _likelihood(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray | None,
+    scratch: Pointer,
+    indices: IntArray | None,
 ) -> bool:
     """Maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
@@ -74,19 +80,20 @@ def _likelihood(
             continue
         estimate.second = False
         if attempt == 1:
-            start(solid, state, frame, arena, places)
+            start(solid, state, frame, scratch, indices)
         if not options.free_gain:
             estimate.gain = 1.0
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
-        if fit(solid, state, frame, arena, places, tolerance):
-            misfit, scatter = _explain(state)
-            if estimate.explained < options.explained_min:
+        if fit(solid, state, frame, scratch, indices, tolerance):
+            misfit, scatter = _set_r_squared(state)
+            if estimate.r_squared < options.r_squared_min:
                 continue
-            # Only pressure beyond the footprint that is no noise and no small part asks for a look.
+            # Only pressure beyond the footprint beyond noise and a small fraction calls for a
+            # search.
             if misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
-                height = further(arena, state.at.centres)
+                height = further(scratch, state.at.centres)
                 estimate.second = presses_outside(solid, state, frame, height, level)
             if not estimate.second:
                 return _is_this_tip(state)
@@ -95,38 +102,40 @@ def _likelihood(
 
 @inner_kernel
 def _is_this_tip(state: EstimatorState) -> bool:
-    """Whether a misfit leaves it possible that the model is the tip's, and d is known at all."""
+    """Return whether the misfit allows the model to be the tip's, and d to be known at all."""
     estimate = state.estimate
     if estimate.shared > SHARED_MAX:
         return False
     near = 1.0 / GAIN_FAR < estimate.gain < GAIN_FAR
-    return bool(estimate.hidden <= (HIDDEN_MAX if near else HIDDEN_MAX_FAR))
+    return bool(estimate.undetected <= (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR))
 
 
 @inner_kernel
-def _explain(state: EstimatorState) -> tuple[float, float]:
-    """Set the share of the frame's squared pressure, noise apart, that the model accounts for.
+def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
+    """Set the fraction of the frame's squared pressure, noise apart, that the model accounts for.
 
     Returns what it doesn't account for [Pa²], and noise's own scatter.
     """
     energy = energy_of(state)
     budget = state.budget
     estimate = state.estimate
-    number = float(state.reach.number)
+    number = float(state.region.number)
     shift = budget.baseline * budget.baseline
     noise = number * (state.signal.variance + shift)
-    scatter = state.signal.variance * math.sqrt(2.0 * number * budget.sharing) + shift * number
+    scatter = (
+        state.signal.variance * math.sqrt(2.0 * number * budget.cells_per_sample) + shift * number
+    )
     misfit = max(energy + estimate.residual - noise, 0.0)
     power = max(energy - noise, scatter)
-    estimate.explained = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / power, 1.0)
+    estimate.r_squared = 1.0 - min(max(misfit - 4.0 * scatter, 0.0) / power, 1.0)
     return misfit, scatter
 
 
 @inner_kernel
-def _judge_moments(
-    state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None
+def _check_moments(
+    state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray | None
 ) -> bool:
-    """Whether the model accounts for the frame at the moments' contact, as for the likelihood.
+    """Return whether the model accounts for the frame at the moments' contact, as for the fit.
 
     By one step of the likelihood's, which takes off what the moments' own small errors leave.
     """
@@ -134,28 +143,30 @@ def _judge_moments(
     estimate = state.estimate
     set_face(fit.face, state.grid.radius, estimate.d, estimate.n_x, estimate.n_y)
     fit.gain = estimate.gain
-    linearise(state, frame, arena, places)
+    linearise(state, frame, scratch, indices)
     if not solve(fit, state.options.free_gain):
         return False
-    variance = judge(None, state, further(arena, state.at.packed))
+    variance = check_fit(None, state, further(scratch, state.at.packed))
     if not variance > 0.0:
         return False
-    _explain(state)
+    _set_r_squared(state)
     wider = variance / state.signal.variance
     if state.budget.correlated:
         # Moments weigh the large scales alone, as all of a deep footprint's patterns do.
-        wider *= math.sqrt(state.budget.inflation[-1, 1, 1] * state.budget.inflation[-1, 2, 2])
+        wider *= math.sqrt(
+            state.budget.variance_factor[-1, 1, 1] * state.budget.variance_factor[-1, 2, 2]
+        )
     for i in range(4):
         for j in range(4):
             fit.covariance[i, j] *= wider
-    return estimate.explained >= state.options.explained_min and _is_this_tip(state)
+    return estimate.r_squared >= state.options.r_squared_min and _is_this_tip(state)
 
 
 @inner_kernel
-def _to_tilts(state: EstimatorState, covariance: Matrix, turned: Matrix) -> None:
+def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> None:
     """Turn the estimate from normals in the sensor's axes to tilts in the finger's.
 
-    And a ``covariance``, which is changed, into ``turned``.
+    And a ``covariance``, which is changed, into ``rotated``.
     """
     estimate = state.estimate
     c = math.cos(state.options.rotation)
@@ -175,10 +186,10 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, turned: Matrix) -> None
     for i in range(4):
         along = covariance[i, 1]
         across = covariance[i, 2]
-        turned[i, 0] = covariance[i, 0]
-        turned[i, 1] = per_x * (c * along - s * across)
-        turned[i, 2] = per_y * (s * along + c * across)
-        turned[i, 3] = covariance[i, 3]
+        rotated[i, 0] = covariance[i, 0]
+        rotated[i, 1] = per_x * (c * along - s * across)
+        rotated[i, 2] = per_y * (s * along + c * across)
+        rotated[i, 3] = covariance[i, 3]
 
 
 @inner_kernel
@@ -186,18 +197,18 @@ def _estimate(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray | None,
+    scratch: Pointer,
+    indices: IntArray | None,
 ) -> bool:
     """The estimate of a frame with a contact; whether it can be used."""
     estimate = state.estimate
     if state.options.moments_only:
-        done = _by_moments(solid, state, frame, arena, places)
+        done = _by_moments(solid, state, frame, scratch, indices)
     else:
-        done = _likelihood(solid, state, frame, arena, places)
+        done = _likelihood(solid, state, frame, scratch, indices)
     in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
     _to_tilts(state, state.fit.covariance, estimate.covariance)
-    if state.budget.systematic or estimate.hidden > 0.0:
+    if state.budget.systematic or estimate.undetected > 0.0:
         _to_tilts(state, state.budget.covariance, estimate.systematic)
         for i in range(4):
             for j in range(4):
@@ -225,11 +236,11 @@ def _begin(state: EstimatorState, scale: float, step: float) -> None:
     estimate.chi2 = 0.0
     estimate.tilt_x = 0.0
     estimate.tilt_y = 0.0
-    estimate.explained = 0.0
+    estimate.r_squared = 0.0
     estimate.cells = 0
     estimate.iterations = 0
     estimate.second = False
-    estimate.hidden = 0.0
+    estimate.undetected = 0.0
     estimate.shared = 0.0
     estimate.shear_x = 0.0
     estimate.shear_y = 0.0
@@ -244,43 +255,43 @@ def estimate_frame(
     frame: FloatArray,
     scale: float,
     step: float,
-    arena: FloatArray,
-    places: IntArray | None,
+    scratch: FloatArray,
+    indices: IntArray | None,
     solids: Records[SolidFit] | None = None,
 ) -> None:
-    """One frame → the estimate in the state. The only compiled entry of the estimator.
+    """Estimate one frame into the state. The only compiled entry of the estimator.
 
     ``frame`` float64 [rows, cols] in counts, contiguous, ``scale`` Pa a count, ``step`` the width
-    of a count's quantum [Pa], 0 for none. ``arena`` as `state.Places` says; ``places`` is scratch
-    for a blur, None without one, and then nothing for a blur is compiled. A solid tip has
-    ``solids``, and the live cells' numbers in ``places``; any other tip None, likewise.
+    of a count's quantum [Pa], 0 for none. ``scratch`` as `state.Offsets` says; ``indices`` is
+    scratch for a blur, None without one, and then nothing for a blur is compiled. A solid tip has
+    ``solids``, and the active cells' numbers in ``indices``; any other tip None, likewise.
     """
     state = states[0]
     solid = None if solids is None else solids[0]
     estimate = state.estimate
     readings = address(frame)
-    whole = address(arena)
+    whole = address(scratch)
     centres = further(whole, state.at.centres)
     cells = further(whole, state.at.cells)
     _begin(state, scale, step)
     rejected = without_outliers(state, readings, cells, centres)
     signal = state.signal
     if solid is not None and signal.finite:
-        signal.contact = presses(state, solid, readings, whole, address(places))
+        signal.contact = presses(state, solid, readings, whole, address(indices))
     estimate.peak = signal.peak * scale
     estimate.rejected = rejected
     estimate.contact = signal.contact
     done = False
     if signal.contact:
-        done = _estimate(solid, state, readings, whole, places)
+        done = _estimate(solid, state, readings, whole, indices)
     else:
         estimate.d = 0.0
         estimate.n_x = 0.0
         estimate.n_y = 0.0
         estimate.gain = 1.0
     # A baseline far below zero is a sensor to tare, not a tip in the air.
-    sound = signal.finite and signal.mean > -3.0 * signal.noise and rejected < OUTLIERS_MAX
-    estimate.valid = sound and (done or not signal.contact)
+    readable = signal.finite and signal.mean > -3.0 * signal.noise and rejected < OUTLIERS_MAX
+    estimate.valid = readable and (done or not signal.contact)
     estimate.warm = done
     if rejected > 0:
         restore_outliers(state, rejected, cells, centres)

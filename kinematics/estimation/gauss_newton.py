@@ -11,9 +11,9 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address, further
-from softfinger.kinematics.estimation.blurred_cells import spread
-from softfinger.kinematics.estimation.error_budget import colour, hidden_misfit, systematic
-from softfinger.kinematics.estimation.likelihood import accumulate, footprint_energy, press
+from softfinger.kinematics.estimation.blurred_cells import blur_cells
+from softfinger.kinematics.estimation.error_budget import correlate, systematic, undetected_misfit
+from softfinger.kinematics.estimation.likelihood import accumulate, compress, footprint_energy
 from softfinger.kinematics.estimation.packing import pack
 from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
@@ -22,7 +22,7 @@ from softfinger.kinematics.sensing.footprint import IntArray, set_face
 # Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
 # square over what a straight model gives rises so.
 GAIN_CURVATURE = 6.0
-_MOST_HALVINGS = 5
+_HALVINGS_MAX = 5
 # tan of the largest tilt of the face that the iteration goes to, 71.57°: beyond it the footprint of
 # any d that matters has left the tip, and a step there would not come back.
 TAN_TILT_MAX = 3.0
@@ -30,7 +30,7 @@ TAN_TILT_MAX = 3.0
 
 @inner_kernel
 def solve(fit: Fit, free: bool) -> bool:
-    """Gauss-Newton step in (gain, u, v, w), the inverse normal matrix and the decrement.
+    """Return the step in (gain, u, v, w), the inverse normal matrix and the decrement.
 
     Without a ``free`` gain its row is left out. False where a pivot of the scaled matrix is below
     1e-11: the frame doesn't determine every parameter.
@@ -97,10 +97,7 @@ def solve(fit: Fit, free: bool) -> bool:
 def set_covariance(
     solid: SolidFit | None, fit: Fit, inverse: Matrix, variance: float, out: Matrix
 ) -> None:
-    """Covariance of (d, n_x, n_y, gain) into ``out``, from that of (gain, u, v, w) over variance.
-
-    At the fit's face.
-    """
+    """Transform the covariance of (gain, u, v, w) over variance to (d, n_x, n_y, gain)."""
     u = fit.face.u
     v = fit.face.v
     w = fit.face.w
@@ -129,7 +126,7 @@ def set_covariance(
 
 @inner_kernel
 def free_noise(square: float, floor: float) -> float:
-    """A cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
+    """Return a cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
 
     They read it from ``floor`` [Pa] on and 0 below, so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ:
     half of the variance without a floor. Where none is above it the noise is below a third of it.
@@ -141,9 +138,9 @@ def free_noise(square: float, floor: float) -> float:
     high = 3.2
     for _ in range(9):
         tau = 0.5 * (low + high)
-        share = tau * math.exp(-0.5 * tau * tau) / math.sqrt(2.0 * math.pi)
-        share += 0.5 * math.erfc(tau / math.sqrt(2.0))
-        if share > target * tau * tau:
+        clipped_part = tau * math.exp(-0.5 * tau * tau) / math.sqrt(2.0 * math.pi)
+        clipped_part += 0.5 * math.erfc(tau / math.sqrt(2.0))
+        if clipped_part > target * tau * tau:
             low = tau
         else:
             high = tau
@@ -152,7 +149,7 @@ def free_noise(square: float, floor: float) -> float:
 
 @inner_kernel
 def energy_of(state: EstimatorState) -> float:
-    """Σ p² [Pa²] of the cells in reach."""
+    """Return Σ p² [Pa²] of the cells in the region."""
     energy: float = state.signal.energy * state.signal.scale * state.signal.scale
     return energy
 
@@ -166,7 +163,7 @@ def _clip_noise(state: EstimatorState, packed: Pointer) -> float:
     """
     inside, inside_number = footprint_energy(state, packed)
     clip = math.sqrt(state.signal.variance)
-    number = float(state.reach.number)
+    number = float(state.region.number)
     if number - inside_number >= 16.0:
         free_square = max(energy_of(state) - inside, 0.0) / (number - inside_number)
         clip = min(clip, free_noise(free_square, state.signal.floor))
@@ -174,7 +171,7 @@ def _clip_noise(state: EstimatorState, packed: Pointer) -> float:
 
 
 @inner_kernel
-def _take_step(fit: Fit, a: float) -> bool:
+def _apply_step(fit: Fit, a: float) -> bool:
     """Go on by the step, the face kept between the tip's top and its base plate; False if kept."""
     face = fit.face
     shallow = a - face.u / math.sqrt(1.0 + face.v**2 + face.w**2)
@@ -196,8 +193,8 @@ def _take_step(fit: Fit, a: float) -> bool:
 
 
 @inner_kernel
-def judge(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> float:
-    """χ² of the solved fit, and the covariance by what all frames share and by a smooth misfit.
+def check_fit(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> float:
+    """Compute χ² of the solved fit, and the covariance by shared errors and by a smooth misfit.
 
     The noise's variance [Pa²] is returned, widened by a misfit beyond its own scatter; after that
     ``fit.inverse`` is times it the covariance under the noise. Negative with too few cells.
@@ -211,28 +208,28 @@ def judge(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> flo
     misfit = max(fit.sums.misfit - fit.decrement, 0.0)
     estimate.cells = int(fit.sums.weight)
     estimate.residual = misfit - fit.sums.readings
-    expected = hidden = 0.0
+    expected = undetected = 0.0
     if budget.systematic:
         expected = systematic(solid, state, packed, d, budget.shared)
         set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
         estimate.shared = math.sqrt(budget.covariance[0, 0]) / d
     beyond = misfit - expected - variance * freedom
     if beyond > variance * math.sqrt(2.0 * max(freedom, 0.0)):
-        hidden = hidden_misfit(solid, state, packed, beyond)
-    if hidden > 0.0:
+        undetected = undetected_misfit(solid, state, packed, beyond)
+    if undetected > 0.0:
         if not budget.systematic:
             budget.shared[:] = 0.0
         for i in range(4):
             for j in range(4):
-                budget.shared[i, j] += hidden * fit.inverse[i, j]
-        set_covariance(solid, fit, fit.inverse, hidden, budget.covariance)
-        estimate.hidden = math.sqrt(budget.covariance[0, 0]) / d
+                budget.shared[i, j] += undetected * fit.inverse[i, j]
+        set_covariance(solid, fit, fit.inverse, undetected, budget.covariance)
+        estimate.undetected = math.sqrt(budget.covariance[0, 0]) / d
         set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
     if budget.correlated:
-        freedom = fit.sums.weight - colour(solid, state, d)
+        freedom = fit.sums.weight - correlate(solid, state, d)
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
-    excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.sharing / freedom), 1.0)
+    excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.cells_per_sample / freedom), 1.0)
     return variance * excess if fit.sums.weight > 4.0 else -1.0
 
 
@@ -254,12 +251,12 @@ def _finish(state: EstimatorState, packed: Pointer, iterations: int) -> bool:
 def conclude(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, iterations: int
 ) -> bool:
-    """The covariance and χ² at the fit's end; whether there are cells enough."""
+    """Return the covariance and χ² at the fit's end; whether there are cells enough."""
     fit = state.fit
     estimate = state.estimate
     estimate.gain = fit.gain
     estimate.iterations = iterations
-    variance = judge(solid, state, packed)
+    variance = check_fit(solid, state, packed)
     set_covariance(solid, fit, fit.inverse, variance, fit.covariance)
     if state.options.free_gain:
         # The more d is uncertain, the less straight it is in the gain.
@@ -276,19 +273,19 @@ def conclude(
 
 @inner_kernel
 def linearise(
-    state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray | None
+    state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray | None
 ) -> None:
     """Pack the cells of the fit's face, press them, and sum up the normal equations."""
-    packed = further(arena, state.at.packed)
-    if places is None:
-        pack(state, further(arena, state.at.cells), frame, arena, None)
+    packed = further(scratch, state.at.packed)
+    if indices is None:
+        pack(state, further(scratch, state.at.cells), frame, scratch, None)
     else:
         # Parts have no readings of their own; those taken from ``fine`` are not used.
-        parts = further(arena, state.at.parts)
-        pack(state, parts, further(arena, state.at.fine), arena, address(places))
-    press(state, packed)
-    if places is not None:
-        spread(state, frame, arena, address(places))
+        pieces = further(scratch, state.at.pieces)
+        pack(state, pieces, further(scratch, state.at.fine), scratch, address(indices))
+    compress(state, packed)
+    if indices is not None:
+        blur_cells(state, frame, scratch, address(indices))
     state.fit.clip = _clip_noise(state, packed) if state.signal.clipped else 0.0
     accumulate(state, packed)
 
@@ -298,11 +295,11 @@ def fit(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray | None,
+    scratch: Pointer,
+    indices: IntArray | None,
     tolerance: float,
 ) -> bool:
-    """Gauss-Newton from the contact in ``state.estimate``, the new estimate left there.
+    """Run Gauss-Newton from the contact in ``state.estimate`` and leave the new estimate there.
 
     Stops when the promised decrement is below ``tolerance`` · variance, that is the step is that
     part of the noise floor, squared. False when the frame doesn't determine the contact or the
@@ -312,7 +309,7 @@ def fit(
     face = fit.face
     a = state.grid.radius
     variance = state.signal.variance
-    packed = further(arena, state.at.packed)
+    packed = further(scratch, state.at.packed)
     set_face(face, a, state.estimate.d, state.estimate.n_x, state.estimate.n_y)
     fit.gain = state.estimate.gain
     u = v = w = gain = 0.0  # before the last step
@@ -320,9 +317,9 @@ def fit(
     halvings = 0
     solved = False
     for iteration in range(state.options.iterations):
-        linearise(state, frame, arena, places)
+        linearise(state, frame, scratch, indices)
         now = fit.sums.misfit - fit.sums.readings
-        if solved and not now <= cost + variance and halvings < _MOST_HALVINGS:
+        if solved and not now <= cost + variance and halvings < _HALVINGS_MAX:
             # Too far: half way back.
             face.u = 0.5 * (face.u + u)
             face.v = 0.5 * (face.v + v)
@@ -339,6 +336,6 @@ def fit(
         w = face.w
         gain = fit.gain
         halvings = 0
-        if _take_step(fit, a) and fit.decrement <= tolerance * variance:
+        if _apply_step(fit, a) and fit.decrement <= tolerance * variance:
             return _finish(state, packed, iteration + 1)
     return False

@@ -1,10 +1,10 @@
 """Normal equations of the pressure grid's likelihood, as kernels.
 
-The model of a cell is ``γ · mean(σ(ε)) = γ A (σ(ε̄) + ½ σ''(ε̄) V)``, with A the cell's share in the
-footprint, ε̄ and V the strain's mean and variance over that share; it is exact for a constant
-modulus, and to the strain's third moment for any other law. The strain is linear in (u, v, w) (see
-footprint.py), so its means are sums of fixed means of g, x g, y g for whole cells; cut cells are
-integrated (cut_cells.py). The outline adds no derivative of its own, as σ is 0 there.
+The model of a cell is ``γ · mean(σ(ε)) = γ A (σ(ε̄) + ½ σ''(ε̄) V)``, with A the cell's fraction in
+the footprint, ε̄ and V the strain's mean and variance over that fraction; it is exact for a
+constant modulus, and to the strain's third moment for any other law. The strain is linear in (u, v,
+w) (see footprint.py), so its means are sums of fixed means of g, x g, y g for whole cells; cut
+cells are integrated (cut_cells.py). The outline adds no derivative of its own, as σ is 0 there.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from softfinger.kinematics.compiled.simd import Pointer, address
 from softfinger.kinematics.estimation.state import (
     ALONG_X,
     ALONG_Y,
+    FRACTION,
     LAW_PIECES,
     LAW_TERMS,
     PLAIN,
     READING,
-    SHARE,
     VARIANCE,
     WEIGHT,
     EstimatorState,
@@ -30,8 +30,8 @@ from softfinger.kinematics.estimation.state import (
 )
 from softfinger.kinematics.sensing.footprint import FloatArray
 
-# What `press` makes of the first planes of the packed cells.
-STRESS, BY_U, BY_V, BY_W = SHARE, PLAIN, ALONG_X, ALONG_Y
+# What `compress` makes of the first planes of the packed cells.
+STRESS, BY_U, BY_V, BY_W = FRACTION, PLAIN, ALONG_X, ALONG_Y
 Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 
 # A cell that can't read below its floor (0, or the smallest count sent) reads more than the
@@ -44,7 +44,7 @@ CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 
 def set_law(law: Law, coefficients: FloatArray) -> None:
-    """Any material's law [pieces, order] in one of two forms.
+    """Convert any material's law [pieces, order] to one of two forms.
 
     A law of one polynomial of at most LAW_TERMS terms is kept; any other becomes LAW_PIECES cubics
     by value and slope at the pieces' ends, within 1e-9 of a smooth law.
@@ -73,7 +73,7 @@ def set_law(law: Law, coefficients: FloatArray) -> None:
 
 @fast_inner_kernel
 def footprint_energy(state: EstimatorState, packed: Pointer) -> tuple[float, float]:
-    """Σ W p² [Pa²] and Σ W over the packed cells."""
+    """Return Σ W p² [Pa²] and Σ W over the packed cells."""
     size = state.model.rows * state.model.cols
     energy = 0.0
     number = 0.0
@@ -112,7 +112,7 @@ def _compared(
     model = gain * stress
     residual = max(reading, floor) - model
     response = 1.0
-    least = floor
+    lower = floor
     if clipped:
         # As much below the floor as above it, a cell reads as much more than the larger of both.
         depth = (model - floor) * (1.0 / clip)
@@ -123,13 +123,13 @@ def _compared(
         rise = above * (above * rise - (2.0 / CLIP_END) * base)
         residual = max(reading, floor) - max(model, floor) - clip * above * above * base
         response = 1.0 + rise if depth >= 0.0 else -rise
-        least = floor - CLIP_BELOW * clip
-    counts = ((reading < saturation) | (model < saturation)) & (model >= least)
+        lower = floor - CLIP_BELOW * clip
+    counts = ((reading < saturation) | (model < saturation)) & (model >= lower)
     return residual, response, 1.0 if counts else 0.0
 
 
 @fast_inner_kernel
-def press(state: EstimatorState, packed: Pointer) -> None:
+def compress(state: EstimatorState, packed: Pointer) -> None:
     """Put the material into the packed cells, in place.
 
     STRESS takes the mean stress over each cell, BY_U, BY_V and BY_W its derivatives by −u, v and w:
@@ -146,7 +146,7 @@ def press(state: EstimatorState, packed: Pointer) -> None:
     cubics = address(state.law.cubics)
     for k in range(state.fit.count):
         # Arrays are read here alone: a function that took one would keep the loop out of lanes.
-        share = packed[SHARE * size + k]
+        fraction = packed[FRACTION * size + k]
         g = packed[PLAIN * size + k]
         g_x = packed[ALONG_X * size + k]
         g_y = packed[ALONG_Y * size + k]
@@ -166,8 +166,8 @@ def press(state: EstimatorState, packed: Pointer) -> None:
             half = (c2 + 3.0 * t * c3) * (LAW_PIECES * LAW_PIECES)
         # From a strain of 1 on the stress stays, and what varies there doesn't show.
         half = half if strain < 1.0 else 0.0
-        stress = share * (stress + half * packed[VARIANCE * size + k])
-        slope *= share
+        stress = fraction * (stress + half * packed[VARIANCE * size + k])
+        slope *= fraction
         packed[STRESS * size + k] = stress
         packed[BY_U * size + k] = slope * g
         packed[BY_V * size + k] = slope * g_x
@@ -176,7 +176,7 @@ def press(state: EstimatorState, packed: Pointer) -> None:
 
 @fast_inner_kernel
 def accumulate(state: EstimatorState, packed: Pointer) -> None:
-    """Sums for one Gauss-Newton step over the pressed cells, into ``state.fit.sums``.
+    """Sum up one Gauss-Newton step over the pressed cells, into ``state.fit.sums``.
 
     Columns of the Jacobian are (mean stress, σ' g, σ' x g, σ' y g), that is ∂/∂gain and, but for a
     factor ∓gain, ∂/∂(u, v, w). A full cell counts only while the model stays below its end. No

@@ -55,7 +55,7 @@ class MeasuredFit(Record):
     covariance: Matrix  # of (d, n_x, n_y)
     jacobian: Matrix  # ∂(d, along, across)/∂sums
     systematic: Matrix  # the part of it that all frames share
-    turn: Matrix  # from (·, x, y) to (·, along, across)
+    rotation: Matrix  # from (·, x, y) to (·, along, across)
     random: Matrix  # errors of the sums along these, from frame to frame
     shared: Matrix  # and those that all frames share
     errors: Matrix
@@ -68,11 +68,11 @@ class MeasuredFit(Record):
 def sum_weights(
     grid: SensorGrid,
     radius: float,
-    live: NDArray[np.bool_],
+    active: NDArray[np.bool_],
 ) -> FloatArray:
-    """What makes a frame's sums of its pressures [4, cells]: area, area times x, y and r².
+    """Return the weights of a frame's sums [4, cells]: area, area times x, y and r².
 
-    Over the ``live`` cells under the tip; x and y are along the finger's axes.
+    Over the ``active`` cells under the tip; x and y are along the finger's axes.
     """
     x, y = (
         pitch * (np.arange(count) - 0.5 * (count - 1)) - at
@@ -81,7 +81,7 @@ def sum_weights(
     c, s = math.cos(grid.rotation), math.sin(grid.rotation)
     along, across = c * x - s * y[:, None], s * x + c * y[:, None]
     square = along**2 + across**2
-    area = math.prod(grid.pitches) * (live & (square < (radius + max(grid.pitches)) ** 2))
+    area = math.prod(grid.pitches) * (active & (square < (radius + max(grid.pitches)) ** 2))
     return np.stack([(area * each).ravel() for each in (1.0, along, across, square)])
 
 
@@ -114,7 +114,7 @@ def _root_of(fit: MeasuredFit, force: float, q: float, t: float) -> float:
 def fit_measured_frame(
     fits: Records[MeasuredFit], frame: FloatArray, weights: FloatArray, scale: float
 ) -> None:
-    """One frame [rows, cols] → what the record says of it; ``scale`` Pa a unit."""
+    """Estimate one frame [rows, cols] into the record; ``scale`` Pa a unit."""
     fit = fits[0]
     fit.peak = 0.0
     fit.sums[:] = 0.0
@@ -133,8 +133,8 @@ def fit_measured_frame(
     fit.systematic[:] = 0.0
     force = fit.sums[0]
     fit.valid = math.isfinite(force) and math.isfinite(fit.peak)
-    spread = math.sqrt(fit.noise[0, 0] + fit.shift[0] ** 2)
-    fit.contact = fit.valid and force > _TOUCHED * spread
+    std = math.sqrt(fit.noise[0, 0] + fit.shift[0] ** 2)
+    fit.contact = fit.valid and force > _TOUCHED * std
     if fit.contact:
         fit.valid = _contact(fit)
 
@@ -144,14 +144,14 @@ def _contact(fit: MeasuredFit) -> bool:
     """The contact that the sums say; whether the curves hold there and its extent agrees."""
     force = fit.sums[0]
     moment = math.hypot(fit.sums[1], fit.sums[2])
-    most = _BEYOND * fit.slope
-    s = wanted = step = 0.0
+    s_max = _BEYOND * fit.slope
+    s = target = step = 0.0
     t = _root_of(fit, force, 0.0, fit.root)
     for _ in range(_TURNS):
         lever = max(_curve(fit.lever, t, s * s)[0], 1e-9 * fit.radius)
-        wanted = moment / (force * lever)
+        target = moment / (force * lever)
         before = step
-        step = min(wanted, most) - s
+        step = min(target, s_max) - s
         if step * before < 0.0:
             step *= 0.5
         s += step
@@ -160,8 +160,8 @@ def _contact(fit: MeasuredFit) -> bool:
             break
     c_x = fit.sums[1] / moment if moment > 0.0 else 1.0
     c_y = fit.sums[2] / moment if moment > 0.0 else 0.0
-    spread = _spread(fit, t, s, c_x, c_y)
-    s *= 1.0 - spread * spread / (spread * spread + fit.slope * fit.slope)
+    std = _set_covariance(fit, t, s, c_x, c_y)
+    s *= 1.0 - std * std / (std * std + fit.slope * fit.slope)
     t = _root_of(fit, force, s * s, t)
     q = s * s
     fit.d = fit.radius * t * t
@@ -171,12 +171,12 @@ def _contact(fit: MeasuredFit) -> bool:
     # The sums' r² is 0.08 of itself off, or by its noise, where something else presses.
     off = abs(fit.sums[3] - force * extent)
     agrees = off < _EXTENT * force * extent + _TOUCHED * math.sqrt(fit.noise[3, 3])
-    reach = t < _BEYOND * fit.root * (1.0 - 1e-9) and wanted < most + 3.0 * spread
-    return bool(agrees and reach)
+    within = t < _BEYOND * fit.root * (1.0 - 1e-9) and target < s_max + 3.0 * std
+    return bool(agrees and within)
 
 
 @inner_kernel
-def _spread(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float) -> float:
+def _set_covariance(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float) -> float:
     """Set the covariance; returns the standard deviation of sin θ by the sums alone.
 
     In axes along the tilt and across: the sum's errors and both moments', through the partials. A
@@ -199,14 +199,14 @@ def _spread(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float) -> flo
     fit.jacobian[1, 0] = -c * inverse
     fit.jacobian[1, 1] = a * inverse
     fit.jacobian[2, 2] = 1.0 / across
-    fit.turn[0, 0] = 1.0
-    fit.turn[1, 1] = fit.turn[2, 2] = c_x
-    fit.turn[1, 2] = c_y
-    fit.turn[2, 1] = -c_y
-    _between(fit, fit.turn, fit.noise, fit.random)
+    fit.rotation[0, 0] = 1.0
+    fit.rotation[1, 1] = fit.rotation[2, 2] = c_x
+    fit.rotation[1, 2] = c_y
+    fit.rotation[2, 1] = -c_y
+    _between(fit, fit.rotation, fit.noise, fit.random)
     for i in range(3):
-        shift = fit.turn[i, 0] * fit.shift[0] + fit.turn[i, 1] * fit.shift[1]
-        fit.along[i] = shift + fit.turn[i, 2] * fit.shift[2]
+        shift = fit.rotation[i, 0] * fit.shift[0] + fit.rotation[i, 1] * fit.shift[1]
+        fit.along[i] = shift + fit.rotation[i, 2] * fit.shift[2]
     missed = fit.force_error, fit.lever_error, fit.lever_error
     for i in range(3):
         for j in range(3):
@@ -231,11 +231,11 @@ def _spread(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float) -> flo
         out[1, 0] += prior * drawn_d * drawn
         out[1, 1] += prior * drawn * drawn
         out[2, 2] += prior * aside * aside
-    fit.turn[1, 2] = -c_y  # and back
-    fit.turn[2, 1] = c_y
+    fit.rotation[1, 2] = -c_y  # and back
+    fit.rotation[2, 1] = c_y
     for out in (fit.covariance, fit.systematic):
         fit.errors[:] = out
-        _between(fit, fit.turn, fit.errors, out)
+        _between(fit, fit.rotation, fit.errors, out)
     return math.sqrt(variance)
 
 
@@ -253,9 +253,9 @@ def _between(fit: MeasuredFit, a: FloatArray, m: FloatArray, out: FloatArray) ->
 
 
 class MeasuredEstimator:
-    """As `ContactEstimator`, for a tip whose ``physics`` is "measured". Each frame stands alone.
+    """`ContactEstimator` for a tip whose ``physics`` is "measured". Each frame stands alone.
 
-    ``grid`` has the tip where the law found it. ``live`` [rows, cols] bool masks dead cells;
+    ``grid`` has the tip where the law found it. ``active`` [rows, cols] bool masks dead cells;
     ``known`` are the sensor's other uncertainties. An estimate is ``valid`` where the curves were
     measured, and where the frame's extent is within 8 % of what its force says. Raises ValueError
     for arguments out of their range.
@@ -267,13 +267,13 @@ class MeasuredEstimator:
         self,
         tip: Fingertip,
         grid: SensorGrid,
-        live: NDArray[np.bool_] | None = None,
+        active: NDArray[np.bool_] | None = None,
         known: Uncertainty | None = None,
     ) -> None:
         law = tip.law
         if law is None or law.radius != tip.radius:
             raise ValueError(f"expected a tip measured at its radius {tip.radius:g} m")
-        alive = np.ones(grid.shape, np.bool_) if live is None else live
+        alive = np.ones(grid.shape, np.bool_) if active is None else active
         self.grid = grid
         self._weights = sum_weights(grid, tip.radius, alive)
         fit = self._fit = MeasuredFit()
@@ -289,16 +289,16 @@ class MeasuredEstimator:
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """A new result; frames as for :meth:`update`."""
-        kept, self._last = self._last, ContactEstimate()
+        before, self._last = self._last, ContactEstimate()
         try:
             return self.update(frame, pascal_per_count)
         finally:
-            self._last = kept
+            self._last = before
 
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
     ) -> ContactEstimate:
-        """The one result object, from a frame [rows, cols] of any number type.
+        """Return the one result object, from a frame [rows, cols] of any number type.
 
         Its values times ``pascal_per_count`` are Pa. Raises ValueError for another shape.
         """

@@ -1,4 +1,4 @@
-"""From a pressure grid to a first estimate: the contact's centroid and extent.
+"""First estimate of a contact from a pressure grid's centroid and extent.
 
 Kernels for the moments of the pressure over the footprint, and the relations between those and
 (d, n). For a constant modulus they are closed:
@@ -51,7 +51,7 @@ _WEAK = 15.0  # noise: a largest cell below is looked for together with its neig
 
 
 def closed_trace(a: float, d: float, s: float) -> float:
-    """Trace of the pressure's covariance [m²] for a constant modulus, s = sin θ."""
+    """Return the trace of the pressure's covariance [m²] for a constant modulus, s = sin θ."""
     return d * (4.0 * a - d) / 6.0 - s * s * d * (12.0 * a - 5.0 * d) / 36.0
 
 
@@ -60,7 +60,7 @@ _trace = inner_kernel(closed_trace)
 
 @lru_cache(maxsize=4)
 def moment_ratios(tip: Fingertip, material: Material) -> FloatArray:
-    """Force, centroid and trace over the closed forms of E₀, float64 [RATIO_POINTS, 3], over d.
+    """Return force, centroid and trace over E₀'s closed forms, float64 [RATIO_POINTS, 3], over d.
 
     Rows are evenly spaced from 0 to 0.8 a. Integrated over the flattened disc in polar coordinates
     at a tilt of 0.2 rad.
@@ -107,10 +107,10 @@ def _ratio(m: Moments, a: float, d: float, column: int) -> float:
 
 @inner_kernel
 def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, own: float) -> None:
-    """Σp, centroid, trace of the covariance and number of the cells that ``moments.face`` presses.
+    """Sum the cells that ``moments.face`` presses: Σp, centroid, trace of the covariance, number.
 
     Those whose centre lies in the footprint; all 0 but the number where nothing presses. ``own``
-    [m²] is the trace of a point's own spread over cells, which is taken off.
+    [m²] is the trace of a point's own blur over cells, which is subtracted.
     """
     m = state.moments
     grid = state.grid
@@ -119,8 +119,8 @@ def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, o
     if m.face.low < m.face.high:
         # Only the rows of the footprint's box.
         first_row, last_row = rows_touched(m.face, grid)
-        first = max(first_row * grid.cols, state.reach.first)
-        last = min(last_row * grid.cols, state.reach.last)
+        first = max(first_row * grid.cols, state.region.first)
+        last = min(last_row * grid.cols, state.region.last)
         sums_inside(m, frame, centres, grid.rows * grid.cols, first, last)
     if m.total > 0.0:
         x = m.x / m.total
@@ -131,15 +131,15 @@ def footprint_moments(state: EstimatorState, frame: Pointer, centres: Pointer, o
 
 
 @inner_kernel
-def _d_from_extent(m: Moments, a: float, reach: float) -> float:
-    """d from the trace of the pressure's covariance and the centroid's distance ``reach``.
+def _d_from_extent(m: Moments, a: float, distance: float) -> float:
+    """d from the trace of the pressure's covariance and the centroid's distance ``distance``.
 
     Newton's iteration from ``m.d``; its last step is below 1e-5 of the radius, so that what is left
     is of 1e-10.
     """
     d = min(max(m.d, 0.01 * a), 0.9 * a)
     for _ in range(8):
-        s = min(reach / (_ratio(m, a, d, 1) * (a - d / 3.0)), 0.95)
+        s = min(distance / (_ratio(m, a, d, 1) * (a - d / 3.0)), 0.95)
         slope = (4.0 * a - 2.0 * d) / 6.0 - s * s * (12.0 * a - 10.0 * d) / 36.0
         miss = _trace(a, d, s) - m.trace / _ratio(m, a, d, 2)
         before = d
@@ -150,7 +150,7 @@ def _d_from_extent(m: Moments, a: float, reach: float) -> float:
 
 
 @inner_kernel
-def _take(state: EstimatorState) -> None:
+def _store(state: EstimatorState) -> None:
     """The moments' contact becomes the estimate."""
     estimate = state.estimate
     estimate.d = state.moments.d
@@ -161,7 +161,7 @@ def _take(state: EstimatorState) -> None:
 
 @inner_kernel
 def track(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
-    """Moments from the last estimate, again while the footprint moves on the scale of a cell."""
+    """Take moments from the last estimate, again while the footprint moves by about a cell."""
     estimate = state.estimate
     m = state.moments
     a = state.grid.radius
@@ -172,11 +172,11 @@ def track(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
         m.n_y = estimate.n_y
         refine(state, frame, centres)
         grown = math.sqrt(m.d * (2.0 * a - m.d)) - math.sqrt(estimate.d * (2.0 * a - estimate.d))
-        moved = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
-        _take(state)
+        shift = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
+        _store(state)
         if not m.gain > 0.0:
             return False
-        if abs(grown) + moved < near:
+        if abs(grown) + shift < near:
             return True
     return False
 
@@ -186,46 +186,47 @@ def start(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray | None,
+    scratch: Pointer,
+    indices: IntArray | None,
 ) -> None:
-    """The estimate from the frame alone: its strongest cells, then twice their moments."""
+    """Estimate from the frame alone: its strongest cells, then twice their moments."""
     m = state.moments
     signal = state.signal
-    centres = further(arena, state.at.centres)
+    centres = further(scratch, state.at.centres)
     peak = signal.peak
     if peak > _WEAK * signal.noise:
         level = max(4.0 * signal.noise, 0.15 * peak)
         size = state.grid.rows * state.grid.cols
-        sums_above(m, state.reach, frame, centres, size, level)
-        share = 1.0
+        sums_above(m, state.region, frame, centres, size, level)
+        cells_factor = 1.0
     else:
         _sums_of_weak(state, frame, centres)
-        share = 1.3  # of a weak contact's cells about three quarters pass
+        cells_factor = 1.3  # of a weak contact's cells about three quarters pass
     if not m.total > 0.0:
         at = signal.row * state.grid.cols + signal.col
         size = state.grid.rows * state.grid.cols
         m.total, m.x, m.y, m.number = 1.0, centres[X * size + at], centres[Y * size + at], 1.0
-    _set_from_area(m, state.grid, share * m.number)
+    _set_from_area(m, state.grid, cells_factor * m.number)
     refine(state, frame, centres)
     refine(state, frame, centres)
-    _take(state)
+    _store(state)
     state.estimate.gain = min(max(m.gain, 0.02), 50.0)
 
 
 @inner_kernel
 def _sums_of_weak(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
-    """As :func:`sums_above` for pressures of a few times the noise, where lone cells mislead.
+    """Sum as :func:`sums_above` does, over weak pressures of a few times the noise.
 
-    Over cells of twice the noise whose neighbourhood stands out as a contact's.
+    Lone cells mislead there: the sums are over cells of twice the noise whose neighbourhood stands
+    out as a contact's.
     """
     m = state.moments
     level = 2.0 * state.signal.noise
     patch = state.options.patch_level * state.signal.noise
     size = state.grid.rows * state.grid.cols
-    last = state.reach.last
+    last = state.region.last
     total = sum_x = sum_y = number = 0.0
-    at = next_above(frame, centres, state.reach.first, last, level)
+    at = next_above(frame, centres, state.region.first, last, level)
     while at < last:
         if neighbourhood(frame, centres, state.grid, at) > patch:
             value = frame[at]
@@ -264,7 +265,7 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
-    """Contact in ``state.moments`` anew, from the moments over its footprint, a cell wider.
+    """Refine the contact in ``state.moments`` by the moments over its footprint, a cell wider.
 
     Where the gain is fixed the displacement comes from the force, otherwise from the extent, and
     the gain from the force; 0 where nothing presses. ``state.fit.covariance`` takes that of
@@ -292,7 +293,7 @@ def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
 
 @inner_kernel
 def _set_contact(state: EstimatorState) -> None:
-    """What :func:`refine` finds, from the moments."""
+    """Set :func:`refine`'s contact from the moments."""
     m = state.moments
     grid = state.grid
     a = grid.radius
@@ -314,18 +315,20 @@ def _set_contact(state: EstimatorState) -> None:
             d = min(max(d, 1e-4 * a), 0.95 * a)
         covariance[0, 0] = 0.25 * relative * d * d
     m.d = d
-    reach = _ratio(m, a, d, 1) * (a - d / 3.0)
-    _set_normal(m, m.x / reach, m.y / reach)
+    distance = _ratio(m, a, d, 1) * (a - d / 3.0)
+    _set_normal(m, m.x / distance, m.y / distance)
     if state.options.free_gain:
         cosine = math.sqrt(1.0 - m.n_x * m.n_x - m.n_y * m.n_y)
         gain = force * cosine / (math.pi * modulus * d * d * _ratio(m, a, d, 0))
         m.gain = gain
         # Over a disc of that many cells: mean of (r² − trace)².
         square = m.number * grid.pitch_x * grid.pitch_y / math.pi
-        spread = square * square / 3.0 - m.trace * square + m.trace * m.trace
+        variance = square * square / 3.0 - m.trace * square + m.trace * m.trace
         slope = (4.0 * a - 2.0 * d) / 6.0
-        by_d = relative * spread / (slope * slope)
+        by_d = relative * variance / (slope * slope)
         covariance[0, 0] = by_d
         covariance[3, 3] = gain * gain * (relative + 4.0 * by_d / (d * d))
         covariance[0, 3] = covariance[3, 0] = -2.0 * gain * by_d / d
-    covariance[1, 1] = covariance[2, 2] = relative * 0.25 * m.radius * m.radius / (reach * reach)
+    covariance[1, 1] = covariance[2, 2] = (
+        relative * 0.25 * m.radius * m.radius / (distance * distance)
+    )

@@ -15,25 +15,25 @@ from softfinger.kinematics.estimation.cut_cells import (
     FINE,
     FINEST,
     STRIPS_A_CELL,
+    append_strips,
     flush,
-    push_strips,
 )
 from softfinger.kinematics.estimation.state import (
     ALONG_X,
     ALONG_Y,
+    FRACTION,
     LEVELS,
     OWNERS,
     PLAIN,
     READING,
-    SHARE,
     STRIPS,
     VARIANCE,
     WEIGHT,
     EstimatorState,
 )
 from softfinger.kinematics.sensing.cell_integrals import (
+    ACTIVE,
     CELL_PLANES,
-    LIVE,
     PLAIN_MEAN,
     PLAIN_VAR,
     PLAIN_X,
@@ -52,17 +52,21 @@ from softfinger.kinematics.sensing.footprint import (
     set_extremes,
 )
 
-PLACE_BITS = 16  # of the column in a place; the row is above
+INDEX_BITS = 16  # of the column in an index; the row is above
 
 
 @inner_kernel
 def pack(
-    state: EstimatorState, cells: Pointer, frame: Pointer, arena: Pointer, places: IntPointer | None
+    state: EstimatorState,
+    cells: Pointer,
+    frame: Pointer,
+    scratch: Pointer,
+    indices: IntPointer | None,
 ) -> None:
     """Gather the footprint's cells of the model's grid, their number into ``state.fit.count``.
 
-    ``cells`` are the planes of `sensing.cell_integrals`, ``frame`` the readings. ``places`` takes
-    the cells' rows and columns for :func:`estimation.blurred_cells.spread`.
+    ``cells`` are the planes of `sensing.cell_integrals`, ``frame`` the readings. ``indices`` takes
+    the cells' rows and columns for :func:`estimation.blurred_cells.blur_cells`.
     """
     fit = state.fit
     face = fit.face
@@ -76,13 +80,13 @@ def pack(
         return
     first_row, last_row = rows_touched(face, grid)
     j0, j1 = cols_touched(face, grid)
-    left = further(arena, state.at.columns)
+    left = further(scratch, state.at.columns)
     right = further(left, cols + 1)
     line_spans(face, grid, True, j0, j1, left, right)
-    low = further(arena, state.at.lines)
+    low = further(scratch, state.at.lines)
     high = further(low, grid.rows + 1)
     line_spans(face, grid, False, first_row, last_row, low, high)
-    packed = further(arena, state.at.packed)
+    packed = further(scratch, state.at.packed)
     scale = state.signal.scale
     low_edge = _is_low(state)
     count = 0
@@ -109,13 +113,13 @@ def pack(
                     level = FINEST if low_edge and far2 > 0.97 * a * a else FINE
                 strips = state.strips[level]
                 crossings = (left[j], right[j], left[j + 1], right[j + 1])
-                push_strips(strips, x0, max(y0, face.low), min(y1, face.high), y1 - y0, crossings)
-                live = row[LIVE * cols + j]
-                packed[READING * size + count] = readings[j] * scale if live > 0.0 else 0.0
-                packed[WEIGHT * size + count] = live
-                if places is not None:
-                    places[count] = (i << PLACE_BITS) | j
-                strips.places[strips.owners] = count
+                append_strips(strips, x0, max(y0, face.low), min(y1, face.high), y1 - y0, crossings)
+                active = row[ACTIVE * cols + j]
+                packed[READING * size + count] = readings[j] * scale if active > 0.0 else 0.0
+                packed[WEIGHT * size + count] = active
+                if indices is not None:
+                    indices[count] = (i << INDEX_BITS) | j
+                strips.indices[strips.owners] = count
                 strips.ends[strips.owners] = strips.count
                 strips.owners += 1
                 count += 1
@@ -123,9 +127,9 @@ def pack(
                     flush(state, level, packed)
         n = inner_last - inner_first
         if n > 0:
-            if places is not None:
+            if indices is not None:
                 for k in range(n):
-                    places[count + k] = (i << PLACE_BITS) | (inner_first + k)
+                    indices[count + k] = (i << INDEX_BITS) | (inner_first + k)
             _copy_whole(
                 state,
                 further(row, inner_first),
@@ -142,7 +146,7 @@ def pack(
 
 @inner_kernel
 def _is_low(state: EstimatorState) -> bool:
-    """Whether the outline's lowest point over the base plane comes near to the rim."""
+    """Return whether the outline's lowest point over the base plane comes near to the rim."""
     face = state.fit.face
     a = state.model.radius
     cosine2 = 1.0 / (1.0 + face.v * face.v + face.w * face.w)
@@ -160,14 +164,14 @@ def _copy_whole(state: EstimatorState, cells: Pointer, row: Pointer, n: int, out
     v = state.fit.face.v
     w = state.fit.face.w
     for k in range(n):
-        out[SHARE * size + k] = 1.0
+        out[FRACTION * size + k] = 1.0
         out[PLAIN * size + k] = cells[PLAIN_MEAN * cols + k]
         out[ALONG_X * size + k] = cells[X_MEAN * cols + k]
         out[ALONG_Y * size + k] = cells[Y_MEAN * cols + k]
         reading = row[k]
-        live = cells[LIVE * cols + k]
-        out[READING * size + k] = reading * scale if live > 0.0 else 0.0
-        out[WEIGHT * size + k] = live
+        active = cells[ACTIVE * cols + k]
+        out[READING * size + k] = reading * scale if active > 0.0 else 0.0
+        out[WEIGHT * size + k] = active
     if state.law.bent:
         for k in range(n):
             plain = u * cells[PLAIN_VAR * cols + k] - 2.0 * (

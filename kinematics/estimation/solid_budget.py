@@ -1,7 +1,7 @@
-"""A solid tip's part of `error_budget`: its patterns of error, as sums of pictures.
+"""A solid tip's part of `error_budget`: its patterns of error, as sums of images.
 
-A frame is a sum of pictures, and so is what it changes by where the tip stands elsewhere, or the
-cells are wider: each picture has its change. All sums over cells of pictures and changes are made
+A frame is a sum of images, and so is what it changes by where the tip stands elsewhere, or the
+cells are wider: each image has its change. All sums over cells of images and changes are made
 once, so that a frame's own take products of matrices alone.
 """
 
@@ -17,10 +17,10 @@ from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.estimation.error_budget import (
     Uncertainty,
-    bend,
+    add_second_order,
     both_ways,
-    colour,
-    patterns,
+    correlate,
+    project_shared_errors,
     quadratic,
     set_errors,
     smooth_misfit,
@@ -37,12 +37,12 @@ from softfinger.kinematics.estimation.solid_projection import (
 from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.kinematics.sensing.solid_pressure import PICTURES
+from softfinger.kinematics.sensing.solid_pressure import IMAGES
 
-# What the fit makes of a motion besides its straight answer, as shares of d and of the tilt by the
-# square of the motion in depth over d, and of d by that of the turn: measured with shifts of 1 kPa
-# and of 0.5 mm.
-_D_BY_DEPTH, _TILT_BY_DEPTH, _D_BY_TURN = 0.4, 1.2, 1.6
+# What the fit makes of a motion besides its straight answer, as fractions of d and of the tilt by
+# the square of the motion in depth over d, and of d by that of the turn: measured with shifts of 1
+# kPa and of 0.5 mm.
+_D_BY_DEPTH, _TILT_BY_DEPTH, _D_BY_ROTATION = 0.4, 1.2, 1.6
 
 
 def set_solid_budget(
@@ -51,59 +51,59 @@ def set_solid_budget(
     known: Uncertainty,
     grid: SensorGrid,
     tip: Fingertip,
-    places: IntArray,
+    indices: IntArray,
     law: float,
 ) -> None:
-    """As `error_budget.set_budget`, for the live cells ``places`` of ``grid``.
+    """Set the budget as `error_budget.set_budget` does, for the cells ``indices`` of ``grid``.
 
     A shift is no contact to a solid tip whatever its size: the activity test takes the mean off.
     """
     set_errors(state, known, law)
     budget = solid.budget
-    live = np.ascontiguousarray(grid.pictures(tip)[:, places])
-    shear = live[-2:]
+    active = np.ascontiguousarray(grid.images(tip)[:, indices])
+    shear = active[-2:]
     across = np.linalg.inv(shear @ shear.T)
 
     def alone(fields: FloatArray) -> FloatArray:
-        """The fields less what is like shear."""
+        """Return the fields less their projection on shear."""
         return np.asarray(fields - fields @ shear.T @ across @ shear)
 
-    shown = alone(live)
-    count = len(live) - 2
-    ones = alone(np.ones((1, live.shape[1])))
-    budget.shift[:count] = shown[:count] @ ones[0]
+    basis = alone(active)
+    count = len(active) - 2
+    ones = alone(np.ones((1, active.shape[1])))
+    budget.shift[:count] = basis[:count] @ ones[0]
     budget.cells = float((ones**2).sum())
-    for k, (x, y, stretch) in enumerate(
+    for k, (x, y, scaling) in enumerate(
         ((known.centre, 0.0, 0.0), (0.0, known.centre, 0.0), (0.0, 0.0, known.pitch))
     ):
-        size = max(x, y, stretch)
+        size = max(x, y, scaling)
         if size > 0.0:
-            moved = alone(
+            displacement = alone(
                 (
-                    _elsewhere(grid, x, y, stretch).pictures(tip)[:, places]
-                    - _elsewhere(grid, -x, -y, -stretch).pictures(tip)[:, places]
+                    _elsewhere(grid, x, y, scaling).images(tip)[:, indices]
+                    - _elsewhere(grid, -x, -y, -scaling).images(tip)[:, indices]
                 )
                 / (2.0 * size)
             )
-            budget.moved[k, : count + 2, :count] = moved @ shown[:count].T
-            budget.squares[k, : count + 2, : count + 2] = moved @ moved.T
+            budget.displacement[k, : count + 2, :count] = displacement @ basis[:count].T
+            budget.squares[k, : count + 2, : count + 2] = displacement @ displacement.T
     if state.budget.correlated:
         rho = both_ways(known.correlation)
 
-        def coloured(fields: FloatArray) -> FloatArray:
+        def correlated_sums(fields: FloatArray) -> FloatArray:
             whole = np.zeros((len(fields), grid.rows * grid.cols))
-            whole[:, places] = fields
+            whole[:, indices] = fields
             return quadratic(whole.T.reshape(grid.rows, grid.cols, -1), rho)
 
-        budget.coloured[:count, :count] = coloured(shown[:count])
-        budget.shear = float((across * coloured(shear)).sum())
-        first = live[:1] - live[0].mean()
-        state.options.patch_level *= math.sqrt(coloured(first)[0, 0] / (first**2).sum())
+        budget.correlated_sums[:count, :count] = correlated_sums(basis[:count])
+        budget.shear = float((across * correlated_sums(shear)).sum())
+        first = active[:1] - active[0].mean()
+        state.options.patch_level *= math.sqrt(correlated_sums(first)[0, 0] / (first**2).sum())
 
 
-def _elsewhere(grid: SensorGrid, x: float, y: float, stretch: float) -> SensorGrid:
+def _elsewhere(grid: SensorGrid, x: float, y: float, scaling: float) -> SensorGrid:
     """The grid with the tip's centre moved, and with wider cells."""
-    wider = 1.0 + stretch
+    wider = 1.0 + scaling
     return replace(
         grid,
         pitch=(grid.pitches[0] * wider, grid.pitches[1] * wider),
@@ -117,77 +117,81 @@ def _apply(matrix: Pointer, values: Pointer, rows: int, count: int, out: Pointer
     for k in range(count):
         out[k] = 0.0
     for j in range(rows):
-        row = further(matrix, j * PICTURES)
+        row = further(matrix, j * IMAGES)
         value = values[j]
         for k in range(count):
             out[k] += value * row[k]
 
 
-@solid_kernel(patterns)
-def _patterns(solid: SolidFit, state: EstimatorState, packed: Pointer) -> None:
+@solid_kernel(project_shared_errors)
+def _project_shared_errors(solid: SolidFit, state: EstimatorState, packed: Pointer) -> None:
     budget = solid.budget
     count = solid.count
     each = columns_at(solid)
-    pictures = solid.weights.pictures
+    images = solid.weights.images
     whole = address(budget.whole)
-    for k in range(pictures):
+    for k in range(images):
         whole[k] = each[0][k]
     for k in range(2):
-        whole[pictures + k] = solid.shear[k] / state.fit.gain
+        whole[images + k] = solid.shear[k] / state.fit.gain
     sizes = (state.budget.shift, state.budget.centre, state.budget.centre, state.budget.pitch)
     sums = address(budget.sums)
     for source in range(4):
         state.budget.squares[source] = budget.cells
         change = address(budget.shift)
         if source > 0 and sizes[source] > 0.0:
-            start = (source - 1) * PICTURES * PICTURES
+            start = (source - 1) * IMAGES * IMAGES
             squares = further(address(budget.squares), start)
-            _apply(squares, whole, pictures + 2, pictures + 2, sums)
-            state.budget.squares[source] = dot(sums, whole, pictures + 2)
-            change = further(address(budget.moved), start)
-            _apply(change, whole, pictures + 2, count, sums)
+            _apply(squares, whole, images + 2, images + 2, sums)
+            state.budget.squares[source] = dot(sums, whole, images + 2)
+            change = further(address(budget.displacement), start)
+            _apply(change, whole, images + 2, count, sums)
             change = sums
         for column in range(4):
-            state.budget.answers[column, source] = dot(each[column], change, count)
+            state.budget.responses[column, source] = dot(each[column], change, count)
 
 
-@solid_kernel(bend)
-def _bend(solid: SolidFit, state: EstimatorState, d: float, out: Matrix) -> None:
-    moved = state.budget.moved
-    square = min((moved[1] / d) ** 2, 1.0)
-    turned = _D_BY_TURN * d * min(moved[2] * moved[2] + moved[3] * moved[3], 1.0)
+@solid_kernel(add_second_order)
+def _add_second_order(solid: SolidFit, state: EstimatorState, d: float, out: Matrix) -> None:
+    displacement = state.budget.displacement
+    square = min((displacement[1] / d) ** 2, 1.0)
+    rotated = (
+        _D_BY_ROTATION
+        * d
+        * min(displacement[2] * displacement[2] + displacement[3] * displacement[3], 1.0)
+    )
     deeper = _D_BY_DEPTH * d * square
     along_x = _TILT_BY_DEPTH * solid.n_x * square
     along_y = _TILT_BY_DEPTH * solid.n_y * square
-    out[1, 1] += deeper * deeper + turned * turned
+    out[1, 1] += deeper * deeper + rotated * rotated
     out[2, 2] += along_x * along_x
     out[2, 3] += along_x * along_y
     out[3, 2] += along_x * along_y
     out[3, 3] += along_y * along_y
 
 
-@solid_kernel(colour)
-def _colour(solid: SolidFit, state: EstimatorState, d: float) -> float:
+@solid_kernel(correlate)
+def _correlate(solid: SolidFit, state: EstimatorState, d: float) -> float:
     fit = state.fit
     first = 0 if state.options.free_gain else 1
     count = solid.count
     columns = columns_at(solid)
     sides = address(solid.sides)
-    multiply(address(solid.budget.coloured), columns, count, sides)
+    multiply(address(solid.budget.correlated_sums), columns, count, sides)
     factor = (1.0, -fit.gain, fit.gain, fit.gain)
     # JᵀCJ times the inverse, then the inverse times that.
     half = fit.matrix
-    kept = solid.budget.kept
+    work = solid.budget.work
     for i in range(4):
         for j in range(4):
-            both = dot(further(sides, i * PICTURES), columns[j], count)
-            kept[i, j] = factor[i] * factor[j] * both
+            both = dot(further(sides, i * IMAGES), columns[j], count)
+            work[i, j] = factor[i] * factor[j] * both
     trace = 0.0
     for i in range(first, 4):
         for j in range(first, 4):
             value = 0.0
             for m in range(first, 4):
-                value += kept[i, m] * fit.inverse[m, j]
+                value += work[i, m] * fit.inverse[m, j]
             half[i, j] = value
         trace += half[i, i]
     for i in range(first, 4):
@@ -195,10 +199,10 @@ def _colour(solid: SolidFit, state: EstimatorState, d: float) -> float:
             value = 0.0
             for m in range(first, 4):
                 value += fit.inverse[i, m] * half[m, j]
-            kept[i, j] = value
+            work[i, j] = value
     for i in range(first, 4):
         for j in range(first, 4):
-            fit.inverse[i, j] = kept[i, j]
+            fit.inverse[i, j] = work[i, j]
     # Shear's two are off the cells' number already.
     return trace + solid.budget.shear - 2.0
 

@@ -1,7 +1,7 @@
 """The likelihood of a solid tip's frame, and its maximum by Gauss-Newton, as kernels.
 
-The model is Σ_j w_j(d, n_x, n_y) P_j with fixed pictures P_j (`sensing.solid_pressure`). So a frame
-is projected on the pictures once, and the iteration works on these sums and on the pictures'
+The model is Σ_j w_j(d, n_x, n_y) P_j with fixed images P_j (`sensing.solid_pressure`). So a frame
+is projected on the images once, and the iteration works on these sums and on the images'
 products alone. Where the projection goes by the model before (`solid_projection`), the frame is
 projected again until that settles.
 """
@@ -37,19 +37,19 @@ from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES
 from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.kinematics.sensing.solid_pressure import PICTURES, own_shear
+from softfinger.kinematics.sensing.solid_pressure import IMAGES, own_shear
 
 _RIM = {"bonded": 0.03, "lying": 0.05}  # of the radius: nearer to a solid tip's rim none counts
 CELLS_MIN = 9  # that a solid tip's contact and shear can be told from
 _PASSES = 24  # projections of a frame
 _LIMITED = 4  # of them that may end where the data do, one after the other
 _SETTLED = 0.1  # squared step, in units of the noise floor, at which readings by the model stay
-_MOST_HALVINGS = 5
+_HALVINGS_MAX = 5
 _STARTS = 8  # depths from which a frame alone is fitted
 
 
 def within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
-    """The cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
+    """Return the cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
 
     A bonded base's stress is singular there, which no two meshes have alike: from independent
     elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. Under a
@@ -72,32 +72,31 @@ def lay_out_solid(
     state: EstimatorState,
     grid: SensorGrid,
     tip: Fingertip,
-    live: NDArray[np.bool_],
+    active: NDArray[np.bool_],
     material: Material,
 ) -> tuple[FloatArray, IntArray, SolidFit]:
-    """The arena of a grid under a solid tip, its live cells' numbers, and the fit's memory.
+    """Return a grid's scratch under a solid tip, its active cells' indices, and the fit's memory.
 
     Raises ValueError where there are too few.
     """
-    if live.sum() < CELLS_MIN:
+    if active.sum() < CELLS_MIN:
         raise ValueError(
-            f"a solid tip needs {CELLS_MIN} live cells within its rim, got {live.sum()}"
+            f"a solid tip needs {CELLS_MIN} active cells within its rim, got {active.sum()}"
         )
     geometry = grid.on(tip)
     state.grid.assign(geometry)
     state.model.assign(geometry)
-    centres = cell_centres(geometry, live, tip.radius + 3.0 * grid.blur, state.reach)
+    centres = cell_centres(geometry, active, tip.radius + 3.0 * grid.blur, state.region)
     cells = np.zeros((grid.rows, CELL_PLANES, grid.cols))
-    places = np.flatnonzero(centres[HEIGHT] >= 0.0).astype(np.int64)
-    packed = np.ascontiguousarray(grid.pictures(tip)[:, places])
+    indices = np.flatnonzero(centres[HEIGHT] >= 0.0).astype(np.int64)
+    packed = np.ascontiguousarray(grid.images(tip)[:, indices])
     solid = solid_fit(tip, material, packed)
     state.at.cells = centres.size
     solid.packed = centres.size + cells.size
     solid.readings = solid.packed + packed.size
-    solid.model = solid.readings + len(places)
-    scratch = np.zeros(2 * len(places))
-    arena = np.concatenate([centres.ravel(), cells.ravel(), packed.ravel(), scratch])
-    return arena, places, solid
+    solid.model = solid.readings + len(indices)
+    arrays = centres.ravel(), cells.ravel(), packed.ravel(), np.zeros(2 * len(indices))
+    return np.concatenate(arrays), indices, solid
 
 
 @inner_kernel
@@ -116,7 +115,7 @@ def _set_sums(state: EstimatorState, solid: SolidFit) -> float:
     right = fit.sums.right
     at = 0
     for i in range(4):
-        side = further(sides, i * PICTURES)
+        side = further(sides, i * IMAGES)
         for j in range(i, 4):
             normal[at] = dot(side, columns[j], count)
             at += 1
@@ -137,11 +136,11 @@ def _go_on(state: EstimatorState, solid: SolidFit) -> None:
     n_x = solid.n_x + fit.step[2]
     n_y = solid.n_y + fit.step[3]
     tilt = math.hypot(n_x, n_y)
-    most = math.sin(table.tilt)
-    solid.limited = d > table.deepest or tilt > most
-    if tilt > most:
-        n_x *= most / tilt
-        n_y *= most / tilt
+    sine_max = math.sin(table.tilt)
+    solid.limited = d > table.deepest or tilt > sine_max
+    if tilt > sine_max:
+        n_x *= sine_max / tilt
+        n_y *= sine_max / tilt
     solid.d = min(max(d, 0.3 * solid.d, 1e-4 * table.radius), table.deepest)
     solid.n_x = n_x
     solid.n_y = n_y
@@ -157,7 +156,7 @@ def _descend(state: EstimatorState, solid: SolidFit, tolerance: float) -> int:
     halvings = 0
     for number in range(state.options.iterations):
         cost = _set_sums(state, solid)
-        if not cost <= before + variance and halvings < _MOST_HALVINGS:
+        if not cost <= before + variance and halvings < _HALVINGS_MAX:
             solid.d = 0.5 * (solid.d + d)
             solid.n_x = 0.5 * (solid.n_x + n_x)
             solid.n_y = 0.5 * (solid.n_y + n_y)
@@ -182,7 +181,7 @@ def _descend(state: EstimatorState, solid: SolidFit, tolerance: float) -> int:
 
 @solid_kernel(start)
 def _start(
-    solid: SolidFit, state: EstimatorState, frame: Pointer, arena: Pointer, places: IntArray
+    solid: SolidFit, state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray
 ) -> None:
     """The best of some contacts, straight and tilted, into ``state.estimate``: where a fit starts.
 
@@ -191,11 +190,11 @@ def _start(
     estimate = state.estimate
     fit = state.fit
     deepest = solid.weights.table.deepest
-    clip = further(arena, solid.model)
+    clip = further(scratch, solid.model)
     for k in range(solid.cells):
         clip[k] = math.inf
     solid.count = solid.low
-    project(state, solid, frame, arena, address(places))
+    project(state, solid, frame, scratch, address(indices))
     best = math.inf
     tilt = 0.5 * math.sin(solid.weights.table.tilt)
     for k in range(_STARTS):
@@ -231,8 +230,8 @@ def _fit(
     solid: SolidFit,
     state: EstimatorState,
     frame: Pointer,
-    arena: Pointer,
-    places: IntArray,
+    scratch: Pointer,
+    indices: IntArray,
     tolerance: float,
 ) -> bool:
     """False also where the contact is beyond what the data cover."""
@@ -248,29 +247,29 @@ def _fit(
         solid.count = counting(state, solid)
         x = solid.shear[0]
         y = solid.shear[1]
-        set_model(solid, arena, fit.gain)
-        changed = project(state, solid, frame, arena, address(places))
+        set_model(solid, scratch, fit.gain)
+        changed = project(state, solid, frame, scratch, address(indices))
         # What is read off the model settles more slowly than Gauss-Newton does.
         steps = _descend(state, solid, min(tolerance, _SETTLED) if changed else tolerance)
         total += steps
         if steps == 0:
             return False
-        # What the pictures leave of the shear that was fitted alone.
+        # What the images leave of the shear that was fitted alone.
         for k in range(2):
             for j in range(solid.count):
-                solid.shear[k] -= fit.gain * solid.likeness[j, k] * solid.weights.value[j]
+                solid.shear[k] -= fit.gain * solid.overlap[j, k] * solid.weights.value[j]
         limited = limited + 1 if solid.limited else 0
         if limited == _LIMITED:
             return False
         sheared = solid.strongest * math.hypot(solid.shear[0] - x, solid.shear[1] - y)
         same = steps == 1 or not (changed or counting(state, solid) > solid.count)
         if same and limited == 0 and sheared < 0.5 * math.sqrt(state.signal.variance):
-            return _finish(state, solid, arena, total)
+            return _finish(state, solid, scratch, total)
     return False
 
 
 @inner_kernel
-def _finish(state: EstimatorState, solid: SolidFit, arena: Pointer, iterations: int) -> bool:
+def _finish(state: EstimatorState, solid: SolidFit, scratch: Pointer, iterations: int) -> bool:
     """The estimate and its covariance at the fit's end."""
     estimate = state.estimate
     fit = state.fit
@@ -288,4 +287,4 @@ def _finish(state: EstimatorState, solid: SolidFit, arena: Pointer, iterations: 
     estimate.n_y = solid.n_y
     fit.sums.readings = solid.raw
     fit.sums.weight = solid.counted - 2.0  # shear's
-    return conclude(solid, state, arena, iterations)
+    return conclude(solid, state, scratch, iterations)

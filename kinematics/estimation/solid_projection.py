@@ -1,10 +1,10 @@
-"""A solid tip's frame, projected on the pictures that the model is made of, as kernels.
+"""A solid tip's frame, projected on the images that the model is made of, as kernels.
 
 Cells that don't read the pressure as it is, since it ends at a floor or is cut at 0 where the model
 pulls, are given what they would have read, by the model before.
 
-A shear force on the face adds two pictures of its own, which look much like a tilt's. It is fitted
-along, by taking out of all other pictures what they share with these two.
+A shear force on the face adds two images of its own, which look much like a tilt's. It is fitted
+along, by taking out of all other images what they share with these two.
 """
 
 from __future__ import annotations
@@ -25,59 +25,59 @@ from softfinger.kinematics.estimation.likelihood import CLIP, CLIP_END
 from softfinger.kinematics.estimation.state import EstimatorState, Matrix
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import (
-    PICTURES,
+    IMAGES,
     Weights,
-    add_picture,
-    pictures_of,
-    weigh,
+    add_image,
+    image_count,
+    set_weights,
     weights_of,
 )
 
-_LOST = 0.01  # squared noise floor that a picture may count to be left out
-_KEPT = 0.5  # of the level for a first contact: one that is just felt doesn't flicker
+_LOST = 0.01  # squared noise floor that a image may count to be left out
+_HYSTERESIS = 0.5  # of the level for a first contact: one that is just felt doesn't flicker
 _NEAR = 0.03  # rad round a contact for which that holds
 
-Sums = Annotated[FloatArray, PICTURES]
-Products = Annotated[FloatArray, PICTURES, PICTURES]
+Sums = Annotated[FloatArray, IMAGES]
+Products = Annotated[FloatArray, IMAGES, IMAGES]
 Columns: TypeAlias = tuple[Pointer, Pointer, Pointer, Pointer]
-Likeness = Annotated[FloatArray, PICTURES, 2]  # how much of each shear picture is in each other
+Overlap = Annotated[FloatArray, IMAGES, 2]  # how much of each shear image is in each other
 
 
 class SolidBudget(Record):
     """Sums over the cells for `solid_budget`, less what is like shear."""
 
-    shift: Sums  # Σ picture
+    shift: Sums  # Σ image
     cells: float
-    moved: Annotated[FloatArray, 3, PICTURES, PICTURES]  # Σ change of one · other picture
-    squares: Annotated[FloatArray, 3, PICTURES, PICTURES]  # Σ change · change
-    coloured: Products  # Σ over pairs of cells of picture · their correlation · picture
+    displacement: Annotated[FloatArray, 3, IMAGES, IMAGES]  # Σ change of one · other image
+    squares: Annotated[FloatArray, 3, IMAGES, IMAGES]  # Σ change · change
+    correlated_sums: Products  # Σ over pairs of cells of image · their correlation · image
     shear: float  # the same of both of shear's alone, scaled to 1
-    whole: Sums  # scratch: what each picture counts, with shear's
+    whole: Sums  # scratch: what each image counts, with shear's
     sums: Sums  # scratch
-    kept: Matrix  # scratch
+    work: Matrix  # scratch
 
 
 class SolidFit(Record):
-    """A solid tip's pictures over a grid's live cells, and one frame's sums over them."""
+    """A solid tip's images over a grid's active cells, and one frame's sums over them."""
 
     weights: Weights
     cells: int
-    packed: int  # where in the arena the pictures of live cells start [pictures, cells]
+    packed: int  # where in the scratch the images of active cells start [images, cells]
     readings: int  # likewise [cells]
     model: int
-    projected: Sums  # Σ picture · reading
-    count: int  # pictures that count in the contact at work: the first ones
+    projected: Sums  # Σ image · reading
+    count: int  # images that count in the contact at work: the first ones
     low: int  # those of m ≤ 2
-    first: float  # mean of the first picture, which any contact shows most
-    spread: float  # √Σ(first picture − mean)²
-    plain: Products  # Σ picture · picture over live cells, shear's two last
+    first: float  # mean of the first image, which any contact shows most
+    norm: float  # √Σ(first image − mean)²
+    plain: Products  # Σ image · image over active cells, shear's two last
     products: Products  # the same without what is like shear
     used: Products  # and over the cells that count in this frame
-    whole: Likeness
-    likeness: Likeness  # in this frame
+    whole: Overlap
+    overlap: Overlap  # in this frame
     shear: Pair  # of the model [Pa]
-    strongest: float  # cell of shear's pictures
-    sides: Annotated[FloatArray, 4, PICTURES]  # products times columns of the Jacobian
+    strongest: float  # cell of shear's images
+    sides: Annotated[FloatArray, 4, IMAGES]  # products times columns of the Jacobian
     d: float  # of the contact at work
     n_x: float
     n_y: float
@@ -88,20 +88,20 @@ class SolidFit(Record):
     budget: SolidBudget
 
 
-def solid_fit(tip: Fingertip, material: Material, live: FloatArray) -> SolidFit:
-    """The fit's memory for the pictures of ``live`` cells, float64 [pictures, cells]."""
+def solid_fit(tip: Fingertip, material: Material, active: FloatArray) -> SolidFit:
+    """Allocate the fit's memory for the images of ``active`` cells, float64 [images, cells]."""
     fit = SolidFit()
     fit.weights.assign(weights_of(tip, material))
-    count, fit.cells = live.shape
-    fit.plain[:count, :count] = plain = live @ live.T
+    count, fit.cells = active.shape
+    fit.plain[:count, :count] = plain = active @ active.T
     both = plain[-2:, -2:]
-    fit.whole[: count - 2] = likeness = plain[:-2, -2:] @ np.linalg.inv(both)
-    fit.products[: count - 2, : count - 2] = plain[:-2, :-2] - likeness @ both @ likeness.T
-    fit.strongest = np.abs(live[-2:]).max()
-    fit.first = live[0].mean()
-    fit.spread = live[0].std() * math.sqrt(fit.cells)
+    fit.whole[: count - 2] = overlap = plain[:-2, -2:] @ np.linalg.inv(both)
+    fit.products[: count - 2, : count - 2] = plain[:-2, :-2] - overlap @ both @ overlap.T
+    fit.strongest = np.abs(active[-2:]).max()
+    fit.first = active[0].mean()
+    fit.norm = active[0].std() * math.sqrt(fit.cells)
     low = fit.weights.harmonics[: fit.weights.modes] <= 2
-    fit.low = pictures_of(fit.weights.harmonics[: fit.weights.modes][low])
+    fit.low = image_count(fit.weights.harmonics[: fit.weights.modes][low])
     return fit
 
 
@@ -130,11 +130,11 @@ def dot(a: Pointer, b: Pointer, count: int) -> float:
 
 @inner_kernel
 def columns_at(solid: SolidFit) -> Columns:
-    """What each picture counts in the contact at work, and the partials by −d, n_x and n_y."""
+    """Return each image's weight in the contact at work, and the partials by −d, n_x and n_y."""
     weights = solid.weights
-    weigh(weights, solid.d, solid.n_x, solid.n_y)
+    set_weights(weights, solid.d, solid.n_x, solid.n_y)
     by_d = address(weights.by_d)
-    for k in range(weights.pictures):
+    for k in range(weights.images):
         by_d[k] = -by_d[k]
     return address(weights.value), by_d, address(weights.by_x), address(weights.by_y)
 
@@ -146,110 +146,110 @@ def multiply(
     count: int,
     out: Pointer,
 ) -> None:
-    """The symmetric ``matrix`` [PICTURES, PICTURES] times four columns, into ``out`` by rows."""
+    """Multiply the symmetric ``matrix`` [PICTURES, PICTURES] by four columns, into ``out``."""
     a, b, c, d = columns
-    for k in range(4 * PICTURES):
+    for k in range(4 * IMAGES):
         out[k] = 0.0
     for j in range(count):
-        row = further(matrix, j * PICTURES)
+        row = further(matrix, j * IMAGES)
         p = a[j]
         q = b[j]
         r = c[j]
         s = d[j]
         for k in range(count):
             out[k] += p * row[k]
-            out[PICTURES + k] += q * row[k]
-            out[2 * PICTURES + k] += r * row[k]
-            out[3 * PICTURES + k] += s * row[k]
+            out[IMAGES + k] += q * row[k]
+            out[2 * IMAGES + k] += r * row[k]
+            out[3 * IMAGES + k] += s * row[k]
 
 
 @inner_kernel
 def presses(
-    state: EstimatorState, solid: SolidFit, frame: Pointer, arena: Pointer, places: IntPointer
+    state: EstimatorState, solid: SolidFit, frame: Pointer, scratch: Pointer, indices: IntPointer
 ) -> bool:
-    """Whether the frame shows the first picture, by more than ``patch_level`` deviations.
+    """Return whether the frame shows the first image, by more than ``patch_level`` deviations.
 
     The mean over the cells is taken off both, so that a shift of all their zeros, or noise that
     ends at 0, is no contact. Much of a solid tip's pressure is spread over its base: a weak contact
     shows in all cells together long before it does in any neighbourhood.
     """
-    readings = further(arena, solid.readings)
+    readings = further(scratch, solid.readings)
     total = 0.0
     for k in range(solid.cells):
-        readings[k] = frame[places[k]]
+        readings[k] = frame[indices[k]]
         total += readings[k]
-    shown = dot(further(arena, solid.packed), readings, solid.cells)
-    level = state.options.patch_level * state.signal.noise * solid.spread
-    level *= _KEPT if state.estimate.warm else 1.0
-    return bool(shown - solid.first * total > level)
+    projection = dot(further(scratch, solid.packed), readings, solid.cells)
+    level = state.options.patch_level * state.signal.noise * solid.norm
+    level *= _HYSTERESIS if state.estimate.warm else 1.0
+    return bool(projection - solid.first * total > level)
 
 
 @inner_kernel
 def counting(state: EstimatorState, solid: SolidFit) -> int:
-    """How many pictures count at the contact, and near it: the others are well within the noise."""
+    """Return the number of images above the noise at the contact and near it."""
     weights = solid.weights
-    weigh(weights, solid.d, solid.n_x, solid.n_y)
-    least = _LOST * state.signal.variance / (state.fit.gain * state.fit.gain)
-    count = weights.pictures
+    set_weights(weights, solid.d, solid.n_x, solid.n_y)
+    threshold = _LOST * state.signal.variance / (state.fit.gain * state.fit.gain)
+    count = weights.images
     while count > solid.low:
         j = count - 1
         near = _NEAR * max(abs(weights.by_x[j]), abs(weights.by_y[j]))
-        shown = max(abs(weights.value[j]), near)
-        if shown * shown * solid.products[j, j] > least:
+        projection = max(abs(weights.value[j]), near)
+        if projection * projection * solid.products[j, j] > threshold:
             break
         count = j
     return count
 
 
 @fast_inner_kernel
-def set_model(solid: SolidFit, arena: Pointer, gain: float) -> None:
-    model = further(arena, solid.model)
+def set_model(solid: SolidFit, scratch: Pointer, gain: float) -> None:
+    model = further(scratch, solid.model)
     for k in range(solid.cells):
         model[k] = 0.0
     for j in range(solid.count):
-        picture = further(arena, solid.packed + j * solid.cells)
-        add_picture(picture, gain * solid.weights.value[j], 0, solid.cells, model)
+        image = further(scratch, solid.packed + j * solid.cells)
+        add_image(image, gain * solid.weights.value[j], 0, solid.cells, model)
     for k in range(2):
-        picture = further(arena, solid.packed + (solid.weights.pictures + k) * solid.cells)
-        add_picture(picture, solid.shear[k], 0, solid.cells, model)
+        image = further(scratch, solid.packed + (solid.weights.images + k) * solid.cells)
+        add_image(image, solid.shear[k], 0, solid.cells, model)
 
 
 @inner_kernel
 def _excess(model: float, floor: float, clip: float) -> float:
-    """How much more a cell reads on average than the model, cut at 0, with noise at ``floor``."""
+    """Return the mean excess of a cell over the model, cut at 0, with noise at ``floor``."""
     pressure = max(model, 0.0)
-    most = max(pressure, floor) - model
+    excess = max(pressure, floor) - model
     if clip > 0.0:
         z = abs(pressure - floor) / clip
         if z < CLIP_END:
             above = 1.0 - z * (1.0 / CLIP_END)
             base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
-            most += clip * above * above * base
-    return most
+            excess += clip * above * above * base
+    return excess
 
 
 @inner_kernel
 def project(
-    state: EstimatorState, solid: SolidFit, frame: Pointer, arena: Pointer, places: IntPointer
+    state: EstimatorState, solid: SolidFit, frame: Pointer, scratch: Pointer, indices: IntPointer
 ) -> bool:
-    """Take the frame's live cells, as they would read the model without ends, and project them.
+    """Take the frame's active cells, as they would read the model without ends, and project them.
 
     Whether any cell was changed, so that this depends on the model.
     """
     signal = state.signal
-    readings = further(arena, solid.readings)
-    model = further(arena, solid.model)
-    height = further(arena, state.at.centres)
+    readings = further(scratch, solid.readings)
+    model = further(scratch, solid.model)
+    height = further(scratch, state.at.centres)
     floor = max(signal.floor, 0.0)
     clip = math.sqrt(signal.variance) if signal.clipped else 0.0
     near = floor + CLIP_END * clip
     count = solid.count
-    pictures = solid.weights.pictures + 2
+    images = solid.weights.images + 2
     solid.counted = float(solid.cells)
     square = raw = 0.0
     changed = False
     for k in range(solid.cells):
-        at = places[k]
+        at = indices[k]
         reading = frame[at] * signal.scale
         pressure = model[k]
         outlier = height[at] < 0.0
@@ -259,10 +259,10 @@ def project(
             # Saturated, or an outlier: it doesn't count.
             if solid.counted == solid.cells:
                 solid.used[:] = solid.plain
-            for i in range(pictures):
-                value = arena[solid.packed + i * solid.cells + k]
-                for j in range(pictures):
-                    solid.used[i, j] -= value * arena[solid.packed + j * solid.cells + k]
+            for i in range(images):
+                value = scratch[solid.packed + i * solid.cells + k]
+                for j in range(images):
+                    solid.used[i, j] -= value * scratch[solid.packed + j * solid.cells + k]
             solid.counted -= 1.0
             readings[k] = 0.0
             changed = changed or full
@@ -273,28 +273,28 @@ def project(
         readings[k] = reading
         square += reading * reading
     solid.raw = raw
-    last = further(arena, solid.packed + (pictures - 2) * solid.cells)
+    last = further(scratch, solid.packed + (images - 2) * solid.cells)
     x = dot(last, readings, solid.cells)
     y = dot(further(last, solid.cells), readings, solid.cells)
     if solid.counted == solid.cells:
-        solid.likeness[:] = solid.whole
-        solid.square = square - _along_shear(solid.plain, pictures, (x, y), solid.shear)
+        solid.overlap[:] = solid.whole
+        solid.square = square - _along_shear(solid.plain, images, (x, y), solid.shear)
     else:
-        solid.square = square - _along_shear(solid.used, pictures, (x, y), solid.shear)
-        _take_out_shear(solid, pictures)
+        solid.square = square - _along_shear(solid.used, images, (x, y), solid.shear)
+        _remove_shear(solid, images)
     for j in range(count):
-        picture = further(arena, solid.packed + j * solid.cells)
-        shown = dot(picture, readings, solid.cells)
-        solid.projected[j] = shown - solid.likeness[j, 0] * x - solid.likeness[j, 1] * y
+        image = further(scratch, solid.packed + j * solid.cells)
+        projection = dot(image, readings, solid.cells)
+        solid.projected[j] = projection - solid.overlap[j, 0] * x - solid.overlap[j, 1] * y
     return changed
 
 
 @inner_kernel
 def _along_shear(
-    products: FloatArray, pictures: int, sums: tuple[float, float], shear: FloatArray
+    products: FloatArray, images: int, sums: tuple[float, float], shear: FloatArray
 ) -> float:
-    """Fit shear's two pictures alone: ``shear`` by their ``sums``, and the squares they explain."""
-    k = pictures - 2
+    """Fit shear's two images alone: ``shear`` by their ``sums``, and the squares they explain."""
+    k = images - 2
     x, y = sums
     p = products[k, k]
     q = products[k, k + 1]
@@ -302,18 +302,18 @@ def _along_shear(
     inverse = 1.0 / (p * r - q * q)
     shear[0] = (r * x - q * y) * inverse
     shear[1] = (p * y - q * x) * inverse
-    explained: float = shear[0] * x + shear[1] * y
-    return explained
+    r_squared: float = shear[0] * x + shear[1] * y
+    return r_squared
 
 
 @inner_kernel
-def _take_out_shear(solid: SolidFit, pictures: int) -> None:
+def _remove_shear(solid: SolidFit, images: int) -> None:
     """Take what is like shear out of this frame's products, where some cells don't count."""
-    count = pictures - 2
+    count = images - 2
     used = solid.used
-    likeness = solid.likeness
+    overlap = solid.overlap
     for j in range(count):
-        _along_shear(used, pictures, (used[j, count], used[j, count + 1]), likeness[j])
+        _along_shear(used, images, (used[j, count], used[j, count + 1]), overlap[j])
     for i in range(count):
         for j in range(count):
-            used[i, j] -= likeness[i, 0] * used[count, j] + likeness[i, 1] * used[count + 1, j]
+            used[i, j] -= overlap[i, 0] * used[count, j] + overlap[i, 1] * used[count + 1, j]

@@ -1,6 +1,6 @@
 """The estimator's memory, with names: options, one frame, the estimate, a step of the fit, scratch.
 
-What depends on the grid's size stands in one array of floats, the arena; `Places` says where.
+What depends on the grid's size stands in one array of floats, the scratch; `Offsets` says where.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from typing import Annotated, TypeAlias
 from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntArray
 
-# Planes of the packed cells of a footprint: the share of a cell that lies in it, over that share
-# the means of g, x g, y g (g = 1/√(a² − x² − y²)) and the strain's variance; reading and weight.
-SHARE, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
+# Planes of the packed cells of a footprint: the fraction of a cell that lies in it, over that
+# fraction the means of g, x g, y g (g = 1/√(a² − x² − y²)) and the strain's variance; reading and
+# weight.
+FRACTION, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
 PLANES = 7
 
 LEVELS = 3  # how near the rim a cut cell is
@@ -30,7 +31,7 @@ Strip: TypeAlias = Annotated[FloatArray, STRIPS]
 
 
 class Options(Record):
-    """What the estimator was made for; see `ContactEstimator`."""
+    """Constants of one estimator; see `ContactEstimator`."""
 
     noise: float  # of a cell [Pa]
     saturation: float  # [counts]
@@ -38,7 +39,7 @@ class Options(Record):
     tolerance: float
     peak_level: float  # [noise]
     patch_level: float
-    explained_min: float
+    r_squared_min: float
     modulus: float  # at no strain [Pa]
     blur: float  # standard deviation [m]
     rotation: float  # of the sensor [rad]
@@ -56,7 +57,7 @@ class Law(Record):
     bent: bool  # curved, so that the strain's variance counts
 
 
-class Reach(Record):
+class Region(Record):
     """Cells that a contact can press: the flat range of their rows, and their number."""
 
     first: int
@@ -70,11 +71,11 @@ class Signal(Record):
     scale: float  # Pa a count
     variance: float  # of a cell [Pa²]
     noise: float  # of a cell [counts]
-    confined: float  # most that a contact as wide as a cell presses [counts]
+    confined: float  # upper limit of a contact as wide as a cell [counts]
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf for none
-    peak: float  # largest cell [counts], and its place, −1 for none above the level
+    peak: float  # largest cell [counts], and its indices, −1 for none above the level
     row: int
     col: int
     mean: float  # [counts]
@@ -85,14 +86,14 @@ class Signal(Record):
 
 
 class Estimate(Record):
-    """What a frame leaves, where the next one starts: in the sensor's axes, then the finger's."""
+    """Estimate of one frame and start of the next: in the sensor's axes, then the finger's."""
 
     d: float
     gain: float
     chi2: float
     tilt_x: float
     tilt_y: float
-    explained: float
+    r_squared: float
     peak: float  # [Pa]
     cells: int
     iterations: int
@@ -106,7 +107,7 @@ class Estimate(Record):
     n_x: float
     n_y: float
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
-    hidden: float  # what a smooth misfit may hide of d, over d
+    undetected: float  # what a smooth misfit may hide of d, over d
     shared: float  # standard deviation of d by the known uncertainties, over d
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
     systematic: Matrix  # the part of it that all frames share
@@ -158,7 +159,7 @@ class Fit(Record):
 
 
 class Budget(Record):
-    """What the noise of single cells leaves out, see `error_budget`; and scratch for it."""
+    """Errors beside single cells' noise, see `error_budget`, and scratch for them."""
 
     baseline: float  # standard deviations: of a shift of all cells [Pa]
     shift: float  # the same, and of the pressed ones by the law's misfit
@@ -166,14 +167,14 @@ class Budget(Record):
     pitch: float  # relative
     modulus: float  # relative; 0 with a free gain
     along: float  # correlation of neighbours in a row
-    sharing: float  # Σρ²: cells for each that is independent
+    cells_per_sample: float  # Σρ²: cells for each that is independent
     systematic: bool  # any of those but the correlation
     correlated: bool
-    inflation: Annotated[FloatArray, DEPTHS, 4, 4]
-    kept: Matrix
-    answers: Matrix  # Jᵀq, columns by source
+    variance_factor: Annotated[FloatArray, DEPTHS, 4, 4]
+    work: Matrix
+    responses: Matrix  # Jᵀq, columns by source
     squares: Four  # qᵀq
-    moved: Four
+    displacement: Four
     shared: Matrix  # covariance by what all frames share, of (gain, u, v, w)
     covariance: Matrix  # the same of (d, n_x, n_y, gain)
 
@@ -194,32 +195,32 @@ class Strips(Record):
     sum_square: Strip
     count: int
     owners: int  # cells that they belong to
-    places: Annotated[IntArray, OWNERS]  # of these among the packed cells
+    indices: Annotated[IntArray, OWNERS]  # of these among the packed cells
     ends: Annotated[IntArray, OWNERS]  # of their strips
 
 
 class Blur(Record):
-    """How a blurred grid is modelled: on parts of cells, spread by weights."""
+    """Model of a blurred grid: pieces of cells, blurred by weights."""
 
-    parts_x: int  # of a cell
-    parts_y: int
-    weights_x: int  # for each remainder of a part's column
+    pieces_x: int  # of a cell
+    pieces_y: int
+    weights_x: int  # for each remainder of a piece's column
     weights_y: int
     width: int  # of a row of scratch
 
 
-class Places(Record):
-    """Where in the arena each array starts."""
+class Offsets(Record):
+    """Offsets of the arrays in the scratch."""
 
     centres: int  # planes of cell_centres [3, cells]
     cells: int  # planes of cell_integrals [rows, CELL_PLANES, cols]
     columns: int  # spans on the lines between columns, [2, cols + 1]
     lines: int  # and on those between rows
     packed: int  # [PLANES, cells]
-    parts: int  # planes of the parts of cells; the rest is for a blur alone
-    across: int  # weights [parts, n]
+    pieces: int  # planes of the pieces of cells; the following ones are for a blur alone
+    across: int  # weights [pieces, n]
     along: int
-    fine: int  # [rows of parts + 1, width]
+    fine: int  # [rows of pieces + 1, width]
     half: int  # [width]
 
 
@@ -229,8 +230,8 @@ class EstimatorState(Record):
     options: Options
     law: Law
     grid: Grid
-    model: Grid  # what is modelled: the grid, or its parts with a blur
-    reach: Reach
+    model: Grid  # what is modelled: the grid, or its pieces with a blur
+    region: Region
     signal: Signal
     estimate: Estimate
     moments: Moments
@@ -240,4 +241,4 @@ class EstimatorState(Record):
     around: Face  # a little beyond the footprint
     outliers: Annotated[IntArray, OUTLIERS_MAX]  # cells
     blur: Blur
-    at: Places
+    at: Offsets

@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 def tip_position(
     q: float, side: float, half_separation: float, length: float, offset: float
 ) -> tuple[float, float]:
-    """Centre (x, y) [m] of one tip at joint angle ``q`` [rad].
+    """Return centre (x, y) [m] of one tip at joint angle ``q`` [rad].
 
     ``side`` is +1 for the left finger and −1 for the right one.
     """
@@ -45,7 +45,7 @@ def tip_position(
 
 @kernel
 def tip_velocity(q: float, side: float, length: float, offset: float) -> tuple[float, float]:
-    """Derivative (∂x/∂q, ∂y/∂q) [m/rad] of the tip's centre; ``side`` as in tip_position."""
+    """Return the tip centre's derivative (∂x/∂q, ∂y/∂q) [m/rad]; ``side`` as in tip_position."""
     sine = math.sin(q)
     cosine = math.cos(q)
     return side * (length * cosine - offset * sine), -(length * sine + offset * cosine)
@@ -88,13 +88,13 @@ class HandGeometry:
         return math.hypot(self.finger_length, self.finger_offset)
 
     def tips(self, q: ArrayLike) -> FloatArray:
-        """Tip centres [[x1, y1], [x2, y2]] [m] at joint angles ``q`` (2,) [rad]."""
+        """Return the tip centres [[x1, y1], [x2, y2]] [m] at joint angles ``q`` (2,) [rad]."""
         q1, q2 = vector(q, 2, "q")
         lengths = (self.half_separation, self.finger_length, self.finger_offset)
         return np.array([tip_position(q1, 1.0, *lengths), tip_position(q2, -1.0, *lengths)])
 
     def contacts(self, q: ArrayLike, pose: ArrayLike, width: float) -> ContactVariables:
-        """Contact variables at joint angles ``q`` (2,) and object ``pose`` (x, y, φ)."""
+        """Return contact variables at joint angles ``q`` (2,) and object ``pose`` (x, y, φ)."""
         x, y, angle = vector(pose, 3, "pose")
         sign = np.array([1.0, -1.0])
         normal = np.array([math.cos(angle), math.sin(angle)])
@@ -108,7 +108,7 @@ class HandGeometry:
 
 
 def vector(values: ArrayLike, length: int, name: str) -> FloatArray:
-    """``values`` as float64 (length,). Raises ValueError for another shape."""
+    """Return ``values`` as float64 (length,). Raises ValueError for another shape."""
     out = np.asarray(values, dtype=np.float64)
     if out.shape != (length,):
         raise ValueError(f"{name} must have shape ({length},), not {out.shape}")

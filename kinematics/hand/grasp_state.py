@@ -27,7 +27,7 @@ _SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
 
 @kernel
 def total_tilt(tilt_x: float, tilt_y: float) -> float:
-    """Angle between the object's normal and the tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
+    """Return the angle between normal and tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
@@ -35,7 +35,7 @@ def total_tilt(tilt_x: float, tilt_y: float) -> float:
 def held_motion(
     q: Two, d: Two, angle: float, taper: float, lengths: tuple[float, float, float, float]
 ) -> Motion:
-    """(arm1, arm2, turn1, turn2, slide, width, across) of a held object.
+    """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
     ``lengths`` [m] of the hand: half the pivots' separation, a finger's length and offset, and the
     tip's radius.
@@ -60,8 +60,8 @@ def held_motion(
     half_separation, length, offset, radius = lengths
     nx = math.cos(angle)
     ny = math.sin(angle)
-    lean = math.tan(0.5 * taper)
-    longer = math.sqrt(1.0 + lean * lean)
+    face_slope = math.tan(0.5 * taper)
+    longer = math.sqrt(1.0 + face_slope * face_slope)
     x1, y1 = tip_position(q1, 1.0, half_separation, length, offset)
     x2, y2 = tip_position(q2, -1.0, half_separation, length, offset)
     vx1, vy1 = tip_velocity(q1, 1.0, length, offset)
@@ -69,11 +69,11 @@ def held_motion(
     across = d1 + d2 - 2.0 * radius + longer * ((x2 - x1) * nx + (y2 - y1) * ny)
     bounded = max(across, 0.5 * radius)
     return (
-        longer * (vx1 * nx + vy1 * ny) - lean * (radius - d1),
-        -longer * (vx2 * nx + vy2 * ny) - lean * (radius - d2),
+        longer * (vx1 * nx + vy1 * ny) - face_slope * (radius - d1),
+        -longer * (vx2 * nx + vy2 * ny) - face_slope * (radius - d2),
         (radius - d1 - longer * (vy1 * nx - vx1 * ny)) / bounded,
         (radius - d2 - longer * (vy2 * nx - vx2 * ny)) / bounded,
-        longer * ((y1 - y2) * nx - (x1 - x2) * ny) + lean * (d1 - d2),
+        longer * ((y1 - y2) * nx - (x1 - x2) * ny) + face_slope * (d1 - d2),
         across / longer,
         across,
     )
@@ -86,17 +86,19 @@ def sheared_gradient(
     theta: float,
     tangential: float,
 ) -> tuple[float, float]:
-    """(∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N]; ``contact`` as looked up."""
+    """Return (∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N] and a looked-up
+    ``contact``.
+    """
     force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
     sine = math.sin(theta)
     cosine = math.cos(theta)
     # T = F (sin θ + 2 cos θ d_t/d), solved for d_t/d
-    bend = 0.5 * (tangential / force - sine) / cosine
-    shear = bend * d
-    stretch = shear * (sine + cosine * bend)
+    shear_ratio = 0.5 * (tangential / force - sine) / cosine
+    shear = shear_ratio * d
+    depth_change = shear * (sine + cosine * shear_ratio)
     return (
-        energy_d + force_d * stretch - force * cosine * bend * bend,
-        energy_theta + force_theta * stretch + force * shear * (cosine - sine * bend),
+        energy_d + force_d * depth_change - force * cosine * shear_ratio * shear_ratio,
+        energy_theta + force_theta * depth_change + force * shear * (cosine - sine * shear_ratio),
     )
 
 
@@ -109,7 +111,7 @@ def holding_levers(
     taper: float,
     motion: Motion,
 ) -> tuple[float, float, float, float, float]:
-    """(τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
+    """Return (τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
 
     The torques are the energy's gradient along the rolling increments, ``motion`` as
     :func:`held_motion` gives it,
@@ -133,9 +135,9 @@ def holding_levers(
     tangential = normal = normal1 = normal2 = turning1 = turning2 = 0.0
     tangent1 = math.tan(theta1)
     tangent2 = math.tan(theta2)
-    lean = math.tan(0.5 * taper)
+    face_slope = math.tan(0.5 * taper)
     for _ in range(_SHEAR_STEPS):
-        out = lean * normal
+        out = face_slope * normal
         by_d1, turning1 = sheared_gradient(contact1, d1, theta1, tangential - out)
         by_d2, turning2 = sheared_gradient(contact2, d2, theta2, tangential + out)
         normal1 = by_d1 - (tangential - out) * tangent1
@@ -153,7 +155,7 @@ def holding_levers(
     )
 
 
-_LEAST_SLOPE = 0.1  # of what it is without a load
+_SLOPE_MIN = 0.1  # of what it is without a load
 
 
 @inner_kernel
@@ -165,25 +167,35 @@ def _unexplained(
     shear: float,
     torque: float,
     arm: float,
-    lever: float,
+    moment_arm: float,
 ) -> tuple[float, float, float]:
-    """What of side τ [N·m] one tip's N, ∂U/∂θ and T leave, and how fast it falls with T and T²."""
+    """Return the torque of side τ [N·m] that one tip's N, ∂U/∂θ and T leave, and its fall with T,
+    T².
+    """
     contact = lookup(data, d, theta)
     force, _, force_d, force_theta, _, _, _ = contact
     by_d, by_theta = sheared_gradient(contact, d, theta, shear)
     sine = math.sin(theta)
     cosine = math.cos(theta)
     tangent = sine / cosine
-    bend = 0.5 * (shear / force - sine) / cosine
-    bend_t = 0.5 / (force * cosine)
-    stretch_t = d * bend_t * (sine + 2.0 * cosine * bend)
-    stretch_tt = d * bend_t * cosine * bend_t
-    normal_t = force_d * stretch_t - 2.0 * force * cosine * bend * bend_t - tangent
-    normal_tt = force_d * stretch_tt - force * cosine * bend_t * bend_t
-    theta_t = force_theta * stretch_t + force * d * bend_t * (cosine - 2.0 * sine * bend)
-    theta_tt = force_theta * stretch_tt - force * d * bend_t * sine * bend_t
-    left = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * lever
-    return left, side * arm * normal_t + theta_t + lever, side * arm * normal_tt + theta_tt
+    shear_ratio = 0.5 * (shear / force - sine) / cosine
+    shear_ratio_t = 0.5 / (force * cosine)
+    depth_change_t = d * shear_ratio_t * (sine + 2.0 * cosine * shear_ratio)
+    depth_change_tt = d * shear_ratio_t * cosine * shear_ratio_t
+    normal_t = (
+        force_d * depth_change_t - 2.0 * force * cosine * shear_ratio * shear_ratio_t - tangent
+    )
+    normal_tt = force_d * depth_change_tt - force * cosine * shear_ratio_t * shear_ratio_t
+    theta_t = force_theta * depth_change_t + force * d * shear_ratio_t * (
+        cosine - 2.0 * sine * shear_ratio
+    )
+    theta_tt = force_theta * depth_change_tt - force * d * shear_ratio_t * sine * shear_ratio_t
+    remaining = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * moment_arm
+    return (
+        remaining,
+        side * arm * normal_t + theta_t + moment_arm,
+        side * arm * normal_tt + theta_tt,
+    )
 
 
 @inner_kernel
@@ -197,16 +209,16 @@ def load_torques(
     rolled: Two,
     torques: Two,
 ) -> tuple[float, float, float, float]:
-    """(δ1, δ2, lever, bow): what of both torques [N·m] nothing but a load along t explains.
+    """Return (δ1, δ2, lever, bow): what of both torques [N·m] nothing but a load along t explains.
 
-    Where each tip bears a share L [N] of a load 2 L along the object's t, both torques are
+    Where each tip bears a part L [N] of a load 2 L along the object's t, both torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
     with n_i, t_i of each tip's face, ``rolled`` [N] the shears that rolling, the turning moments
     and the ``taper`` [rad] cause without a load (:func:`hand.grasp_state.holding_levers`), and N
-    and ∂U/∂θ as the shears bend them. Between parallel faces ±v_i·n is arm_i and lever_i is W
+    and ∂U/∂θ as the shears change them. Between parallel faces ±v_i·n is arm_i and lever_i is W
     turn_i; ``motion`` is what :func:`hand.grasp_state.held_motion` gives. δ_i is what is left of
     τ_i at L = 0; a load makes (δ1 + δ2)/2 = lever L + bow L², exactly. Zeros without two contacts,
     or where no load would show.
@@ -217,26 +229,32 @@ def load_torques(
         return 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, _, across = motion
     # What rolls the object out along its bisector is no lever of each force: taken back here.
-    lean = math.tan(0.5 * taper)
-    share = 1.0 / (1.0 + lean * lean)
-    lever1 = share * (across * turn1 - lean * arm1)
-    lever2 = share * (across * turn2 - lean * arm2)
-    arm1 = share * (arm1 + lean * across * turn1)
-    arm2 = share * (arm2 + lean * across * turn2)
-    left1, slope1, bow1 = _unexplained(data1, d1, theta1, 1.0, rolled[0], torques[0], arm1, lever1)
-    left2, slope2, bow2 = _unexplained(data2, d2, theta2, -1.0, rolled[1], torques[1], arm2, lever2)
-    lever = 0.5 * (slope1 + slope2)
-    if lever <= 0.0:
+    face_slope = math.tan(0.5 * taper)
+    scale = 1.0 / (1.0 + face_slope * face_slope)
+    moment_arm1 = scale * (across * turn1 - face_slope * arm1)
+    moment_arm2 = scale * (across * turn2 - face_slope * arm2)
+    arm1 = scale * (arm1 + face_slope * across * turn1)
+    arm2 = scale * (arm2 + face_slope * across * turn2)
+    remaining1, slope1, curvature1 = _unexplained(
+        data1, d1, theta1, 1.0, rolled[0], torques[0], arm1, moment_arm1
+    )
+    remaining2, slope2, curvature2 = _unexplained(
+        data2, d2, theta2, -1.0, rolled[1], torques[1], arm2, moment_arm2
+    )
+    moment_arm = 0.5 * (slope1 + slope2)
+    if moment_arm <= 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    return left1, -left2, lever, 0.5 * (bow1 - bow2)
+    return remaining1, -remaining2, moment_arm, 0.5 * (curvature1 - curvature2)
 
 
 @inner_kernel
-def load_of(torque: float, lever: float, bow: float) -> tuple[float, float]:
-    """(L, slope): the load [N] of a torque = lever L + bow L² [N·m], and the torque's slope [m].
+def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
+    """Return (L, slope): load [N] of a torque = lever L + bow L² [N·m], and the torque's slope [m].
 
     Beyond the parabola's end, to which no load leads, L goes on with the least slope.
     """
-    least = _LEAST_SLOPE * lever
-    slope = math.sqrt(max(lever * lever + 4.0 * bow * torque, least * least))
-    return 2.0 * torque / (lever + slope), slope
+    slope_min = _SLOPE_MIN * moment_arm
+    slope = math.sqrt(
+        max(moment_arm * moment_arm + 4.0 * curvature * torque, slope_min * slope_min)
+    )
+    return 2.0 * torque / (moment_arm + slope), slope

@@ -1,4 +1,4 @@
-"""At which angle stuck tips let a held object come to rest, and how they let it stand upright.
+"""The angle at which stuck tips let a held object rest, and the spring that keeps it upright.
 
 Two fingers that mirror each other hold an object of width W between parallel faces, both tips d
 deep. Small motions that don't mirror are its angle φ and the fingers' lean δ = (q1 − q2)/2, with
@@ -28,7 +28,7 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-_LEAST_WIDTH = 0.1  # of the tip's radius, that W − d is not taken for less than
+_WIDTH_MIN = 0.1  # of the tip's radius, that W − d is not taken for less than
 
 
 @inner_kernel
@@ -39,7 +39,7 @@ def upright_spring(
     turning: float,
     lengths: tuple[float, float, float, float],
 ) -> float:
-    """The spring k [N·m/rad] between joints at ``q`` [rad] with which the object stands upright.
+    """Return the spring k [N·m/rad] between joints at ``q`` [rad] that keeps the object upright.
 
     ``d`` [m] and ``force`` [N] are the means of both tips, ``turning`` is their c; ``lengths`` [m]
     as in :func:`hand.grasp_state.held_motion`.
@@ -47,18 +47,17 @@ def upright_spring(
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)
     width = 2.0 * (half_separation - inward - radius + d)
-    rest = max(width - d, _LEAST_WIDTH * radius)
-    return force * half_separation * (2.0 * inward + (1.0 - 2.0 * turning) * d) / rest
+    gap = max(width - d, _WIDTH_MIN * radius)
+    return force * half_separation * (2.0 * inward + (1.0 - 2.0 * turning) * d) / gap
 
 
-def resting_share(
+def resting_ratio(
     d: float, width: float, spring: float, force: float, lengths: tuple[float, float, float, float]
 ) -> float:
-    """φ/φ0 of an object of ``width`` [m] held with a ``spring`` [N·m/rad] between the joints.
+    """Return φ/φ0 of an object of ``width`` [m] held with a joint ``spring`` [N·m/rad].
 
-    The tips are springs, as the paper's.
-
-    ``d`` [m] and ``force`` [N] are those of each tip, ``lengths`` as in :func:`upright_spring`.
+    The tips are the paper's springs. ``d`` [m] and ``force`` [N] are those of each tip, ``lengths``
+    as in :func:`upright_spring`.
     """
     half_separation, _, _, radius = lengths
     inward = half_separation - radius + d - 0.5 * width

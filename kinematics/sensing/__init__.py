@@ -1,4 +1,4 @@
-"""What a pressure sensor under a tip reads: the forward model, and counts to pressures.
+"""Pressure sensor under a tip: the forward model, and counts to pressures.
 
 Numbers alone: no files, no ports.
 """

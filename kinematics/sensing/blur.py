@@ -15,12 +15,12 @@ import numpy as np
 from softfinger.kinematics.sensing.footprint import FloatArray
 
 _MATCHED = 0.75  # steps: below it weights that match moments, above it samples of the Gaussian
-_REACH = 4.5  # standard deviations
-_MOST_PARTS = 8
+_CUTOFF = 4.5  # standard deviations
+_PIECES_MAX = 8
 
 
 def stencil(width: float) -> FloatArray:
-    """Weights of the blur over neighbouring cells, float64 [2 n + 1], ``width`` in cells.
+    """Return the blur's weights over neighbouring cells, float64 [2 n + 1]; ``width`` in cells.
 
     Samples of the Gaussian: the trapezoid rule, whose error falls like exp(−2π² w²). Below
     three quarters of a cell five weights of the Gaussian's moments up to the fifth, which are exact
@@ -33,26 +33,26 @@ def stencil(width: float) -> FloatArray:
         far = (3.0 * square * square - square) / 24.0
         near = 0.5 * square - 4.0 * far
         return np.array([far, near, 1.0 - 2.0 * (near + far), near, far])
-    n = math.ceil(_REACH * width)
+    n = math.ceil(_CUTOFF * width)
     weights = np.exp(-0.5 * (np.arange(-n, n + 1) / width) ** 2)
     return np.asarray(weights / weights.sum())
 
 
-def parts(width: float) -> int:
-    """Parts that a cell's side is cut into for the forward model, ``width`` in cells."""
-    return min(max(math.ceil(1.0 / width), 2), _MOST_PARTS)
+def pieces(width: float) -> int:
+    """Return the pieces of a cell's side in the forward model; ``width`` in cells."""
+    return min(max(math.ceil(1.0 / width), 2), _PIECES_MAX)
 
 
 def average(
     fine: FloatArray, across: FloatArray, along: FloatArray, n: tuple[int, int]
 ) -> FloatArray:
-    """Blur ``fine`` by the stencils along x and y and average it over cells of n = (x, y) parts.
+    """Blur ``fine`` by the stencils along x and y and average it over cells of n = (x, y) pieces.
 
-    ``fine`` has the stencils' half lengths more on each side than there are parts.
+    ``fine`` has the stencils' half lengths more on each side than there are pieces.
     """
     cols = (fine.shape[1] - len(across) + 1) // n[0]
     rows = (fine.shape[0] - len(along) + 1) // n[1]
-    # The mean over a cell's parts goes into the weights, so that only cells are summed.
+    # The mean over a cell's pieces goes into the weights, so that only cells are summed.
     half = np.zeros((fine.shape[0], cols))
     for k, weight in enumerate(np.convolve(across, np.full(n[0], 1.0 / n[0]))):
         half += weight * fine[:, k : k + cols * n[0] : n[0]]

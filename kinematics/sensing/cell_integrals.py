@@ -52,7 +52,7 @@ class Nodes(Record):
 
 @inner_kernel
 def nodes_needed(a: float, half: float, far: float) -> int:
-    """Gauss points a direction that keep a cell well within 1e-6 E; 0 where the angle is needed.
+    """Return the Gauss points a direction that keep a cell within 1e-6 E; 0 if the angle is needed.
 
     ``far`` is the distance of the farthest point from the axis, ``half`` half the cell's longer
     side: the rim is a branch point at (a − far)/half half-lengths behind the cell's end.
@@ -72,7 +72,7 @@ def nodes_needed(a: float, half: float, far: float) -> int:
 
 
 @inner_kernel
-def _push_line(
+def _add_line(
     nodes: Nodes, a: float, y: float, left: float, right: float, n: int, w: float
 ) -> None:
     """Add the nodes of ∫ dx on the line ``y`` from ``left`` to ``right``, times ``w``.
@@ -102,7 +102,7 @@ def _push_line(
 
 
 @inner_kernel
-def push_whole(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
+def add_whole_cell(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
     """Add the nodes of the mean over a cell that lies in the footprint."""
     a = grid.radius
     x0 = grid.x + j * grid.pitch_x
@@ -115,7 +115,7 @@ def push_whole(nodes: Nodes, grid: Grid, i: int, j: int) -> None:
     scale = 1.0 / (x1 - x0)
     for k in range(m):
         y = y0 + (y1 - y0) * GAUSS_NODES[m, k]
-        _push_line(nodes, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
+        _add_line(nodes, a, y, x0, x1, n, GAUSS_WEIGHTS[m, k] * scale)
 
 
 @fast_inner_kernel
@@ -143,7 +143,7 @@ def _polynomial(nodes: Nodes, coefficients: FloatArray) -> None:
 
 @inner_kernel
 def evaluate(nodes: Nodes, face: Face, a: float, law: FloatArray) -> None:
-    """Strain, at most 1, and stress at the nodes, in SIMD lanes."""
+    """Evaluate strain, at most 1, and stress at the nodes, in SIMD lanes."""
     _strains(nodes, face, a)
     if law.shape[0] == 1:
         _polynomial(nodes, law[0])
@@ -166,7 +166,7 @@ def _insert(breaks: FloatArray, count: int, value: float, low: float, high: floa
 
 
 @inner_kernel
-def push_cut(
+def add_cut_cell(
     nodes: Nodes, face: Face, grid: Grid, i: int, j: int, left_span: Span, right_span: Span
 ) -> None:
     """Add the nodes of the mean over a cell that the outline may cut.
@@ -235,20 +235,20 @@ def push_cut(
             inner = max(n, 4) if n > 0 else 0
             kink = (u - w * y) / v if beyond and v != 0.0 else math.inf
             if left < kink < right:
-                _push_line(nodes, a, y, left, kink, inner, weight)
+                _add_line(nodes, a, y, left, kink, inner, weight)
                 left = kink
-            _push_line(nodes, a, y, left, right, inner, weight)
+            _add_line(nodes, a, y, left, right, inner, weight)
 
 
 # Planes of a grid's cells, float64 [rows, CELL_PLANES, cols]: means over the whole cell of g, x g
 # and y g with g = 1/√(a² − x² − y²), their covariances, and 1 for a live cell, 0 for a dead one.
-PLAIN_MEAN, X_MEAN, Y_MEAN, LIVE, PLAIN_VAR, PLAIN_X, PLAIN_Y, X_VAR, X_Y, Y_VAR = range(10)
+PLAIN_MEAN, X_MEAN, Y_MEAN, ACTIVE, PLAIN_VAR, PLAIN_X, PLAIN_Y, X_VAR, X_Y, Y_VAR = range(10)
 CELL_PLANES = 10
 _MEAN_NODES = 8
 
 
 def cell_integrals(grid: Grid) -> FloatArray:
-    """The planes of a grid's cells, all but LIVE.
+    """Return the planes of a grid's cells, all but LIVE.
 
     The strain's mean over a whole cell in the footprint is exactly 1 − u ḡ + v (xg) + w (yg), and
     its variance the same form's in the covariances. A cell that the rim cuts never lies in the

@@ -1,4 +1,4 @@
-"""From a calibrated sensor's counts to pressures: kernels over a frame, and nothing else."""
+"""Conversion of a calibrated sensor's counts to pressures: kernels over a frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def to_pressure(
     curve: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Counts → Pa, all [rows, cols]: x = max(counts − zero, 0)·gain, then the curve of x.
+    """Convert counts [rows, cols] to Pa: x = max(counts − zero, 0)·gain, then the curve of x.
 
     ``curve`` is (exponent b, c_1, c_2, c_3): p = c_1 x^b for b ≠ 1, else c_1 x + c_2 x² + c_3 x³.
     """
@@ -41,7 +41,7 @@ def look_up_pressure(
     per_step: float,
     out: FloatArray,
 ) -> None:
-    """As :func:`to_pressure`, from the curve's ``table`` at every 1/``per_step`` of x, linearly.
+    """Convert as :func:`to_pressure`, linearly in the curve's ``table`` of steps 1/``per_step``.
 
     A tenth of a power's time; beyond the table the last step goes on. For p = c x^b its error is
     below |b(b − 1)|/8 · (step/x)² of p, that of less than a tenth of a step.

@@ -1,4 +1,4 @@
-"""Where the pressed tip touches: the footprint's outline on a grid of cells, as kernels.
+"""Outline of the footprint on a grid of cells, as kernels.
 
 The geometry that the forward model and the estimator share; no pressure. Lengths are m in the
 sensor's axes, from the tip's centre. The object's face is the plane ``n·(x, y, z) = h`` with
@@ -74,7 +74,7 @@ GAUSS_NODES, GAUSS_WEIGHTS = _gauss_table()
 
 @inner_kernel
 def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
-    """The face pressed in by ``d``; the z component of its normal (n_x, n_y, …) is positive."""
+    """Set the face pressed in by ``d``; the z component of its normal (n_x, n_y, …) is positive."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     face.u = (a - d) / n_z
     face.v = n_x / n_z
@@ -83,7 +83,7 @@ def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def beyond_limit(face: Face, a: float) -> bool:
-    """Whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
+    """Return whether the face cuts the base plane inside the rim, that is |θ| > θ_lim(d)."""
     u = face.u
     return u <= 0.0 or u * u < (face.v * face.v + face.w * face.w) * a * a
 
@@ -104,12 +104,12 @@ def set_extremes(face: Face, a: float) -> None:
         face.high = face.right = a
     else:
         root = s * a * a - u * u
-        reach = math.sqrt((1.0 + v * v) * root)
-        face.low = (u * w - reach) / s
-        face.high = (u * w + reach) / s
-        reach = math.sqrt((1.0 + w * w) * root)
-        left = (u * v - reach) / s
-        right = (u * v + reach) / s
+        half_length = math.sqrt((1.0 + v * v) * root)
+        face.low = (u * w - half_length) / s
+        face.high = (u * w + half_length) / s
+        half_length = math.sqrt((1.0 + w * w) * root)
+        left = (u * v - half_length) / s
+        right = (u * v + half_length) / s
         e = 1.0 + w * w
         face.left = left
         face.left_y = w * (u - v * left) / e
@@ -119,7 +119,7 @@ def set_extremes(face: Face, a: float) -> None:
 
 @inner_kernel
 def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
-    """Ends (left, right) in x of the footprint on the line ``y``; (inf, −inf) if it has none.
+    """Return the ends (left, right) in x of the footprint on the line ``y``; (inf, −inf) for none.
 
     To cut along a line of constant x instead, exchange v and w.
     """
@@ -149,20 +149,20 @@ def line_span(u: float, v: float, w: float, a: float, y: float) -> Span:
 def line_spans(
     face: Face, grid: Grid, upright: bool, first: int, last: int, left: Pointer, right: Pointer
 ) -> None:
-    """:func:`line_span` on the grid's lines first..last, those of x if ``upright``, else of y."""
+    """Evaluate :func:`line_span` on grid lines first..last, of x if ``upright``, else of y."""
     a = grid.radius
     u = face.u
     v = face.w if upright else face.v
     w = face.v if upright else face.w
     start = grid.x if upright else grid.y
     pitch = grid.pitch_x if upright else grid.pitch_y
-    stretch = 1.0 + v * v
-    e = 1.0 / stretch
+    norm2 = 1.0 + v * v
+    e = 1.0 / norm2
     for k in range(first, last + 1):
         y = start + k * pitch
         rim = a * a - y * y
         q = u - w * y
-        square = stretch * rim - q * q
+        square = norm2 * rim - q * q
         root = math.sqrt(max(square, 0.0))
         edge = math.sqrt(max(rim, 0.0))
         near = (v * q - root) * e
@@ -176,7 +176,7 @@ def line_spans(
 
 @inner_kernel
 def rows_touched(face: Face, grid: Grid) -> tuple[int, int]:
-    """The range of the rows that the footprint touches."""
+    """Return the range of the rows that the footprint touches."""
     first = min(max(math.floor((face.low - grid.y) / grid.pitch_y), 0), grid.rows)
     last = min(max(math.ceil((face.high - grid.y) / grid.pitch_y), first), grid.rows)
     return first, last
@@ -184,7 +184,7 @@ def rows_touched(face: Face, grid: Grid) -> tuple[int, int]:
 
 @inner_kernel
 def cols_touched(face: Face, grid: Grid) -> tuple[int, int]:
-    """The range of the columns that the footprint touches."""
+    """Return the range of the columns that the footprint touches."""
     first = min(max(math.floor((face.left - grid.x) / grid.pitch_x), 0), grid.cols)
     last = min(max(math.ceil((face.right - grid.x) / grid.pitch_x), first), grid.cols)
     return first, last
@@ -194,7 +194,7 @@ def cols_touched(face: Face, grid: Grid) -> tuple[int, int]:
 def band_columns(
     face: Face, grid: Grid, below: Span, above: Span, y0: float, y1: float
 ) -> tuple[int, int, int, int]:
-    """Columns (a, b, c, d) of the cells in the band y0..y1: a..d touch the footprint, b..c lie in.
+    """Return columns (a, b, c, d) of the band y0..y1: a..d touch the footprint, b..c lie inside.
 
     ``below`` and ``above`` are the spans at y0 and y1. Cells a..b and c..d may be cut by the
     outline, and beyond the limit some of them lie outside.

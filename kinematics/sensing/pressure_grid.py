@@ -17,14 +17,14 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import average, parts, stencil
+from softfinger.kinematics.sensing.blur import average, pieces, stencil
 from softfinger.kinematics.sensing.cell_integrals import (
     NODES,
     NODES_A_CELL,
     Nodes,
+    add_cut_cell,
+    add_whole_cell,
     evaluate,
-    push_cut,
-    push_whole,
 )
 from softfinger.kinematics.sensing.footprint import (
     Face,
@@ -37,7 +37,7 @@ from softfinger.kinematics.sensing.footprint import (
     set_extremes,
     set_face,
 )
-from softfinger.kinematics.sensing.solid_pressure import SolidPressure, pictures
+from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 
 _PITCH_MAX = 0.1  # m; a greater one is in millimetres
 OWNERS = 256  # cells whose nodes are evaluated at once
@@ -114,11 +114,11 @@ def render(
         first, inner_first, inner_last, last = band_columns(face, grid, below, above, y0, y1)
         for j in range(first, last):
             if inner_first <= j < inner_last:
-                push_whole(nodes, grid, i, j)
+                add_whole_cell(nodes, grid, i, j)
             else:
                 left = (columns[j, 0], columns[j, 1])
                 right = (columns[j + 1, 0], columns[j + 1, 1])
-                push_cut(nodes, face, grid, i, j, left, right)
+                add_cut_cell(nodes, face, grid, i, j, left, right)
             work.cells[work.waiting] = i * grid.cols + j
             work.ends[work.waiting] = nodes.count
             work.waiting += 1
@@ -172,7 +172,7 @@ class SensorGrid:
         return self.rows, self.cols
 
     def on(self, tip: Fingertip) -> Grid:
-        """The cells as kernels take them, counted from this tip's centre."""
+        """Return the cells as kernels take them, counted from this tip's centre."""
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
@@ -181,7 +181,7 @@ class SensorGrid:
         return Grid(np.array([fields], Grid.dtype))
 
     def to_sensor(self, n_x: float, n_y: float) -> tuple[float, float]:
-        """A vector's components along the finger's axes → along the sensor's."""
+        """Rotate a vector's components from the finger's axes to the sensor's."""
         if self.rotation == 0.0:
             return n_x, n_y
         c, s = math.cos(self.rotation), math.sin(self.rotation)
@@ -197,7 +197,7 @@ class SensorGrid:
         gain: float = 1.0,
         out: FloatArray | None = None,
     ) -> FloatArray:
-        """Pressure [Pa] averaged over each cell, float64 [rows, cols].
+        """Return the pressure [Pa] averaged over each cell, float64 [rows, cols].
 
         ``d`` [m] is the displacement, the tilts [rad] give the object's normal
         (sin tilt_x, sin tilt_y, …). Accurate to 1e-6 of the modulus, cut cells included; with a
@@ -212,7 +212,7 @@ class SensorGrid:
         elif out.shape != self.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
             raise ValueError(f"out must be a contiguous float64 array of shape {self.shape}")
         if tip.physics == "solid":
-            SolidPressure(tip, material, self.pictures(tip))(
+            SolidPressure(tip, material, self.images(tip))(
                 (d, *self.to_sensor(n_x, n_y)), gain, out
             )
             return out
@@ -224,7 +224,7 @@ class SensorGrid:
             render(work, material.law, np.empty((self.cols + 1, 2)), out)
             return out
         pitch_x, pitch_y = self.pitches
-        n = parts(self.blur / pitch_x), parts(self.blur / pitch_y)
+        n = pieces(self.blur / pitch_x), pieces(self.blur / pitch_y)
         stencils, finer = self.finer(n)
         fine = np.empty(finer.shape)
         work["grid"] = finer.on(tip).array
@@ -232,21 +232,21 @@ class SensorGrid:
         out[:] = average(fine, *stencils, n)
         return out
 
-    def pictures(self, tip: Fingertip) -> FloatArray:
-        """The cells' means of a solid tip's modes and shear, see `solid_pressure`: [·, cells]."""
-        return _pictures(replace(self, rotation=0.0), tip)
+    def images(self, tip: Fingertip) -> FloatArray:
+        """Return cells' means of a solid tip's modes and shear [·, cells], see `solid_pressure`."""
+        return _images(replace(self, rotation=0.0), tip)
 
-    def finer(self, parts: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:
-        """The blur's stencils along x and y in parts of cells, and the unblurred grid of all parts.
+    def finer(self, pieces: tuple[int, int]) -> tuple[tuple[FloatArray, FloatArray], SensorGrid]:
+        """Return the blur's stencils in x and y by pieces of cells, and the unblurred grid of all.
 
-        ``parts`` (x, y) are those of a cell; the grid is as much wider as the stencils reach.
+        ``pieces`` (x, y) are those of a cell; the grid is as much wider as the stencils reach.
         """
-        pitch_x, pitch_y = self.pitches[0] / parts[0], self.pitches[1] / parts[1]
+        pitch_x, pitch_y = self.pitches[0] / pieces[0], self.pitches[1] / pieces[1]
         across, along = stencil(self.blur / pitch_x), stencil(self.blur / pitch_y)
         finer = replace(
             self,
-            rows=self.rows * parts[1] + len(along) - 1,
-            cols=self.cols * parts[0] + len(across) - 1,
+            rows=self.rows * pieces[1] + len(along) - 1,
+            cols=self.cols * pieces[0] + len(across) - 1,
             pitch=(pitch_x, pitch_y),
             blur=0.0,
         )
@@ -254,17 +254,17 @@ class SensorGrid:
 
 
 @lru_cache(maxsize=16)  # two fingers' grids, and those that an uncertain place makes of them
-def _pictures(grid: SensorGrid, tip: Fingertip) -> FloatArray:
+def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     if grid.blur == 0.0:
-        return pictures(tip, grid.on(tip))
-    n = parts(grid.blur / grid.pitches[0]), parts(grid.blur / grid.pitches[1])
+        return images(tip, grid.on(tip))
+    n = pieces(grid.blur / grid.pitches[0]), pieces(grid.blur / grid.pitches[1])
     stencils, finer = grid.finer(n)
-    fine = pictures(tip, finer.on(tip)).reshape(-1, *finer.shape)
+    fine = images(tip, finer.on(tip)).reshape(-1, *finer.shape)
     return np.stack([average(each, *stencils, n).ravel() for each in fine])
 
 
 def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float, float]:
-    """(n_x, n_y) of tilts [rad], after checking that the contact is one. Raises ValueError."""
+    """Return (n_x, n_y) of tilts [rad]. Raises ValueError for tilts of no contact."""
     if not (math.isfinite(d) and math.isfinite(tilt_x) and math.isfinite(tilt_y)):
         raise ValueError(f"d and tilts must be finite, got {d}, {tilt_x}, {tilt_y}")
     if d > radius:

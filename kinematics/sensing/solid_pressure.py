@@ -1,6 +1,6 @@
-"""The forward model of a solid tip: a frame is a sum of fixed pictures, the modes of `solid_data`.
+"""The forward model of a solid tip: a frame is a sum of fixed images, the modes of `solid_data`.
 
-A mode makes one picture of a grid's cells, or two where it has a direction: B(r) cos mφ and
+A mode makes one image of a grid's cells, or two where it has a direction: B(r) cos mφ and
 B(r) sin mφ, averaged over each cell. What each counts in a contact are its weights, smooth in
 (d, n_x, n_y). The sensor feels no pull: where the sum is below 0 a cell reads 0.
 """
@@ -23,51 +23,51 @@ from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes,
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
-PICTURES = 2 * MODES  # with shear's two
+IMAGES = 2 * MODES  # with shear's two
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
 
 _INSIDE, _CUT = 6, 24  # points a side of a cell, and of one that the rim cuts
 
 
 class Weights(Record):
-    """What each picture counts in one contact: their sum is the pressure over E; see `weigh`."""
+    """Weights of the images in one contact: their sum is the pressure over E; see `set_weights`."""
 
     table: SolidTable
     modes: int
-    pictures: int
+    images: int
     harmonics: Annotated[IntArray, MODES]
-    shares: Annotated[FloatArray, SQUARE_TERMS, ROOT_TERMS, MODES]  # by powers of x and y
+    ratios: Annotated[FloatArray, SQUARE_TERMS, ROOT_TERMS, MODES]  # by powers of x and y
     q: Annotated[FloatArray, MODES]
     q_x: Annotated[FloatArray, MODES]
     q_y: Annotated[FloatArray, MODES]
     row: Annotated[FloatArray, MODES]  # scratch
     slope: Annotated[FloatArray, MODES]
-    value: Annotated[FloatArray, PICTURES]
-    by_d: Annotated[FloatArray, PICTURES]
-    by_x: Annotated[FloatArray, PICTURES]
-    by_y: Annotated[FloatArray, PICTURES]
+    value: Annotated[FloatArray, IMAGES]
+    by_d: Annotated[FloatArray, IMAGES]
+    by_x: Annotated[FloatArray, IMAGES]
+    by_y: Annotated[FloatArray, IMAGES]
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
-    """A solid tip's modes, without a contact yet. Raises MaterialError for one not linear."""
+    """Return a solid tip's modes, without a contact yet. Raises MaterialError unless linear."""
     data, weights = solid_data(tip), Weights()
     weights.table.assign(solid_table(tip, material))
-    count, i, j = data.shares.shape
-    weights.modes, weights.pictures = count, pictures_of(data.harmonics)
+    count, i, j = data.ratios.shape
+    weights.modes, weights.images = count, image_count(data.harmonics)
     weights.harmonics[:count] = data.harmonics
-    weights.shares[:j, :i, :count] = data.shares.T
+    weights.ratios[:j, :i, :count] = data.ratios.T
     return weights
 
 
-def pictures_of(harmonics: IntArray) -> int:
-    """How many pictures the modes make."""
+def image_count(harmonics: IntArray) -> int:
+    """Return how many images the modes make."""
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
-def pictures(tip: Fingertip, cells: Grid) -> FloatArray:
-    """The modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
+def images(tip: Fingertip, cells: Grid) -> FloatArray:
+    """Return modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
     data = solid_data(tip)
-    out = np.zeros((pictures_of(data.harmonics) + 2, cells.rows * cells.cols))
+    out = np.zeros((image_count(data.harmonics) + 2, cells.rows * cells.cols))
     x, y = (
         (low + pitch * np.arange(count)) / cells.radius
         for low, pitch, count in (
@@ -80,9 +80,9 @@ def pictures(tip: Fingertip, cells: Grid) -> FloatArray:
     far = np.hypot(*np.meshgrid(np.maximum(-x, x + width), np.maximum(-y, y + height)))
     for points, chosen in ((_INSIDE, far <= 1.0), (_CUT, (near < 1.0) & (far > 1.0))):
         rows, cols = np.nonzero(chosen)
-        place = (np.arange(points) + 0.5) / points
-        at_x = x[cols, None, None] + width * place[None, None, :]
-        at_y = y[rows, None, None] + height * place[None, :, None]
+        offset = (np.arange(points) + 0.5) / points
+        at_x = x[cols, None, None] + width * offset[None, None, :]
+        at_y = y[rows, None, None] + height * offset[None, :, None]
         z = (at_x + 1j * at_y).reshape(len(rows), points**2)
         out[:, rows * cells.cols + cols] = _means(tip, z)
     return out
@@ -93,12 +93,12 @@ def _nearest(low: NDArray[Any], width: float) -> NDArray[Any]:
 
 
 def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
-    """Means of all pictures over the points x + i y [cells, points], 0 beyond the rim."""
+    """Means of all images over the points x + i y [cells, points], 0 beyond the rim."""
     data = solid_data(tip)
     middle = 0.5 * (data.edges[1:] + data.edges[:-1])
     r = np.abs(z)
     inside = (r < 1.0) / z.shape[1]
-    turn = z / np.maximum(r, 1e-12)
+    phase = z / np.maximum(r, 1e-12)
     found: list[FloatArray] = []
     modes = zip([*data.harmonics.tolist(), 1], [*data.modes, data.shear], strict=True)
     for m, mode in modes:
@@ -106,39 +106,39 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
         start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
         end = 1.5 * mode[-1] - 0.5 * mode[-2]
         value = np.interp(r, [0.0, *middle, 1.0], [start, *mode, end]) * inside
-        found.append((value * (turn**m).real).sum(axis=1))
+        found.append((value * (phase**m).real).sum(axis=1))
         if m:
-            found.append((value * (turn**m).imag).sum(axis=1))
+            found.append((value * (phase**m).imag).sum(axis=1))
     return np.stack(found)
 
 
 @inner_kernel
-def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """The weights of a contact and their partials by d [m], n_x and n_y, for pressures in Pa."""
+def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
+    """Set a contact's weights and their partials by d [m], n_x and n_y, for pressures in Pa."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
     g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
-    # The push over a², and its partials by t and sin² θ.
-    push = table.modulus * t * t * t * (2.5 * g + 0.5 * t * g_t)
-    push_t = 0.5 * table.modulus * t * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
-    push_s = table.modulus * t * t * t * (2.5 * g_s + 0.5 * t * g_ts)
+    # The normal force over a², and its partials by t and sin² θ.
+    normal = table.modulus * t * t * t * (2.5 * g + 0.5 * t * g_t)
+    normal_t = 0.5 * table.modulus * t * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
+    normal_s = table.modulus * t * t * t * (2.5 * g_s + 0.5 * t * g_ts)
     t_d = 0.5 * table.inverse_radius / t
     cosine = math.sqrt(1.0 - square)
     value = weights.value
     by_d = weights.by_d
     by_x = weights.by_x
     by_y = weights.by_y
-    _evaluate_shares(weights, x, y)
+    _evaluate_ratios(weights, x, y)
     # F over N cos θ is not 1 where the face sticks.
     held = 1.0 - square * weights.q[0]
     held_t = -square * weights.q_x[0] * table.by_root
     held_s = -weights.q[0] - square * weights.q_y[0] * table.by_square
-    value[0] = push * cosine * held
-    by_d[0] = (push_t * held + push * held_t) * t_d * cosine
-    both = 2.0 * (push_s * held + push * held_s) * cosine - push * held / cosine
+    value[0] = normal * cosine * held
+    by_d[0] = (normal_t * held + normal * held_t) * t_d * cosine
+    both = 2.0 * (normal_s * held + normal * held_s) * cosine - normal * held / cosine
     by_x[0] = n_x * both
     by_y[0] = n_y * both
     # (n_x + i n_y)^m and its derivative over m; modes stand in the order of m.
@@ -150,42 +150,42 @@ def weigh(weights: Weights, d: float, n_x: float, n_y: float) -> None:
         q = weights.q[k]
         q_t = weights.q_x[k] * table.by_root
         q_s = weights.q_y[k] * table.by_square
-        share = push * q
-        share_d = (push_t * q + push * q_t) * t_d
-        share_s = 2.0 * (push_s * q + push * q_s)
+        amplitude = normal * q
+        amplitude_d = (normal_t * q + normal * q_t) * t_d
+        amplitude_s = 2.0 * (normal_s * q + normal * q_s)
         while m < weights.harmonics[k]:
             below = power
             power *= complex(n_x, n_y)
             m += 1
-        value[at] = share * power.real
-        by_d[at] = share_d * power.real
-        by_x[at] = share_s * n_x * power.real + share * m * below.real
-        by_y[at] = share_s * n_y * power.real - share * m * below.imag
+        value[at] = amplitude * power.real
+        by_d[at] = amplitude_d * power.real
+        by_x[at] = amplitude_s * n_x * power.real + amplitude * m * below.real
+        by_y[at] = amplitude_s * n_y * power.real - amplitude * m * below.imag
         at += 1
         if m > 0:
-            value[at] = share * power.imag
-            by_d[at] = share_d * power.imag
-            by_x[at] = share_s * n_x * power.imag + share * m * below.imag
-            by_y[at] = share_s * n_y * power.imag + share * m * below.real
+            value[at] = amplitude * power.imag
+            by_d[at] = amplitude_d * power.imag
+            by_x[at] = amplitude_s * n_x * power.imag + amplitude * m * below.imag
+            by_y[at] = amplitude_s * n_y * power.imag + amplitude * m * below.real
             at += 1
 
 
 @inner_kernel
 def own_shear(weights: Weights, d: float, square: float) -> float:
-    """The shear over sin θ and a² [Pa] of a press straight on a sticking face, at the height a.
+    """Return shear over sin θ and a² [Pa] of a straight press on a sticking face, at the height a.
 
     The modes have it already. ``weights`` are those of the contact.
     """
     q = weights.q[0]
-    push = weights.value[0] / (1.0 - square * q)
-    shear: float = -push * q * (1.0 - d * weights.table.inverse_radius)
+    normal = weights.value[0] / (1.0 - square * q)
+    shear: float = -normal * q * (1.0 - d * weights.table.inverse_radius)
     return shear
 
 
 @fast_inner_kernel
-def _evaluate_shares(weights: Weights, x: float, y: float) -> None:
+def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
     """q of each mode, and its partials by x and y, all modes side by side in SIMD lanes."""
-    shares = address(weights.shares)
+    ratios = address(weights.ratios)
     q = address(weights.q)
     q_x = address(weights.q_x)
     q_y = address(weights.q_y)
@@ -197,7 +197,7 @@ def _evaluate_shares(weights: Weights, x: float, y: float) -> None:
         for k in range(MODES):
             row[k] = slope[k] = 0.0
         for i in range(ROOT_TERMS - 1, -1, -1):
-            c = further(shares, (j * ROOT_TERMS + i) * MODES)
+            c = further(ratios, (j * ROOT_TERMS + i) * MODES)
             for k in range(MODES):
                 slope[k] = slope[k] * x + row[k]
                 row[k] = row[k] * x + c[k]
@@ -208,16 +208,16 @@ def _evaluate_shares(weights: Weights, x: float, y: float) -> None:
 
 
 @fast_inner_kernel
-def add_picture(picture: Pointer, weight: float, first: int, last: int, out: Pointer) -> None:
-    """Add ``weight`` times the picture's cells first..last to ``out``."""
+def add_image(image: Pointer, weight: float, first: int, last: int, out: Pointer) -> None:
+    """Add ``weight`` times the image's cells first..last to ``out``."""
     for k in range(first, last):
-        out[k] += weight * picture[k]
+        out[k] += weight * image[k]
 
 
 @kernel
 def render_solid(
     weights: Records[Weights],
-    shown: FloatArray,
+    basis: FloatArray,
     contact: tuple[float, float, float],
     shear: tuple[float, float],
     whole: bool,
@@ -227,7 +227,7 @@ def render_solid(
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
 
     ``shear`` [N] is the force along x and y on the face, as at the height a: the ``whole``, or what
-    is more than a press straight has. ``shown`` are the grid's pictures. d ≤ 0 gives zeros; beyond
+    is more than a press straight has. ``basis`` are the grid's images. d ≤ 0 gives zeros; beyond
     what the data cover the deepest and the most tilted contact of that azimuth.
     """
     each = weights[0]
@@ -237,34 +237,34 @@ def render_solid(
     if not (d > 0.0 and n_x * n_x + n_y * n_y < 1.0):
         return
     tilt = math.hypot(n_x, n_y)
-    most = math.sin(table.tilt)
-    if tilt > most:
-        n_x *= most / tilt
-        n_y *= most / tilt
+    sine_max = math.sin(table.tilt)
+    if tilt > sine_max:
+        n_x *= sine_max / tilt
+        n_y *= sine_max / tilt
     d = min(d, table.deepest)
-    weigh(each, d, n_x, n_y)
+    set_weights(each, d, n_x, n_y)
     own = own_shear(each, d, n_x * n_x + n_y * n_y) if whole else 0.0
     cells = out.size
     start = address(out)
-    for k in range(each.pictures):
-        picture = further(address(shown), k * cells)
-        add_picture(picture, gain * each.value[k], 0, cells, start)
+    for k in range(each.images):
+        image = further(address(basis), k * cells)
+        add_image(image, gain * each.value[k], 0, cells, start)
     area = table.radius * table.radius
     x = shear[0] / area - own * n_x
     y = shear[1] / area - own * n_y
-    picture = further(address(shown), each.pictures * cells)
-    add_picture(picture, gain * x, 0, cells, start)
-    add_picture(further(picture, cells), gain * y, 0, cells, start)
+    image = further(address(basis), each.images * cells)
+    add_image(image, gain * x, 0, cells, start)
+    add_image(further(image, cells), gain * y, 0, cells, start)
     for k in range(cells):
         start[k] = max(start[k], 0.0)
 
 
 class SolidPressure:
-    """What one tip of one material presses on the cells of given ``shown`` pictures."""
+    """Pressure of one tip of one material on the cells of given ``basis`` images."""
 
-    def __init__(self, tip: Fingertip, material: Material, shown: FloatArray) -> None:
+    def __init__(self, tip: Fingertip, material: Material, basis: FloatArray) -> None:
         self._weights = weights_of(tip, material).array
-        self._shown = shown
+        self._basis = basis
 
     def __call__(
         self,
@@ -273,6 +273,6 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """As :func:`render_solid`; the whole ``shear``, that of a press straight if not given."""
+        """Render as :func:`render_solid`; ``shear`` is that of a straight press if not given."""
         whole = shear is not None
-        render_solid(self._weights, self._shown, contact, shear or (0.0, 0.0), whole, gain, out)
+        render_solid(self._weights, self._basis, contact, shear or (0.0, 0.0), whole, gain, out)

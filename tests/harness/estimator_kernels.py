@@ -31,14 +31,17 @@ def activity(states: Records[EstimatorState], frame: FloatArray, centres: FloatA
 
 @kernel
 def press_and_accumulate(states: Records[EstimatorState], packed: FloatArray) -> None:
-    """:func:`likelihood.press`, then :func:`likelihood.accumulate`."""
-    likelihood.press(states[0], address(packed))
+    """:func:`likelihood.compress`, then :func:`likelihood.accumulate`."""
+    likelihood.compress(states[0], address(packed))
     likelihood.accumulate(states[0], address(packed))
 
 
 @kernel
-def spread(
-    states: Records[EstimatorState], frame: FloatArray, arena: FloatArray, places: NDArray[np.int64]
+def blur_cells(
+    states: Records[EstimatorState],
+    frame: FloatArray,
+    scratch: FloatArray,
+    indices: NDArray[np.int64],
 ) -> None:
-    """:func:`blurred_cells.spread`."""
-    blurred_cells.spread(states[0], address(frame), address(arena), address(places))
+    """:func:`blurred_cells.blur_cells`."""
+    blurred_cells.blur_cells(states[0], address(frame), address(scratch), address(indices))

@@ -19,12 +19,12 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.kinematics.estimation.packing import PLACE_BITS
+from softfinger.kinematics.estimation.packing import INDEX_BITS
 from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
 from softfinger.kinematics.sensing.blur import stencil
-from softfinger.kinematics.sensing.cell_integrals import CELL_PLANES, LIVE
+from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from tests.harness.estimator_kernels import spread
+from tests.harness.estimator_kernels import blur_cells
 
 A = 0.020
 E = 0.304e6
@@ -35,13 +35,13 @@ PITCH = 0.058 / 44
 NOISE = 0.002
 
 
-def dense(grid, material, contact, parts=16, margin=6):
-    """Pressure sampled ``parts`` times a cell's side, blurred by SciPy, averaged over cells."""
+def dense(grid, material, contact, pieces=16, margin=6):
+    """Pressure sampled ``pieces`` times a cell's side, blurred by SciPy, averaged over cells."""
     d, tilt_x, tilt_y = contact
     axes = []
     for cells, pitch, centre in zip((grid.cols, grid.rows), grid.pitches, grid.centre, strict=True):
-        count = (cells + 2 * margin) * parts
-        axes.append((np.arange(count) + 0.5 - 0.5 * count) * pitch / parts - centre)
+        count = (cells + 2 * margin) * pieces
+        axes.append((np.arange(count) + 0.5 - 0.5 * count) * pitch / pieces - centre)
     x, y = axes[0][None, :], axes[1][:, None]
     n_x, n_y = grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
     face = (A - d - n_x * x - n_y * y) / math.sqrt(1.0 - n_x**2 - n_y**2)
@@ -49,11 +49,11 @@ def dense(grid, material, contact, parts=16, margin=6):
     height = np.sqrt(np.where(inside, A * A - x * x - y * y, 1.0))
     strain = np.where(inside, 1.0 - np.maximum(face, 0.0) / height, 0.0)
     pressure = material.stress(np.clip(strain, 0.0, 1.0))
-    widths = [grid.blur / pitch * parts for pitch in grid.pitches[::-1]]
+    widths = [grid.blur / pitch * pieces for pitch in grid.pitches[::-1]]
     pressure = gaussian_filter(pressure, widths, truncate=6.0)
-    edge = margin * parts
+    edge = margin * pieces
     kept = pressure[edge:-edge, edge:-edge]
-    return kept.reshape(grid.rows, parts, grid.cols, parts).mean(axis=(1, 3))
+    return kept.reshape(grid.rows, pieces, grid.cols, pieces).mean(axis=(1, 3))
 
 
 def tilts(degrees, azimuth):
@@ -103,52 +103,52 @@ def test_stencils_have_the_gaussians_moments():
     assert stencil(0.0).tolist() == [1.0]
 
 
-@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("pieces", [1, 2])
 @pytest.mark.parametrize("width", [0.3, 1.4])
-def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
+def test_spreading_of_packed_parts_matches_its_plain_twin(pieces, width):
     rng = np.random.default_rng(6)
     rows, cols = 13, 17
-    one = stencil(width * parts)
+    one = stencil(width * pieces)
     reach = len(one) // 2
-    high, wide = rows * parts + 2 * reach, cols * parts + 2 * reach
-    whole = weights(one, parts)
-    across = np.ascontiguousarray(whole.reshape(-1, parts).T)
+    high, wide = rows * pieces + 2 * reach, cols * pieces + 2 * reach
+    whole = weights(one, pieces)
+    across = np.ascontiguousarray(whole.reshape(-1, pieces).T)
     frame = rng.random((rows, cols))
     cells = np.zeros((rows, CELL_PLANES, cols))
-    cells[:, LIVE] = rng.random((rows, cols)) > 0.1
-    padded = parts * (cols + 2 * STRIDE) + len(whole)
+    cells[:, ACTIVE] = rng.random((rows, cols)) > 0.1
+    padded = pieces * (cols + 2 * STRIDE) + len(whole)
     state = EstimatorState()
     state.grid.rows, state.grid.cols = rows, cols
     state.model.rows, state.model.cols = high, wide
     state.signal.scale = 2.0
     blur, at = state.blur, state.at
-    blur.parts_x = blur.parts_y = parts
+    blur.pieces_x = blur.pieces_y = pieces
     blur.weights_x, blur.weights_y, blur.width = across.shape[1], len(whole), padded
     at.cells, at.across = 7 * high * wide, 7 * high * wide + cells.size
     at.along = at.across + across.size
     at.fine = at.along + len(whole)
     at.half = at.fine + (high + 1) * padded
-    arena = np.zeros(at.half + padded)
-    arena[at.cells : at.fine] = np.concatenate([cells.ravel(), across.ravel(), whole])
+    scratch = np.zeros(at.half + padded)
+    scratch[at.cells : at.fine] = np.concatenate([cells.ravel(), across.ravel(), whole])
     for low, left, tall, broad in ((0, 0, high, wide), (3, 4, 5, 6), (high - 2, wide - 3, 2, 3)):
         i, j = (each.ravel() for each in np.mgrid[low : low + tall, left : left + broad])
-        places = (i << PLACE_BITS) | j
+        indices = (i << INDEX_BITS) | j
         packed = np.zeros((7, high * wide))
         packed[:PLANES, : len(i)] = rng.random((PLANES, len(i)))
         expected = np.zeros((PLANES, rows, cols))
         for plane in range(PLANES):
             field = np.zeros((high, wide))
             field[i, j] = packed[plane, : len(i)]
-            blurred = np.zeros((rows * parts, cols * parts))
+            blurred = np.zeros((rows * pieces, cols * pieces))
             for y in range(len(one)):
                 for x in range(len(one)):
-                    part = field[y : y + rows * parts, x : x + cols * parts]
+                    part = field[y : y + rows * pieces, x : x + cols * pieces]
                     blurred += one[y] * one[x] * part
-            expected[plane] = blurred.reshape(rows, parts, cols, parts).mean(axis=(1, 3))
+            expected[plane] = blurred.reshape(rows, pieces, cols, pieces).mean(axis=(1, 3))
         state.fit.count = len(i)
-        arena[: packed.size] = packed.ravel()
-        spread(state.array, frame, arena, places.copy())
-        packed, count = arena[: packed.size].reshape(packed.shape), state.fit.count
+        scratch[: packed.size] = packed.ravel()
+        blur_cells(state.array, frame, scratch, indices.copy())
+        packed, count = scratch[: packed.size].reshape(packed.shape), state.fit.count
         # Cells that take part are told by their readings, of which no two are equal.
         seen = 0
         for k in range(count):
@@ -160,7 +160,7 @@ def test_spreading_of_packed_parts_matches_its_plain_twin(parts, width):
                 expected[:, at[0], at[1]] = 0.0
                 seen += 1
         assert seen > 0
-        assert np.all(expected * cells[:, LIVE] == 0.0)
+        assert np.all(expected * cells[:, ACTIVE] == 0.0)
 
 
 @pytest.mark.parametrize(
@@ -239,14 +239,14 @@ def test_a_blurred_footprint_cut_by_the_sensors_edge_still_fits():
 def test_dead_cells_counts_and_thresholds_go_with_a_blur():
     rng = np.random.default_rng(7)
     grid = SensorGrid(44, 44, PITCH, blur=0.0008)
-    live = rng.random(grid.shape) > 0.02
+    active = rng.random(grid.shape) > 0.02
     truth = (0.003, 0.2, -0.1)
     clean = grid.pressure(TIP, MEASURED, *truth)
-    estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, live=live, free_gain=False)
+    estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, active=active, free_gain=False)
     score = []
     for _ in range(150):
         counts = np.clip(np.round((clean + rng.normal(0.0, 600.0, grid.shape)) / 50.0), 0, 65535)
-        counts[~live] = 65535
+        counts[~active] = 65535
         e = estimator.update(counts.astype(np.uint16), 50.0)
         assert e.valid
         miss = np.array([e.d, e.tilt_x, e.tilt_y]) - truth

@@ -128,7 +128,7 @@ def test_a_solid_tips_are_too(subtests: pytest.Subtests) -> None:
     tip = Fingertip(0.020, "solid", 0.49, "lying")
 
     def frames(grid: SensorGrid) -> SolidPressure:
-        return SolidPressure(tip, LINEAR, grid.pictures(tip))
+        return SolidPressure(tip, LINEAR, grid.images(tip))
 
     straight = frames(GRID)
     turns = np.arange(8) * 0.25 * math.pi + 0.1

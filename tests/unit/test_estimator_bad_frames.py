@@ -47,14 +47,14 @@ def test_saturated_cells_are_left_out():
 
 def test_dead_cells_are_masked_whatever_they_hold():
     rng = np.random.default_rng(6)
-    live = rng.random(GRID.shape) > 0.01
+    active = rng.random(GRID.shape) > 0.01
     truth = (0.003, 0.2, -0.2, 1.0)
     clean = GRID.pressure(TIP, LINEAR, *truth[:3])
-    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, live=live)
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, active=active)
     score = []
     for _ in range(150):
         frame = clean + rng.normal(0.0, NOISE, GRID.shape)
-        frame[~live] = rng.choice([np.nan, np.inf, -np.inf, 1e9, 0.0], (~live).sum())
+        frame[~active] = rng.choice([np.nan, np.inf, -np.inf, 1e9, 0.0], (~active).sum())
         e = estimator.update(frame)
         assert e.valid
         score.append(errors(e, truth) / np.sqrt(np.diag(e.covariance)))
@@ -181,7 +181,7 @@ def test_what_is_not_one_contact_is_not_valid(free_gain):
         ({"noise": math.nan}, "noise"),
         ({"method": "best"}, "method"),
         ({"readings": Readings(saturation=0.0)}, "saturation"),
-        ({"live": np.ones((4, 4), bool)}, "live"),
+        ({"active": np.ones((4, 4), bool)}, "active"),
     ],
 )
 def test_wrong_arguments_are_refused(options, message):
@@ -229,7 +229,7 @@ def test_garbage_gives_finite_numbers_or_none_that_are_valid(method, free_gain, 
     estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, method=method, free_gain=free_gain)
     for _ in range(200):
         e = estimator.update(_garbage(rng, grid), 10.0 ** rng.uniform(-2, 3))
-        numbers = [e.d, e.tilt_x, e.tilt_y, e.gain, e.chi2, e.explained]
+        numbers = [e.d, e.tilt_x, e.tilt_y, e.gain, e.chi2, e.r_squared]
         assert np.all(np.isfinite(numbers))
         if e.valid:
             assert 0.0 <= e.d < 0.75 * A

@@ -22,30 +22,30 @@ def test_activity_matches_its_plain_twin():
     weights = np.outer([1, 2, 2, 2, 1], [1, 2, 2, 2, 1]).astype(float)
     weights[2, 2] = 0.0
     # Columns 2 … 21 are in reach, and rows 2 … 17.
-    live = np.zeros((20, 24), bool)
-    live[2:18, 2:22] = True
+    active = np.zeros((20, 24), bool)
+    active[2:18, 2:22] = True
     state = EstimatorState()
     grid = state.grid
     grid.radius, grid.pitch_x, grid.pitch_y, grid.rows, grid.cols = 1.0, 0.01, 0.01, 20, 24
     state.options.peak_level, state.signal.patch_level, state.signal.noise = 3.0, 4.0, 1.0
-    centres = cell_centres(grid, live, 2.0, state.reach)
-    assert state.reach.number == live.sum()
+    centres = cell_centres(grid, active, 2.0, state.region)
+    assert state.region.number == active.sum()
     seen = set()
     for k in range(200):
         frame = rng.normal(0.0, 1.0, (20, 24))
         i, j = rng.integers(4, 16), rng.integers(4, 20)
         frame[i - 1 : i + 2, j - 1 : j + 2] += 0.02 * k
         expected = False
-        for r, c in np.argwhere(live & (frame > 3.0)):
+        for r, c in np.argwhere(active & (frame > 3.0)):
             part = np.s_[r - 2 : r + 3, c - 2 : c + 3]
-            w = weights * live[part]
+            w = weights * active[part]
             expected |= (w * frame[part]).sum() / math.sqrt((w**2).sum()) > 4.0
         frame[0, 5], frame[3, 0] = math.nan, 1e9
         activity(state.array, frame, centres)
         found = state.signal
         assert found.contact == expected
         assert found.finite
-        inner = frame[live]
+        inner = frame[active]
         assert found.mean == pytest.approx(inner.mean())
         assert found.energy == pytest.approx((inner**2).sum())
         assert found.peak == inner.max()

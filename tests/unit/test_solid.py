@@ -114,7 +114,7 @@ def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:
 def test_the_estimate_is_at_its_bound_whatever_the_shear(tip: Fingertip, counts: bool) -> None:
     rng = np.random.default_rng(3)
     estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
-    press, table = SolidPressure(tip, RUBBER, GRID.pictures(tip)), ContactTable.build(tip, RUBBER)
+    press, table = SolidPressure(tip, RUBBER, GRID.images(tip)), ContactTable.build(tip, RUBBER)
     frame = np.empty(GRID.shape)
     squares = []
     for d in (0.7e-3, 2e-3, 4e-3, 7e-3):
@@ -182,15 +182,15 @@ def test_noise_and_shifted_zeros_are_no_contact() -> None:
 
 def test_dead_full_and_lone_cells_are_left_out() -> None:
     rng = np.random.default_rng(5)
-    live = rng.random(GRID.shape) > 0.1
-    live[8, 20] = True
+    active = rng.random(GRID.shape) > 0.1
+    active[8, 20] = True
     truth = (0.005, 0.2, -0.1)
     frame = GRID.pressure(TIPS[0], RUBBER, *truth) + NOISE * rng.standard_normal(GRID.shape)
-    frame[~live] = 0.0
-    frame[live & (frame > 45e3)] = 45e3  # 60 cells
+    frame[~active] = 0.0
+    frame[active & (frame > 45e3)] = 45e3  # 60 cells
     frame[8, 20] = 200e3
     readings = Readings(saturation=45e3)
-    found = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, live=live, readings=readings)(frame)
+    found = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, active=active, readings=readings)(frame)
     assert found.valid
     assert found.rejected == 1
     error = np.array([found.d, found.tilt_x, found.tilt_y]) - truth
@@ -264,5 +264,5 @@ def test_a_profile_that_no_solid_tip_has_is_refused() -> None:
     assert wrong(**sound, tactile={"blur": 0.008}) == ["tactile.blur"]
     for tactile in ({"pitch": 0.01}, {"centre_error": 0.01}, {"centre": (0.06, 0.0)}):
         assert wrong(**sound, tactile=tactile) == ["tactile.pitch, tactile.centre"]
-    with pytest.raises(ValueError, match="9 live cells within its rim, got 4"):
+    with pytest.raises(ValueError, match="9 active cells within its rim, got 4"):
         ContactEstimator(TIPS[0], RUBBER, SensorGrid(44, 44, 0.01), NOISE)

@@ -12,7 +12,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.kinematics.hand.upright import resting_share, upright_spring
+from softfinger.kinematics.hand.upright import resting_ratio, upright_spring
 from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.watched import Watched
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
@@ -45,7 +45,7 @@ def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) ->
     q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
     spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
-    expected = resting_share(DEPTH, WIDTH, spring, FORCE, LENGTHS)
+    expected = resting_ratio(DEPTH, WIDTH, spring, FORCE, LENGTHS)
     # Left out of the closed form is q², which is 0.03.
     assert hand.object_pose[2] / START == pytest.approx(expected, abs=0.03)
     if share == 1.0:

@@ -180,7 +180,7 @@ class _Pass:
 
 
 def analyse(source: Source, progress: Progress) -> list[Contacts]:
-    """The contacts of each sensor. Raises what the source's frames raise."""
+    """Return the contacts of each sensor. Raises what the source's frames raise."""
     passes = {finger: _Pass(source, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):
         passes[finger].take(t, counts)
@@ -188,7 +188,7 @@ def analyse(source: Source, progress: Progress) -> list[Contacts]:
 
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
-    """One line a frame, sensors one after the other; names with units. Raises OSError."""
+    """Write one line a frame, sensors one after the other; names with units. Raises OSError."""
     names = [f"{name}_{unit}" if unit else name for name, unit in COLUMNS]
     truths = sorted({name for each in contacts for name in each.truths})
     units = dict(COLUMNS)
@@ -216,7 +216,7 @@ _PANELS = (
 
 
 def draw(contacts: list[Contacts], title: str, path: Path) -> None:
-    """d and θ with two standard deviations, F and U over time. Raises MissingExtra."""
+    """Draw d and θ with two standard deviations, F and U over time. Raises MissingExtra."""
     with style.settings():
         figure = style.new_figure(7.0, 7.5)
         axes = figure.subplots(len(_PANELS), 1, sharex=True)

@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
-    """What draws each page; matplotlib is imported when one is drawn."""
+    """Return the function that draws each page; matplotlib is imported when one is drawn."""
     from softfinger.tools.analysis.plots_error import draw_error
     from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
 

@@ -70,12 +70,12 @@ class RecordedRun:
         return tuple(name for name in FINGERS if self.states[f"{name}.valid"].any())
 
     def touching(self, finger: str) -> BoolArray:
-        """Where the finger's state is valid and in contact."""
+        """Return where the finger's state is valid and in contact."""
         sound = (self.states[f"{finger}.valid"] > 0.0) & (self.states[f"{finger}.contact"] > 0.0)
         return sound & np.isfinite(self.states[f"{finger}.d"])
 
     def gapped(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """t and ``values`` with a NaN in each gap of the stream, which breaks the line."""
+        """Return t and ``values`` with a NaN in each gap of the stream, which breaks the line."""
         t = self.t
         steps = np.diff(t)
         longest = max(_GAP, 10.0 * float(np.median(steps))) if steps.size else math.inf
@@ -83,25 +83,25 @@ class RecordedRun:
         return np.insert(t, at, t[at - 1] if at.size else t[:0]), np.insert(values, at, np.nan)
 
     def matched(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices of the states and the truths of the same ticks."""
+        """Return indices of the states and the truths of the same ticks."""
         pair: tuple[Any, NDArray[np.intp], NDArray[np.intp]] = np.intersect1d(
             self.states["mono_ns"], self.truth["mono_ns"], return_indices=True
         )
         return pair[1], pair[2]
 
     def need_states(self) -> None:
-        """Raises Missing without a state."""
+        """Raise Missing without a state."""
         if not self.t.size:
             raise Missing("no hand/state in it")
 
     def need_model(self) -> tuple[FingerModel, FingerModel]:
-        """Both fingers' models. Raises Missing without them."""
+        """Return both fingers' models. Raises Missing without them."""
         if self.models is None:
             raise Missing(self.why_no_model)
         return self.models
 
     def need_contact(self) -> list[str]:
-        """The fingers that ever touched something. Raises Missing when none did."""
+        """Return the fingers that ever touched something. Raises Missing when none did."""
         self.need_states()
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
@@ -159,7 +159,7 @@ class _Columns:
         self.count = 0
 
     def take(self, message: dict[str, Any]) -> None:
-        """One more row, unless the map lacks a field."""
+        """Add a row, unless the map lacks a field."""
         try:
             row = [float(message[name]) for name in self._own]
             for part, names in self._nested.items():
@@ -171,7 +171,7 @@ class _Columns:
         self.count += 1
 
     def arrays(self) -> dict[str, FloatArray]:
-        """By name, float64 [rows]."""
+        """Return the columns by name, float64 [rows]."""
         table = np.array(self._values, np.float64).reshape(-1, len(self.names)).T
         columns = map(np.ascontiguousarray, table)
         return dict(zip(self.names, columns, strict=True))

@@ -33,18 +33,18 @@ _GRID = 241  # of the landscape along each axis
 
 
 def time_axis(panel: Axes, t: FloatArray) -> None:
-    """Label and limits of the time axis."""
+    """Set label and limits of the time axis."""
     panel.set_xlabel("time [s]")
     panel.set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
 
 
 def titled(figure: Figure, run: RecordedRun, text: str) -> None:
-    """The recording's name and ``text`` above a figure."""
+    """Write the recording's name and ``text`` above a figure."""
     figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
 def _some(indices: NDArray[np.intp], count: int = _POINTS) -> NDArray[np.intp]:
-    """At most ``count`` of these, evenly spaced."""
+    """Return at most ``count`` of these, evenly spaced."""
     if indices.size <= count:
         return indices
     return indices[np.linspace(0, indices.size - 1, count).astype(np.intp)]
@@ -67,7 +67,7 @@ def _groups(
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """F and U against θ beside the curves at fixed d, and measured over modelled pressure."""
+    """Draw F and U against θ on curves at fixed d, and measured over modelled pressure."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
     figure = style.new_figure(7.2, 1.9 + 3.0 * len(groups))
@@ -177,7 +177,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Paths over U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
+    """Return paths over U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
     fingers = run.need_contact()
     groups = _groups(run, fingers, run.need_model())
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(groups))
@@ -212,7 +212,7 @@ def _path(run: RecordedRun, finger: str) -> tuple[FloatArray, FloatArray]:
 
 
 def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) -> None:
-    """U(d, θ) in mJ up to ``deepest`` m and ±``widest`` rad, its minimum over θ, and its end."""
+    """Draw U(d, θ) [mJ] to ``deepest`` [m] and ±``widest`` [rad], its minimum over θ, its end."""
     from matplotlib.colors import PowerNorm
 
     d = np.linspace(0.0, deepest, _GRID)[1:]
@@ -266,7 +266,7 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
 
 
 def draw_path(panel: Axes, d: FloatArray, theta: FloatArray, finger: str) -> None:
-    """A finger's way over the map, with the places where it began and ended."""
+    """Draw a finger's path over the map, with its start and end."""
     colour = LINES[finger]["color"]
     panel.plot(theta * DEGREES, d * 1e3, label=f"{finger} finger", **LINES[finger])
     sound = np.flatnonzero(np.isfinite(d))

@@ -169,7 +169,7 @@ def estimates(case: DrawnContact, bank: FloatArray) -> tuple[FloatArray, int]:
     board = case.board
     ends = Readings() if board is None else Readings(board.full_count, board.threshold)
     made = ContactEstimator(
-        TIP, LINEAR, case.grid, case.noise, free_gain=case.free, live=case.live, readings=ends
+        TIP, LINEAR, case.grid, case.noise, free_gain=case.free, active=case.live, readings=ends
     )
     clean = case.grid.pressure(TIP, LINEAR, *case.truth[:3])
     scale = 1.0 if board is None else board.pascal_per_count

@@ -125,7 +125,7 @@ def _loop(
     frames: FloatArray,
     cold: bool,
     states: Records[EstimatorState],
-    arena: FloatArray,
+    scratch: FloatArray,
     places: NDArray[np.int64] | None,
     solids: Records[SolidFit] | None,
     out: FloatArray,
@@ -135,7 +135,7 @@ def _loop(
         for k in range(frames.shape[0]):
             if cold:
                 estimate.warm = False
-            estimate_frame(states, frames[k], 1.0, 0.0, arena, places, solids)
+            estimate_frame(states, frames[k], 1.0, 0.0, scratch, places, solids)
             out[k, 0] = estimate.d
             out[k, 1] = estimate.tilt_x
             out[k, 2] = estimate.tilt_y
@@ -154,7 +154,7 @@ def kernel_case(
     out = np.zeros((len(frames), 3))
 
     def run(repeat: int) -> None:
-        _loop(repeat, frames, cold, estimator.state.array, *estimator.arena, out)
+        _loop(repeat, frames, cold, estimator.state.array, *estimator.scratch, out)
 
     return Timed(Subject(run, len(frames)), aim_us, out, truth)
 

@@ -36,26 +36,26 @@ class Terms(NamedTuple):
     third: FloatArray  # eq. 19 [1/m]
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
-        """U(d, 0) by eq. 12 [J]."""
+        """Return U(d, 0) by eq. 12 [J]."""
         first, second, third = self.parts(radius, modulus, d)
         return first + second + third
 
     def parts(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
-        """What each term adds to eq. 12's energy [J]."""
+        """Return each term's contribution to eq. 12's energy [J]."""
         h = radius - d
         factor = 0.5 * modulus * h**2
         return factor * self.first, -2.0 * h * factor * self.second, h**2 * factor * self.third
 
 
 def limits(radius: float, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(θ_max, p) [rad], eqs. 15 and 17: θ at the contact's rim, and t there."""
+    """Return (θ_max, p) [rad], eqs. 15 and 17: θ at the contact's rim, and t there."""
     h = radius - d
     theta_max = np.arctan(np.sqrt(radius**2 - h**2) / h)
     return theta_max, np.arccos(h / radius * np.tan(theta_max))
 
 
 def printed_terms(radius: float, d: FloatArray) -> Terms:
-    """Eqs. 16, 18 and 19 as they are printed, at d [m]."""
+    """Return eqs. 16, 18 and 19 as they are printed, at d [m]."""
     h2 = (radius - d) ** 2
     return Terms(
         2.0 * np.pi * d / (3.0 * h2) * (3.0 * radius**2 - 3.0 * radius * d + d**2),
@@ -65,7 +65,7 @@ def printed_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def integrated_terms(radius: float, d: FloatArray) -> Terms:
-    """The same by Gauss quadrature of eq. 12 over θ; relative error ≤ 1e-12 to d = 0.7 a."""
+    """Return them by Gauss quadrature of eq. 12 over θ; relative error ≤ 1e-12 to d = 0.7 a."""
     d = np.asarray(d, dtype=np.float64)[..., None]
     h = radius - d
     points, weights = leggauss(_NODES)

@@ -15,7 +15,7 @@ import numpy as np
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.hand.upright import resting_share
+from softfinger.kinematics.hand.upright import resting_ratio
 from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
 from softfinger.tools.style import GREY, KINDS, MARKERS
@@ -50,7 +50,7 @@ _CLEAR, _LOST = 0.05, 5.0  # degrees between which the maps' colours run
 
 
 def left(law: str, tilt: float, force: float = _FORCE, **simulation: Any) -> float:
-    """The object's angle after a grasp [degrees]; NaN where it isn't held."""
+    """Return the object's angle after a grasp [degrees]; NaN if it isn't held."""
     sections: dict[str, dict[str, Any]] = {
         "loop": {"clock": "virtual"},
         "material": {"law": "constant"},
@@ -80,7 +80,7 @@ def _varied(name: str, value: float) -> dict[str, Any]:
 
 @cache
 def basin() -> tuple[Sheet, ...]:
-    """Where each law leaves an object over where it was, and what the upright law leaves."""
+    """Return where each law leaves an object over where it was, and what the upright law leaves."""
     ends = [(f"left by {law}", "deg", [left(law, tilt) for tilt in STARTS]) for law in LAWS]
     sheets = [sheet("basin_laws", ("put at", "deg", STARTS), *ends)]
     for name, (unit, values) in ACROSS.items():
@@ -96,7 +96,7 @@ def basin() -> tuple[Sheet, ...]:
 def _laws(laws: Sheet, *_: Sheet) -> Iterator[DrawnCurve]:
     starts = laws["put at"]
     for spring, text in ((0.0, "equal torques, no friction"), (1e9, "fingers locked")):
-        share = resting_share(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
+        share = resting_ratio(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
         line = {"color": GREY, "ls": "--" if spring else ":", "lw": 1.0}
         yield DrawnCurve(starts, share * starts, line, f"closed form: {text}")
     for law, color, marker in zip(LAWS, KINDS, MARKERS, strict=False):

@@ -49,7 +49,7 @@ def _force_table_i(d: Numbers, theta: Numbers) -> FloatArray:
 
 
 def compression() -> tuple[Sheet, ...]:
-    """Force over displacement at each angle: the model, and what the sensor's cells sum to."""
+    """Tabulate force over displacement at each angle: the model and the sum of the cells."""
     material = Material.constant(MODULUS)
     d = np.arange(81) / 10.0
     columns: list[tuple[str, str, FloatArray]] = [("d", "mm", d)]
@@ -96,7 +96,7 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """The path of the relative angle: the finger tilts about its root, then the object rolls.
+    """Return path of the relative angle: the finger tilts about its root, then the object rolls.
 
     Rotation, at each final displacement D: a root at the distance D/sin 11.5° from the tip's centre
     makes d rise from first touch as D sin |θ|/sin 11.5°. Rolling: d stays D.

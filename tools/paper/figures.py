@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def pages() -> dict[str, FigurePage]:
-    """All figures by name."""
+    """Return all figures by name."""
     from softfinger.tools.paper import (
         appendix,
         basin,

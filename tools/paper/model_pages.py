@@ -59,7 +59,7 @@ def _tangent(material: Material, strain: FloatArray) -> FloatArray:
 
 
 def law() -> tuple[Sheet, ...]:
-    """The law over strain, and Table I with the law at its strains."""
+    """Return the law over strain, and Table I with the law at its strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = sheet(
@@ -115,7 +115,7 @@ def _entries(axes: Axes, curve: Sheet, table: Sheet) -> None:
 def double_integrals(
     radius: float, modulus: float, d: ArrayLike, theta: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """(F, U) [N], [J] of eqs. 3 and 10 as printed, at d [m] and θ [rad], which broadcast.
+    """Return (F, U) [N], [J] of eqs. 3 and 10 as printed, at d [m] and θ [rad], which broadcast.
 
     By product Gauss quadrature: with the closed forms each is a check of the other.
 
@@ -157,20 +157,20 @@ class Plotted:
     straight: float  # the power's factor over E
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Closed form in the figure's unit; d in mm, θ in degrees."""
+        """Return closed form in the figure's unit; d in mm, θ in degrees."""
         return closed_forms(MODULUS, d * MILLI, np.radians(theta))[self.row] * self.scale
 
     def integral(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """The paper's double integral in the figure's unit; d in mm, θ in degrees."""
+        """Return the paper's double integral in the figure's unit; d in mm, θ in degrees."""
         pair = double_integrals(TIP.radius, MODULUS, d * MILLI, np.radians(theta))
         return pair[self.row] * self.scale
 
     def at_zero_tilt(self, d: Numbers) -> FloatArray:
-        """The paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
+        """Return the paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
         return self.straight * MODULUS * np.asarray(d * MILLI) ** self.exponent * self.scale
 
     def most(self, tilt: float) -> float:
-        """At 8 mm and this tilt [degrees], in the figure's unit."""
+        """Return the value at 8 mm and this tilt [degrees], in the figure's unit."""
         cosine = np.cos(np.radians(tilt)) ** (self.exponent - 1)
         return float(self.at_zero_tilt(np.float64(8.0)) / cosine)
 
@@ -179,7 +179,7 @@ class Plotted:
         return f"{self.label} {self.symbol} [{self.unit}]"
 
     def columns(self, d: Numbers, theta: Numbers, at: str) -> list[tuple[str, str, FloatArray]]:
-        """Columns of the closed form and of the double integral."""
+        """Return columns of the closed form and of the double integral."""
         return [
             (f"{self.symbol} {at}", self.unit, self.closed(d, theta)),
             (f"{self.symbol} by eq. {self.equation} {at}", self.unit, self.integral(d, theta)),
@@ -193,7 +193,7 @@ ENERGY = Plotted(
 
 
 def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Over θ from −25° to 25° at each displacement."""
+    """Tabulate over θ from −25° to 25° at each displacement."""
     theta = np.arange(-50, 51) / 2.0
     columns: list[tuple[str, str, FloatArray]] = [("theta", "deg", theta)]
     for d in DEPTHS:
@@ -202,7 +202,7 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Over d up to 8 mm at each tilt, with the factor to the power at θ = 0; and the exponents.
+    """Tabulate over d to 8 mm at each tilt, with the ratio to the power at θ = 0; the exponents.
 
     Factor and exponent come from the double integral, so that they owe the closed form nothing.
     """

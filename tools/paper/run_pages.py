@@ -55,7 +55,7 @@ def _rms(off: FloatArray) -> float:
 
 @cache
 def compression() -> tuple[Sheet, ...]:
-    """One sheet an angle, and one with the errors beyond 1 mm."""
+    """Return one sheet an angle, and one with the errors beyond 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
         run = runs.compression(float(np.radians(tilt)))
@@ -100,7 +100,7 @@ def _angles(axes: Axes, *_: Sheet) -> None:
 
 
 def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
-    """Of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
+    """Yield the errors of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
     for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
         deep = run["d"] > _SURE
         truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
@@ -124,7 +124,7 @@ def _error_panel(symbol: str, title: str, label: str, most: float) -> Panel:
 
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """The rotation, the rolling at each displacement, and where force and energy are least."""
+    """Return rotation, the rolling at each displacement, and where force and energy are least."""
     columns, least = [], []
     for depth in DEPTHS:
         run = runs.rolling(depth * MILLI)
@@ -158,7 +158,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
 
 
 def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
-    """Where a parabola in θ through all values is least, and the standard error of that.
+    """Return where a parabola in θ through all values is least, and the standard error of that.
 
     Without noise both curves are parabolas within 0.1 %. The error is that of the fit, from its
     residuals: runs with ten seeds scattered by as much.
@@ -169,7 +169,7 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    """Along the path: the rotation, then the rolling at 4 mm."""
+    """Tabulate along the path: the rotation, then the rolling at 4 mm."""
     for part, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),

@@ -55,7 +55,7 @@ class SimulatedRun:
 
 
 def solid(modulus: float) -> Sections:
-    """Settings of a bonded solid tip of ``modulus`` [Pa] whose face is frictionless."""
+    """Return settings of a bonded solid tip of ``modulus`` [Pa] whose face is frictionless."""
     return {
         "tip": {"physics": "solid", "poisson": 0.49, "base": "bonded"},
         "material": {"modulus": modulus},

@@ -1,4 +1,4 @@
-"""What a figure is: sheets of numbers, each a CSV file, and the panels drawn from them."""
+"""Figures as data: sheets of numbers, each a CSV file, and the panels drawn from them."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ class Sheet:
 
 
 def sheet(name: str, *columns: tuple[str, str, ArrayLike]) -> Sheet:
-    """A sheet from (name, unit, values) of each column."""
+    """Return a sheet from (name, unit, values) of each column."""
     return Sheet(name, tuple((title, unit, np.asarray(v)) for title, unit, v in columns))
 
 
 def summary(name: str, columns: Sequence[tuple[str, str]], rows: ArrayLike) -> Sheet:
-    """A sheet of numbers from (name, unit) of each column and its rows."""
+    """Return a sheet of numbers from (name, unit) of each column and its rows."""
     values = np.asarray(rows, dtype=np.float64).T
     return sheet(name, *((*column, each) for column, each in zip(columns, values, strict=True)))
 
@@ -68,7 +68,7 @@ def _cell(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Erratum:
-    """Where the paper errs: the place, what is printed there, and what holds."""
+    """Error of the paper: the place, the printed statement, and the correct one."""
 
     place: str
     printed: str
@@ -140,7 +140,7 @@ class FigurePage:
 
 
 def errata_sheet(pages: dict[str, FigurePage]) -> Sheet:
-    """The errata of these pages, one a row."""
+    """Return the errata of these pages, one a row."""
     rows = [(name, each) for name, page in pages.items() for each in page.errata]
     return sheet(
         "errata",

@@ -71,7 +71,7 @@ def _springs(d: FloatArray, tilt: float) -> FloatArray:
 
 @cache
 def offsets() -> tuple[Sheet, ...]:
-    """Forces of both faces over d at each tilt, with the modulus of the most constant offset.
+    """Tabulate forces of both faces over d and tilt, with the modulus of the most constant offset.
 
     That is by least squares, F_springs = E F_solid − offset, upright, from 2 to 8 mm.
     """
@@ -112,7 +112,7 @@ def offsets() -> tuple[Sheet, ...]:
 
 @cache
 def solid_runs() -> tuple[Sheet, ...]:
-    """The offsets; the frictionless runs; and forces along each way of rolling."""
+    """Return the offsets; the frictionless runs; and forces along each way of rolling."""
     made = offsets()
     modulus = 1e6 * float(made[1]["modulus"][0])
     for tilt in _RUN_TILTS:
@@ -150,7 +150,7 @@ def solid_runs() -> tuple[Sheet, ...]:
 
 
 def _least(theta: FloatArray, values: FloatArray) -> float:
-    """Where a cubic through all values is least; NaN at the path's end, where it still falls."""
+    """Return where a cubic through all values is least; NaN if it still falls at the end."""
     tried = np.linspace(theta[0], theta[-1], 2001)
     place = int(np.argmin(np.polyval(np.polyfit(theta, values, 3), tried)))
     return float(tried[place]) if 0 < place < tried.size - 1 else np.nan

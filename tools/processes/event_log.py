@@ -103,7 +103,7 @@ class EventLog:
 
 
 def _is_journal() -> bool:
-    """Whether standard error goes to systemd's journal."""
+    """Return whether standard error goes to systemd's journal."""
     try:
         status = os.fstat(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):

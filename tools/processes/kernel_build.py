@@ -31,7 +31,7 @@ _LOOK = 0.2  # s between two looks at the time
 
 
 def table_cache() -> Path | None:
-    """The folder of built contact tables; None without a home folder."""
+    """Return the folder of built contact tables; None without a home folder."""
     try:
         return user_cache()
     except RuntimeError:
@@ -82,7 +82,7 @@ def _kernels(missing: list[Part]) -> int:
 
 
 def _jobs(missing: list[Part]) -> int:
-    """As many processes as there are cores, parts, and memory for."""
+    """Return the number of processes for cores, kernel groups and memory."""
     cores = len(os.sched_getaffinity(0))
     return max(1, min(cores, len(missing), int(_available() / _MEMORY)))
 
@@ -219,7 +219,7 @@ def _start() -> subprocess.Popen[str]:
 
 
 def main() -> None:
-    """A process that compiles kernels, a part of a scene at a time, until standard input ends.
+    """Compile kernels, a part of a scene at a time, until standard input ends.
 
     Standard input: the settings in JSON, the folder of contact tables (empty: none), then the name
     of a part a line. Standard output, a line each: ``kernel NAME`` as one is begun, ``done`` when a

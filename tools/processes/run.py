@@ -143,7 +143,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Where systemd wants to know: ready with the first tick, alive with each, then stopping."""
+    """Notify systemd where it asks: ready with the first tick, alive with each, stopping."""
     service = Service.of_environment()
     if service is None:
         yield
@@ -189,7 +189,7 @@ def _scene(settings: Settings) -> str:
 
 
 def _numbers(state: State) -> dict[str, Any]:
-    """What the log has of the hand at an event; its ``seq`` finds it in a recording."""
+    """Return the hand's numbers that the log has at an event; ``seq`` finds it in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
         name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN

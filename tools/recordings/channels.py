@@ -1,4 +1,4 @@
-"""How a topic's map becomes a channel's JSON, and back: what the writer and the reader share."""
+"""Conversion of a topic's map to a channel's JSON and back, for the writer and the reader."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
-    """The channel of a message: its topic, for frames with the finger's name behind it."""
+    """Return the channel of a message: its topic, and a frame's finger."""
     if topic == schema.TACTILE:
         return f"{topic.decode()}/{message.get('finger')}"
     return topic.decode()
 
 
 def topic_of(channel: str) -> bytes:
-    """The topic whose messages a channel holds."""
+    """Return the topic whose messages a channel holds."""
     topic = schema.TACTILE.decode()
     return schema.TACTILE if channel.startswith(f"{topic}/") else channel.encode()
 
 
 def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
-    """Name and JSON schema of a topic's channels; anything is an object where we know no more."""
+    """Return name and JSON schema of a topic's channels; an unknown topic's is any object."""
     if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
     described = schema_docs.json_schema(topic)
@@ -69,12 +69,12 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
 
 
 def to_json(topic: bytes) -> Converter:
-    """What makes a map fit for JSON. The map may be changed."""
+    """Return the converter of maps to JSON. It may change the map."""
     return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, _as_it_is)
 
 
 def from_json(topic: bytes) -> Converter:
-    """What makes the map of the wire from a channel's JSON."""
+    """Return the converter of a channel's JSON to the map of the wire."""
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
     floats = [field.name.split(".") for field in fields if field.kind == "float"]
     return _Restored(topic, floats)
@@ -128,7 +128,7 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_frame(message: dict[str, Any]) -> bool:
-    """Whether a map is a frame: a finger's, with a time and as many cells as rows × cols."""
+    """Return whether a map is a frame: a finger's, with a time and as many cells as rows × cols."""
     rows, cols, stamp = (message.get(name) for name in ("rows", "cols", "timestamp"))
     return (
         message.get("finger") in FINGERS

@@ -24,7 +24,7 @@ FULL_SCALE = 127.5e3  # Pa, 500 Pa a step of an 8-bit image
 
 
 def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[str, float]:
-    """The numbers of `STATE`, in SI units; ``frames`` are the newest by finger.
+    """Return the numbers of `STATE`, in SI units; ``frames`` are the newest by finger.
 
     ``touch_age`` [s] is how long before the state its finger's frame was sampled.
     """
@@ -40,6 +40,6 @@ def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[st
 
 
 def image(frame: TactileFrame, full_scale: float = FULL_SCALE) -> NDArray[np.uint8]:
-    """A frame's pressure as an image [rows, cols, 3], white from ``full_scale`` [Pa] on."""
+    """Return a frame's pressure as an image [rows, cols, 3], white from ``full_scale`` [Pa] on."""
     grey = np.clip(np.rint(frame.pressure() * (255.0 / full_scale)), 0.0, 255.0)
     return np.repeat(grey.astype(np.uint8)[:, :, np.newaxis], 3, axis=2)

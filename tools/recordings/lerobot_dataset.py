@@ -38,7 +38,7 @@ Sample = tuple[HandState, dict[str, TactileFrame]]
 
 
 def touch_rate(recording: Recording, start: float = -math.inf, end: float = math.inf) -> int:
-    """Frames a second of one sensor, by its clock, from the first few hundred; at least 1."""
+    """Return one sensor's frames a second by its clock, from the first few hundred; at least 1."""
     some = itertools.islice(recording.messages([schema.TACTILE], start, end), 400)
     times = [message["mono_ns"] for _, message in some if message["finger"] == FINGERS[0]]
     between = np.median(np.diff(times)) if len(times) > 1 else 1e9
@@ -52,7 +52,7 @@ def samples(
     end: float = math.inf,
     progress: Any = None,
 ) -> Iterator[Sample]:
-    """The newest state and frames at each 1/fps s, from the first state on that has frames.
+    """Yield the newest state and frames at each 1/fps [s], from the first state with frames on.
 
     Raises RecordingError when the daemon was started anew on the way.
     """
@@ -233,7 +233,7 @@ class _Images:
         return self._last[1]
 
     def stats(self, count: int) -> dict[str, Any]:
-        """Per channel, of levels from 0 to 1; all three are the same."""
+        """Return each channel's levels from 0 to 1; all three are the same."""
         n, seen = self._counts.sum(), np.flatnonzero(self._counts)
         mean = self._counts @ _LEVELS / n
         found = {"min": _LEVELS[seen[0]], "max": _LEVELS[seen[-1]], "mean": mean}

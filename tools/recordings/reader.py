@@ -78,7 +78,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """From the first message to the last [s]; 0 when empty."""
+        """Time from the first message to the last [s]; 0 when empty."""
         return 0.0 if math.isnan(self.start) else self.end - self.start
 
     @property
@@ -92,7 +92,7 @@ class Recording:
         return sorted({topic_of(name) for name, count in self.counts.items() if count})
 
     def count(self, topic: bytes) -> int:
-        """Messages of one topic."""
+        """Return the messages of one topic."""
         return sum(n for name, n in self.counts.items() if topic_of(name) == topic)
 
     def messages(
@@ -102,7 +102,8 @@ class Recording:
         end: float = math.inf,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Topic and map of each message, as it came off the wire, from ``start`` to ``end`` s.
+        """Yield topic and map of each message, as it came off the wire, from ``start`` to ``end``
+        [s].
 
         Times count from the recording's first message. ``progress`` is called with the bytes read
         so far. A truncated file ends where its sound part ends; damaged chunks and messages that

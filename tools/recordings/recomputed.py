@@ -29,7 +29,7 @@ _SETTINGS = ("settings", "calibration_left", "calibration_right")  # of hand/set
 
 @dataclass(slots=True)
 class Difference:
-    """How one field of ``hand/state`` differs: how often, first where, worst where."""
+    """Difference of one field of ``hand/state``: how often, first where, worst where."""
 
     count: int = 0
     first_tick: int = 0
@@ -53,7 +53,7 @@ class Comparison:
 
 
 def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
-    """Settings and calibrations (JSON) that the recording holds. Raises RecordingError."""
+    """Return the recording's settings and calibrations (JSON). Raises RecordingError."""
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
         raise RecordingError(f"{recording.path}: no hand/settings in it")
@@ -139,7 +139,7 @@ _Tick = tuple[
 
 
 def _ticks(recording: Recording, progress: Callable[[int], None] | None) -> Iterator[_Tick]:
-    """Each tick: its frames and commands come before its input, its state after it."""
+    """Yield each tick: its frames and commands come before its input, its state after it."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}

@@ -43,7 +43,7 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """The comment that a profile begins with, up to its first stop."""
+    """Return the comment that a profile begins with, up to its first stop."""
     comment = re.match(r"(#.*\n)+", _text(profile))
     words = "" if comment is None else comment[0].replace("#", " ")
     return re.split(r"[:.] ", " ".join(words.split()))[0]

@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def results(settings: Settings, fix: bool) -> Iterator[Finding]:
-    """All checks in the order of what needs what, with what was repaired before them."""
+    """Run all checks, each after those that it needs, with the repairs before them."""
     ports = _ports(settings)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))

@@ -38,14 +38,14 @@ _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#7777
 
 
 class Cell(NamedTuple):
-    """What came of one grasp."""
+    """Result of one grasp."""
 
     outcome: str  # a key of MEANING
     turned: float  # by the object, at most [rad]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of ``envelope``."""
+    """Add the arguments of ``envelope``."""
     add_profile(parser)
     force = _between("a force above 0 N", 0.0, 1e9)
     parser.add_argument("--force", type=force, default=10.0, metavar="N", help="grip (default: 10)")
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
-    """What reads an argument within the settings' bounds, at least ``low`` if that is not 0."""
+    """Return the reader of an argument within the settings' bounds, at least ``low`` if not 0."""
     return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 

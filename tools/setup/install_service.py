@@ -137,7 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def unit(config: Path | None, user: str) -> str:
-    """The unit's text. Raises ValueError for a user or profile that is not there."""
+    """Return the unit's text. Raises ValueError for a user or profile that is not there."""
     words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task", "--log", "json"]
     if config is not None:
         if not find(config).is_file():
@@ -163,7 +163,7 @@ def _quoted(word: str) -> str:
 
 
 def rules(names: list[str]) -> str:
-    """The rules' text. Raises ValueError for a name that is none."""
+    """Return the rules' text. Raises ValueError for a name that is none."""
     lines = [_RULES]
     for pair in names:
         name, separator, serial = pair.partition("=")

@@ -1,4 +1,4 @@
-"""What the live page shows of the stream, and the sockets it comes from; nothing that draws.
+"""Data of the live page, and the sockets they come from; nothing that draws.
 
 Every message is data of unknown origin: a missing or wrong-typed field is NaN or empty, a message
 that can't be read is counted and skipped.
@@ -39,7 +39,7 @@ _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def field(record: object, *path: str) -> Any:
-    """The value at ``path`` in nested maps, None where there is none."""
+    """Return the value at ``path`` in nested maps, None where there is none."""
     for key in path:
         if not isinstance(record, dict):
             return None
@@ -48,7 +48,7 @@ def field(record: object, *path: str) -> Any:
 
 
 def number(record: object, *path: str) -> float:
-    """The number at ``path``, NaN where there is none."""
+    """Return the number at ``path``, NaN where there is none."""
     value = field(record, *path)
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
@@ -56,13 +56,13 @@ def number(record: object, *path: str) -> float:
 
 
 def text(record: object, *path: str) -> str:
-    """The text at ``path`` without control characters (they would reach the terminal)."""
+    """Return the text at ``path`` without control characters (they would reach the terminal)."""
     value = field(record, *path)
     return printable(value) if isinstance(value, str) else ""
 
 
 def printable(value: str) -> str:
-    """``value`` on one line, with nothing in it that a terminal would obey."""
+    """Return ``value`` on one line, with nothing in it that a terminal would obey."""
     return "".join(c if c.isprintable() else " " for c in value)
 
 
@@ -84,7 +84,7 @@ class ShownEvent(NamedTuple):
     text: str
 
     def clock(self) -> str:
-        """Local time of day."""
+        """Return local time of day."""
         try:
             return time.strftime("%H:%M:%S", time.localtime(self.timestamp))
         except (ValueError, OverflowError, OSError):
@@ -141,7 +141,7 @@ class Feed:
         }
 
     def take(self, message: list[bytes], now: float) -> None:
-        """One message off the wire, whatever it holds."""
+        """Read one message off the wire, of any content."""
         try:
             topic, record = unpack(message)
             if topic in self.topics:
@@ -207,7 +207,7 @@ class Feed:
         self.times = times
 
     def _take_command(self, answered: schema.AnsweredCommand, now: float) -> None:
-        """Who commands; a refusal is shown as an event, for those who didn't send the command."""
+        """Note who commands; show a refusal as an event, unless this page sent the command."""
         client = printable(answered.client)
         if answered.again:
             return
@@ -231,22 +231,22 @@ class Feed:
         self.warm = math.inf if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
-        """The events that have come since the last call."""
+        """Return the events that have come since the last call."""
         fresh = list(self._news)
         self._news.clear()
         return fresh
 
     def commander(self, now: float) -> str:
-        """The client that has the commander's lease; empty: nobody, or one without a name."""
+        """Return client that has the commander's lease; empty: nobody, or one without a name."""
         client, until = self._commanding
         return client if now < until else ""
 
     def age(self, now: float) -> float:
-        """Seconds since the last state, infinite before the first."""
+        """Return seconds since the last state, infinite before the first."""
         return now - self.state_at
 
     def status(self, now: float) -> str:
-        """``waiting`` before the first state, then ``live``, ``stale`` or ``lost`` by its age."""
+        """Return ``waiting`` before the first state, then ``live``, ``stale``, ``lost`` by age."""
         age = self.age(now)
         if age == math.inf:
             return "waiting"
@@ -255,13 +255,13 @@ class Feed:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Seconds that a simulated hand has lately waited for a busy machine."""
+        """Return seconds that a simulated hand has lately waited for a busy machine."""
         while self._waits and self._waits[0][0] < now - LATELY:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
 
     def statistics(self, now: float) -> RecentTicks:
-        """Statistics of the last second's states."""
+        """Return statistics of the last second's states."""
         while self._ticks and self._ticks[0][0] < now - WINDOW:
             self._ticks.popleft()
         if not self._ticks:
@@ -291,7 +291,7 @@ class FeedSubscriber:
 
 
 class ShownReply(NamedTuple):
-    """What came of a command, for the page."""
+    """Reply to a command, for the page."""
 
     at: float
     ok: bool

@@ -41,7 +41,7 @@ Depth = Literal["any", "fixed", "none"]
 
 
 def colour_map() -> list[tuple[int, int, int]]:
-    """The scale's colours from zero to full, as (red, green, blue) of 0…255."""
+    """Return the scale's colours from zero to full, as (red, green, blue) of 0…255."""
     at = np.linspace(0.0, len(_ANCHORS) - 1.0, LEVELS)
     channels = [np.interp(at, range(len(_ANCHORS)), each) for each in zip(*_ANCHORS, strict=True)]
     return [(r, g, b) for r, g, b in np.rint(channels).T.astype(int).tolist()]
@@ -72,14 +72,14 @@ def _overlaps(cells: int, pixels: int) -> FloatArray:
 
 
 def resample(grid: FloatArray, height: int, width: int) -> FloatArray:
-    """Area average of ``grid`` [rows, cols] on [height, width] pixels; keeps the mean."""
+    """Return area average of ``grid`` [rows, cols] on [height, width] pixels; keeps the mean."""
     rows, cols = grid.shape
     result: FloatArray = _overlaps(rows, height) @ grid @ _overlaps(cols, width).T
     return result
 
 
 def fit(rows: int, cols: int, lines: int, columns: int, aspect: float = 1.0) -> tuple[int, int]:
-    """Largest (lines, columns) of characters in the given box that shows cells in their shape.
+    """Return the largest (lines, columns) of characters in the box that keeps the cells' shape.
 
     ``aspect``: a cell's height over its width.
     """
@@ -90,13 +90,13 @@ def fit(rows: int, cols: int, lines: int, columns: int, aspect: float = 1.0) -> 
 
 
 def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
-    """Index into the colour map, 0 for nothing and below, LEVELS − 1 from ``full`` on."""
+    """Return index into the colour map, 0 for nothing and below, LEVELS − 1 from ``full`` on."""
     scaled = np.clip(np.nan_to_num(pixels / full), 0.0, 1.0)
     return np.rint(scaled * (LEVELS - 1)).astype(np.int64)
 
 
 def picture(grid: FloatArray, full: float, lines: int, columns: int, depth: Depth) -> list[Text]:
-    """``grid`` as ``lines`` of ``columns`` characters, row 0 lowest as y points up.
+    """Return ``grid`` as ``lines`` of ``columns`` characters, row 0 lowest as y points up.
 
     ``full`` is the value that gets the brightest colour, or the densest shade.
     """
@@ -123,13 +123,13 @@ def _shades(levels: NDArray[np.int64]) -> Text:
 
 
 def colour_bar(columns: int, depth: Depth) -> Text:
-    """The scale from nothing to full, in one line."""
+    """Return the scale from nothing to full, in one line."""
     levels = levels_of(np.linspace(0.0, 1.0, columns), 1.0)
     return _shades(levels) if depth == "none" else _runs(levels, levels, depth)
 
 
 def round_up(value: float) -> float:
-    """The next round number at or above ``value`` > 0, for the end of a scale."""
+    """Return the next round number at or above ``value`` > 0, for the end of a scale."""
     decade = 10.0 ** np.floor(np.log10(value))
     for step in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0):
         if value <= step * decade * (1.0 + 1e-9):
@@ -147,7 +147,7 @@ class FullScale:
         self.value = least
 
     def follow(self, peak: float, now: float) -> float:
-        """The scale's end for a signal that peaks at ``peak`` at time ``now`` [s]."""
+        """Return the scale's end for a signal that peaks at ``peak`` at time ``now`` [s]."""
         wanted = max(self._least, round_up(peak)) if peak > 0.0 else self._least
         if wanted >= self.value:
             self.value = wanted

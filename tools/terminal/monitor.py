@@ -65,7 +65,7 @@ class HandKeys:
             self._commander.send(now, _SIMPLE[key], _SIMPLE[key])
 
     def force(self, now: float) -> float:
-        """Force of the next grasp [N]; in a grip, its requested force; NaN: not known."""
+        """Return force of the next grasp [N]; in a grip, its requested force; NaN: not known."""
         feed = self._feed
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
@@ -84,7 +84,7 @@ class HandKeys:
         return now - self._pressed < _BETWEEN and not refused
 
     def _change_force(self, way: float, now: float) -> None:
-        """Up or down to the next step; a grip follows at once."""
+        """Raise or lower the force to the next step; a grip follows at once."""
         present = self.force(now)
         if not math.isfinite(present):
             self._commander.refuse(now, "grasp: the hand's settings are not known yet")
@@ -106,7 +106,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Several presses add up: they count from the last target, not from the present angle."""
+        """Rotate by one step from the last target, not the present angle: key presses add up."""
         reply, pose = self._commander.reply, self._feed.state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
@@ -222,7 +222,7 @@ class _Ending(Ending):
         self.wake()
 
     def watch(self, feed: Feed, address: str, now: float) -> None:
-        """With ``--no-wait``: end without a stream."""
+        """Watch the stream; with ``--no-wait`` end without one."""
         if not self._no_wait or self.over:
             return
         status = feed.status(now)
@@ -318,7 +318,7 @@ def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> Non
 
 
 def plain_line(feed: Feed, now: float) -> str:
-    """The hand in one short line."""
+    """Return the hand in one short line."""
     state = feed.state
     parts = [_clock(), feed.mode or "—"]
     if feed.fault:

@@ -96,7 +96,7 @@ class MonitorPage:
     _statistics_at: float = -math.inf
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """The page as ``height`` lines of exactly ``width`` columns."""
+        """Return the page as ``height`` lines of exactly ``width`` columns."""
         if width < WIDTH or height < HEIGHT:
             page = _too_small(width, height)
         else:
@@ -332,7 +332,7 @@ class MonitorPage:
 
     @property
     def _way_out(self) -> str:
-        """What clears a fault."""
+        """Command that clears a fault."""
         return "c clears it " if self.keys else "softfinger send clear "
 
     def _events(self, width: int, count: int) -> list[Text]:

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send, print the reply, exit status by whether it was carried out."""
+    """Send, print the reply, and return 1 when the command was refused."""
     request: dict[str, Any] = {"command": arguments.command}
     if arguments.client:
         request["client"] = arguments.client
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:
-    """The numbers of ``key=value`` words, in SI. Raises ValueError with the word and the reason."""
+    """Parse ``key=value`` words to SI numbers. Raises ValueError with the word and the reason."""
     numbers = {}
     for key, text in _pairs(words):
         found = _NUMBER.fullmatch(text)

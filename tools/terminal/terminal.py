@@ -56,14 +56,14 @@ class KeyDecoder:
         self._rest = b""
 
     def decode(self, data: bytes) -> list[str]:
-        """The keys in ``data``: ``left``, ``right`` or the character itself."""
+        """Return the keys in ``data``: ``left``, ``right`` or the character itself."""
         keys = list(_KEY.finditer(self._rest + data))
         self._rest = keys[-1]["part"] or b"" if keys else b""
         known = (_ARROWS.get(key["arrow"]) or (key["character"] or b"").decode() for key in keys)
         return [key for key in known if key]
 
     def settle(self) -> None:
-        """No more bytes for now: a lone Escape begins nothing."""
+        """Drop an incomplete key: no more bytes come for now, and a lone Escape begins nothing."""
         if not self._rest.startswith(b"\x1b[200~"):
             self._rest = b""
 
@@ -113,7 +113,7 @@ class Terminal:
             self._write(_LEAVE)
 
     def size(self) -> tuple[int, int]:
-        """(columns, lines)"""
+        """Return (columns, lines)"""
         try:
             size = os.get_terminal_size(self._output)
         except OSError:

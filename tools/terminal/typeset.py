@@ -16,13 +16,13 @@ BARS = " ▁▂▃▄▅▆▇█"
 
 
 def cut(line: Text, room: int) -> Text:
-    """``line`` in at most ``room`` columns, with an ellipsis where it was cut."""
+    """Return ``line`` in at most ``room`` columns, with an ellipsis where it was cut."""
     line.truncate(max(room, 0), overflow="ellipsis")
     return line
 
 
 def wrapped(line: Text, room: int) -> list[Text]:
-    """The first two lines of ``room`` columns, one in from the left."""
+    """Return the first two lines of ``room`` columns, one in from the left."""
     lines = line.wrap(Console(), room)[:2]
     for each in lines:
         each.pad_left(1)
@@ -30,18 +30,18 @@ def wrapped(line: Text, room: int) -> list[Text]:
 
 
 def apart(left: Text, right: Text, width: int) -> Text:
-    """``left`` and ``right`` at the two ends of ``width`` columns."""
+    """Return ``left`` and ``right`` at the two ends of ``width`` columns."""
     return Text.assemble(left, " " * max(1, width - left.cell_len - right.cell_len), right)
 
 
 def centred(line: Text, width: int) -> Text:
-    """``line`` in the middle of ``width`` columns, not padded at its end."""
+    """Return ``line`` in the middle of ``width`` columns, not padded at its end."""
     line.pad_left((width - line.cell_len) // 2)
     return line
 
 
 def rule(width: int, title: Text, note: Text | None = None) -> Text:
-    """A line across the page with a title at its left end and a note at its right end."""
+    """Return a line across the page with a title at its left end and a note at its right end."""
     head = f"─ {cut(title, width - 4)} " if title else ""
     if not note:
         return Text(head + "─" * (width - len(head)), DIM)
@@ -51,13 +51,13 @@ def rule(width: int, title: Text, note: Text | None = None) -> Text:
 
 
 def faded(line: Text) -> Text:
-    """``line`` without colours, except the maps, the only ones with a background: out of date."""
+    """Return ``line`` in the faded style of outdated data, but for the maps."""
     maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
     return Text(line.plain, DIM, spans=maps)
 
 
 def bars(values: list[float], full: float, lines: int) -> list[str]:
-    """Values as bars of eighths of a line, highest line first; blank for NaN."""
+    """Return values as bars of eighths of a line, highest line first; blank for NaN."""
     steps = [
         -1 if math.isnan(v) else round(min(max(v / full, 0.0), 1.0) * 8 * lines) for v in values
     ]
@@ -70,7 +70,7 @@ def bars(values: list[float], full: float, lines: int) -> list[str]:
 
 
 def aligned(value: float, decimals: int) -> str:
-    """The number with its decimal point in the fourth column, at most 7 wide."""
+    """Return the number with its decimal point in the fourth column, at most 7 wide."""
     if not math.isfinite(value):
         return "  —"
     shown = f"{value:{4 + decimals}.{decimals}f}"
@@ -78,17 +78,17 @@ def aligned(value: float, decimals: int) -> str:
 
 
 def narrow(value: float) -> str:
-    """A standard deviation in 4 columns."""
+    """Return a standard deviation in 4 columns."""
     return f"{value:.2f}" if value < 9.995 else f"{value:.0f}" if value < 9999.5 else "many"
 
 
 def short(value: float, decimals: int) -> str:
-    """The number, or a dash where there is none."""
+    """Return the number, or a dash where there is none."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
 
 
 def micro(seconds: float) -> str:
-    """A time in µs, in at most 4 columns; from 10 ms on in ms, with its unit."""
+    """Return a time in µs, in at most 4 columns; from 10 ms on in ms, with its unit."""
     if not math.isfinite(seconds):
         return "—"
     return f"{1e6 * seconds:.0f}" if seconds < 9.9995e-3 else f"{1e3 * seconds:.0f}ms"

@@ -75,14 +75,14 @@ class EmulatorClock:
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
-        """The hand's time [s]. What passed since the last call counts up to a limit."""
+        """Return the hand's time [s]. What passed since the last call counts up to a limit."""
         now = time.monotonic()
         self._origin += max(now - self._last - _STALL, 0.0)
         self._last = now
         return now - self._origin
 
     def wall(self) -> float:
-        """Unix time [s]."""
+        """Return Unix time [s]."""
         return time.time()
 
     def sleep_until(self, t: float) -> float:
@@ -94,7 +94,7 @@ class EmulatorClock:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedServos:
-    """How the servos are emulated, beside the settings."""
+    """Emulation options of the servos, beside the settings."""
 
     baud: int = 0  # 0: they answer at once and at any rate
     latency: float = 0.0  # s of a USB adapter's timer, with a ``baud``
@@ -253,7 +253,7 @@ class Emulator:
             self._advance(t)
 
     def _watch(self) -> list[int | TactileBoard | socket.socket]:
-        """What bytes may come from."""
+        """Return the sources of bytes."""
         watched: list[int | TactileBoard | socket.socket] = [
             self._wake[0],
             *self._control.sockets(),
@@ -361,7 +361,8 @@ class Emulator:
         return reply
 
     def report(self, t: float, goals: bool = False) -> dict[str, Any]:
-        """What was on the servos' wire, and the hand's true state; times are the hand's [s].
+        """Report the traffic on the servos' wire and the hand's true state; times are the hand's
+        [s].
 
         ``monotonic`` is time.monotonic() at ``t``, to compare with times of other processes.
         """
@@ -415,7 +416,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """``settings`` with the default board where its tactile backend has no framing."""
+    """Return ``settings`` with the default board where its tactile backend has no framing."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -127,7 +127,7 @@ class ControlPort:
             raise
 
     def sockets(self) -> list[socket.socket]:
-        """What to wait for; :meth:`serve` those that are readable."""
+        """Return the sockets to wait for; :meth:`serve` those that are readable."""
         return [self._listener, *self._clients]
 
     def serve(self, ready: list[socket.socket]) -> None:

@@ -42,7 +42,7 @@ class PlateError(SoftfingerError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class PlatePress:
-    """To ``d`` [m] at ``theta`` [rad], or a uniform ``pressure`` [Pa] on all cells instead.
+    """Press to ``d`` [m] at ``theta`` [rad], or a uniform ``pressure`` [Pa] on all cells instead.
 
     ``force`` [N] is what the tip's base then feels; ``hold`` [s], inf: until told otherwise.
     """
@@ -63,7 +63,7 @@ class PlatePress:
 
 
 def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
-    """The presses of each finger's tip: ``[tip=left] depth=4mm [tilt=10deg] …, …``.
+    """Return the presses of each finger's tip: ``[tip=left] depth=4mm [tilt=10deg] …, …``.
 
     Each has one of depth (0 lifts off), force and pressure (uniform, as by a bladder), and may have
     tilt, speed, hold, tip (left, right or both, the default). Without ``hold`` the last one stays,
@@ -164,7 +164,7 @@ class Plate:
         self._doing.append((press, rests))
 
     def __call__(self, t: float) -> StageTouch:
-        """What the tip feels at ``t``."""
+        """Return the tip's touch at ``t``."""
         press, rests = self._doing[self._leg(t)]
         d = float(np.interp(self._within(t), self._t, self._d))
         if press is None:
@@ -172,7 +172,7 @@ class Plate:
         return StageTouch(d, press.theta, press.pressure if rests else 0.0)
 
     def reached(self, t: float) -> PlatePress | None:
-        """The press that has come to rest since the last call; None: none has."""
+        """Return the press that has come to rest since the last call; None: none has."""
         leg = self._leg(t)
         press, rests = self._doing[leg]
         fresh = rests and leg != self._told

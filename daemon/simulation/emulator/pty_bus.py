@@ -36,7 +36,7 @@ _SCHEDSTAT = "/proc/thread-self/schedstat"  # ns run, ns waited for a processor,
 
 
 def open_pty() -> tuple[int, int, str]:
-    """A new pty: its non-blocking end, the clients' one, which is raw, and that one's path.
+    """Return a new pty: its non-blocking end, the clients' one, which is raw, and that one's path.
 
     The clients' end stays open here, so that they may come and go without an error.
     """
@@ -84,12 +84,12 @@ class PtyServoBus:
         self.plug()
 
     def fileno(self) -> int:
-        """The descriptor to wait for; -1 while unplugged."""
+        """Return the descriptor to wait for; -1 while unplugged."""
         return self._master
 
     @property
     def plugged(self) -> bool:
-        """Whether the terminal is there."""
+        """True if the terminal exists."""
         return self._master >= 0
 
     def plug(self) -> None:
@@ -109,13 +109,13 @@ class PtyServoBus:
         self._statistics = -1
 
     def client_baud(self) -> int:
-        """The rate that the terminal is set to."""
+        """Return the rate that the terminal is set to."""
         raw = bytearray(_TERMIOS2.size)
         fcntl.ioctl(self._master, _TCGETS2, raw, True)
         return int(_TERMIOS2.unpack(raw)[-1])
 
     def next_event(self) -> float:
-        """When :meth:`service` is needed next [s] though no byte came."""
+        """Return when :meth:`service` is needed next [s] though no byte came."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
@@ -139,7 +139,7 @@ class PtyServoBus:
         self._send()
 
     def _arrival(self, t: float, since: float) -> float:
-        """When bytes seen at time t came, if others had the processor from then on."""
+        """Return when bytes seen at time t came, if others had the processor from then on."""
         try:
             if self._statistics < 0:
                 self._statistics = os.open(_SCHEDSTAT, os.O_RDONLY | os.O_CLOEXEC)

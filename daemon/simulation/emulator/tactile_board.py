@@ -31,10 +31,10 @@ _NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
 
 
 class FrameSource(Protocol):
-    """Where a board's frames come from: the simulated sensor."""
+    """Source of a board's frames: the simulated sensor."""
 
     def latest(self) -> Frame | None:
-        """The newest frame that is due, or None before the first."""
+        """Return the newest frame that is due, or None before the first."""
 
 
 class FrameWriter:
@@ -51,7 +51,7 @@ class FrameWriter:
         self._unread = array.array("i", [0])
 
     def fileno(self) -> int:
-        """Readable when the client has written something; see :meth:`drain`."""
+        """Return a descriptor, readable when the client has written; see :meth:`drain`."""
         return self._master
 
     def send(self, frame: bytes) -> bool:
@@ -71,7 +71,7 @@ class FrameWriter:
         return not self._rest
 
     def drain(self) -> bytes:
-        """What the client has written."""
+        """Return the bytes that the client has written."""
         try:
             return os.read(self._master, _DRAIN)
         except BlockingIOError:
@@ -144,7 +144,7 @@ class TactileBoard:
         return self._writer.dropped
 
     def fileno(self) -> int:
-        """Readable when :meth:`hear` has something to do."""
+        """Return a descriptor, readable when :meth:`hear` has something to do."""
         return self._writer.fileno()
 
     def hear(self) -> None:
@@ -154,7 +154,7 @@ class TactileBoard:
             self._asked = True
 
     def next_event(self) -> float:
-        """When :meth:`service` next has something to do [s]."""
+        """Return when :meth:`service` next has something to do [s]."""
         return self._due
 
     def service(self, t: float) -> None:
@@ -218,14 +218,14 @@ class Encoder:
 
 
 def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
-    """``AA 55``, then one byte a cell, row-major; counts above 255 saturate."""
+    """Encode ``AA 55``, then one byte a cell, row-major; counts above 255 saturate."""
     return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
 
 
 def encode_glove(
     counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
 ) -> bytes:
-    """Number + 11, each count's high and low half + 11, newline; counts beyond that saturate.
+    """Encode number + 11, each count's high and low half + 11, newline; larger counts saturate.
 
     ``values`` of a half: 32 or, with a 12-bit converter, 64.
     """
@@ -235,7 +235,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """The framing of a backend's board whose largest count is ``full_count``."""
+    """Return the framing of a backend's board whose largest count is ``full_count``."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

@@ -21,7 +21,7 @@ HALVINGS = 12  # of a step that has to be shortened
 
 @inner_kernel
 def kinetic_energy(plant: Plant) -> float:
-    """Kinetic energy of joints and object [J]."""
+    """Return kinetic energy of joints and object [J]."""
     p, v = plant.parameters, plant.state.velocity
     joints = v[0] ** 2 + v[1] ** 2
     moving = v[2] ** 2 + v[3] ** 2
@@ -31,7 +31,7 @@ def kinetic_energy(plant: Plant) -> float:
 
 @inner_kernel
 def weight_energy(plant: Plant) -> float:
-    """Potential energy of the object's weight [J]."""
+    """Return potential energy of the object's weight [J]."""
     p, at = plant.parameters, plant.state.position
     energy: float = -p.mass * (p.gravity[0] * at[2] + p.gravity[1] * at[3])
     return energy
@@ -39,7 +39,7 @@ def weight_energy(plant: Plant) -> float:
 
 @inner_kernel
 def elastic_energy(plant: Plant) -> float:
-    """Energy of all contacts as last evaluated in the first stage, and of the end stops [J]."""
+    """Return the energy [J] of the end stops and of all contacts in the first stage."""
     p, stage = plant.parameters, plant.stages[0]
     energy: float = plant.palm_energy
     for finger in range(2):
@@ -54,7 +54,7 @@ def elastic_energy(plant: Plant) -> float:
 
 @inner_kernel
 def on_rim(plant: Plant) -> bool:
-    """Whether a backing plate's rim is pressed into something."""
+    """Return whether a backing plate's rim is pressed into something."""
     stage = plant.stages[0]
     depth = 0.0
     for finger in range(2):
@@ -73,7 +73,7 @@ def open_guard(plant: Plant) -> None:
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
-    """The most that motors and pushes can have put in since the earlier state [J]."""
+    """Return the largest work of motors and loads since the earlier state [J]."""
     before, now = plant.earlier, plant.state
     work = 0.0
     for j in range(5):
@@ -130,7 +130,7 @@ def shorten(plant: Plant, share: float) -> None:
 
 @inner_kernel
 def is_allowed(plant: Plant) -> bool:
-    """Whether a state at rest has no more energy than it may have."""
+    """Return whether a state at rest has no more energy than it may have."""
     energy = elastic_energy(plant) + weight_energy(plant)
     return bool(energy <= plant.allowed + work_done(plant))
 

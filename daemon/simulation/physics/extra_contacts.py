@@ -50,7 +50,7 @@ _FAR = 1.5  # radii: half the tips' distance from which on nothing is evaluated
 
 @inner_kernel
 def palm_is_far(plant: Plant, now: Motion) -> bool:
-    """Whether no point of the object can meet the palm within a step."""
+    """Return whether no point of the object can meet the palm within a step."""
     p = plant.parameters
     height = now.position[3] - p.palm - p.extent
     rate = now.velocity[3]
@@ -130,7 +130,7 @@ def touch_palm(
 
 @inner_kernel
 def tips_are_far(plant: Plant) -> bool:
-    """Whether both tips are too far from each other to be evaluated."""
+    """Return whether both tips are too far from each other to be evaluated."""
     left, right = plant.fingers[0], plant.fingers[1]
     way_x = right.x - left.x
     way_y = right.y - left.y

@@ -23,7 +23,7 @@ from softfinger.kinematics.compiled.simd import Pointer
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Current [A] that a servo asks of its motor: its mode's law within all limits.
+    """Return current [A] that a servo asks of its motor: its mode's law within all limits.
 
     The supply's limit falls linearly from the stall current at rest to none at no-load speed.
     """
@@ -46,7 +46,7 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 
 @inner_kernel
 def set_motor_slopes(plant: Plant, g: float) -> None:
-    """How steeply the motors' torques fall with angle and with velocity, over (τ + g).
+    """Set the slopes of the motors' torques by angle and by velocity, over (τ + g).
 
     Only where a step of ``g`` makes them stiff, else 0. They are upper bounds, since whether the
     reference is limited may change within the step.
@@ -70,7 +70,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def stop_stiffness(plant: Plant, joint: int) -> float:
-    """Stiffness [N·m/rad] of the end stop that the joint is on or will be within a step, else 0."""
+    """Return the stiffness [N·m/rad] of an end stop within a step of the joint, else 0."""
     p = plant.parameters
     stiffness: float = 0.0
     q = plant.state.position[joint]
@@ -82,7 +82,7 @@ def stop_stiffness(plant: Plant, joint: int) -> float:
 
 @inner_kernel
 def free_object(plant: Plant, now: Motion) -> None:
-    """Weight, pushes and the table's friction on the object."""
+    """Add weight, loads and the table's friction to the object."""
     p, push = plant.parameters, plant.goals.push
     vx = now.velocity[2]
     vy = now.velocity[3]
@@ -99,7 +99,7 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 @inner_kernel
 def free_joint(plant: Plant, finger: int, q: float, rate: float) -> float:
-    """Torque [N·m] of a joint's friction and end stops; sets its drag."""
+    """Return torque [N·m] of a joint's friction and end stops; sets its drag."""
     p = plant.parameters
     drag = p.joint_damping + p.joint_friction / math.sqrt(rate * rate + p.joint_speed**2)
     beyond = min(q - p.stop_low[finger], 0.0) + max(q - p.stop_high[finger], 0.0)
@@ -168,7 +168,7 @@ def evaluate_state(plant: Plant, table: Pointer) -> None:
 
 @inner_kernel
 def script_x(plant: Plant, t: float) -> float:
-    """x [m] of a held object at ``t``: from its start onto the left tip, back, the right, back."""
+    """Return x [m] of a scripted object at ``t``: from its start to the left tip, back, right."""
     p = plant.parameters
     x: float = p.script_x
     left = p.script_reach[0]

@@ -21,7 +21,7 @@ _SMALLEST = 1e-12  # m
 
 @inner_kernel
 def nearest_on_rectangle(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """From a point (u, v) of the object's frame to its boundary: direction inwards, distance.
+    """Return inward direction and distance of the boundary from a point (u, v) in its frame.
 
     The direction leads from an outer point to the nearest one of the rectangle. For a point inside
     the distance is negative, to the nearest face, and the direction that face's inward normal. The
@@ -44,7 +44,7 @@ def nearest_on_rectangle(p: Parameters, u: float, v: float) -> tuple[float, floa
 
 @inner_kernel
 def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """As :func:`nearest_on_rectangle`, for the edges of the outline."""
+    """Evaluate :func:`nearest_on_rectangle` for the edges of the outline."""
     best = -math.inf
     face = 0
     for k in range(p.corners):
@@ -81,7 +81,7 @@ def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float,
 
 @inner_kernel
 def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """As :func:`nearest_on_rectangle`, for whatever shape the object has; a disc's radius last."""
+    """Evaluate :func:`nearest_on_rectangle` for any shape of the object; a disc's radius last."""
     if p.shape == RECTANGLE:
         found: tuple[float, float, float, float] = nearest_on_rectangle(p, u, v)
     elif p.shape == POLYGON:
@@ -116,7 +116,7 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 
 @inner_kernel
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
-    """As :func:`rim_on_plane`, the plate's chord pressed into a disc by one spring.
+    """Evaluate :func:`rim_on_plane` for a disc, the plate's chord pressed into it by one spring.
 
     ``away`` is the distance of the disc's centre from the tip's. The chord is as deep in the disc
     as the disc's radius exceeds the distance of its centre from the chord, and that is smooth.

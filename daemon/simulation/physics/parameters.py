@@ -33,7 +33,7 @@ COMPRESSION_DEPTH = 0.4  # of the tip's radius, how far the scripted compression
 
 
 def geometry_of(settings: Settings) -> HandGeometry:
-    """The hand's lengths as the settings have them."""
+    """Return the hand's lengths as the settings have them."""
     hand = settings.hand
     return HandGeometry(
         hand.pivot_separation, hand.finger_length, hand.finger_offset, settings.tip.radius
@@ -41,7 +41,7 @@ def geometry_of(settings: Settings) -> HandGeometry:
 
 
 def stiff_step(settings: Settings, table: ContactTable) -> float:
-    """Sub-step [s] from the stiffest oscillation of the object on the tips, deeply grasped."""
+    """Return the sub-step [s] for the stiffest oscillation of the object on deeply pressed tips."""
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, _deepest(settings, table))
     c = table(d, 0.0)

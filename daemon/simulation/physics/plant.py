@@ -65,7 +65,7 @@ _GAMMA = 1.0 - math.sqrt(0.5)
 
 @inner_kernel
 def bounded(value: float, most: float) -> float:
-    """``value`` within ± ``most``."""
+    """Return ``value`` within ± ``most``."""
     return min(max(value, -most), most)
 
 
@@ -108,7 +108,7 @@ def finish_stage(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def first_stage(plant: Plant, g: float) -> None:
-    """k1 of the step."""
+    """Compute k1 of the step."""
     stage, state, k = plant.stages[0], plant.state, plant.first
     for j in range(5):
         plant.load[j] = plant.forces[j]
@@ -131,7 +131,7 @@ def first_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def go_to_second_stage(plant: Plant, h: float) -> None:
-    """Where the second stage is evaluated: y + h k1."""
+    """Move to the second stage: y + h k1."""
     state, k, later = plant.state, plant.first, plant.later
     for j in range(5):
         later.position[j] = state.position[j] + h * k.position[j]
@@ -145,7 +145,7 @@ def go_to_second_stage(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def second_stage(plant: Plant, g: float) -> None:
-    """k2 of the step, from the second stage's forces."""
+    """Compute k2 of the step, from the second stage's forces."""
     p, stage, first, k = plant.parameters, plant.stages[1], plant.first, plant.second
     for j in range(5):
         inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
@@ -166,7 +166,7 @@ def second_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def go_on(plant: Plant, h: float) -> None:
-    """The step itself: y + h (3 k1 + k2)/2, of what isn't held."""
+    """Take the step: y + h (3 k1 + k2)/2, of what isn't held."""
     p, state, first, second = plant.parameters, plant.state, plant.first, plant.second
     for j in range(2):
         state.shear[j] += h * (1.5 * first.shear[j] + 0.5 * second.shear[j])
@@ -207,7 +207,7 @@ def go_back(plant: Plant, table: Pointer) -> None:
 
 @inner_kernel
 def feels_tip(plant: Plant, finger: int) -> bool:
-    """Whether a tip feels the other one, which presses more than the object."""
+    """Return whether a tip feels the other one, which presses more than the object."""
     if not plant.tips_near:
         return False
     stage = plant.stages[0]
@@ -217,7 +217,7 @@ def feels_tip(plant: Plant, finger: int) -> bool:
 
 @inner_kernel
 def felt_contact(plant: Plant, finger: int) -> TipContact:
-    """The contact that a tip feels."""
+    """Return the contact that a tip feels."""
     if feels_tip(plant, finger):
         return plant.stages[0].on_tip[finger]
     return plant.stages[0].on_object[finger]

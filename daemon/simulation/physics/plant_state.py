@@ -54,7 +54,7 @@ class Motion(Record):
 
 
 class Sample(Record):
-    """What the tips felt at a frame's instant; fields as in :class:`TipContact`."""
+    """Contact of the tips at a frame's instant; fields as in :class:`TipContact`."""
 
     number: int  # -1: none
     t: float  # since the start [s]
@@ -76,7 +76,7 @@ class Edge(Record):
 
 
 class Parameters(Record):
-    """What the settings fix."""
+    """Parameters fixed by the settings."""
 
     step: float  # sub-step [s]
     sample_period: float  # [s]
@@ -134,7 +134,7 @@ class Parameters(Record):
 
 
 class Goals(Record):
-    """What servos and object are commanded."""
+    """Commands to the servos and loads on the object."""
 
     mode: Annotated[NDArray[np.int64], 2]
     torque_on: Flags
@@ -144,7 +144,7 @@ class Goals(Record):
 
 
 class Finger(Record):
-    """Where a finger is: its tip's centre from the hand's origin."""
+    """Position of a finger: its tip's centre from the hand's origin."""
 
     cosine: float  # of the joint angle
     sine: float

@@ -48,7 +48,7 @@ class Shape:
         return float(0.5 * (max(across) - min(across)))
 
     def edges(self) -> FloatArray:
-        """The edges, float64 [n, 5]: start x, y, outward normal x, y, length."""
+        """Return the edges, float64 [n, 5]: start x, y, outward normal x, y, length."""
         way = np.roll(self.corners, -1, axis=0) - self.corners
         length = np.hypot(*way.T)
         normal = np.stack((way[:, 1], -way[:, 0]), axis=1) / length[:, None]
@@ -56,7 +56,7 @@ class Shape:
 
 
 def shape_of(settings: Settings) -> Shape:
-    """The object of the settings, made by the function that `daemon.backends` names for it."""
+    """Make the settings' object by the function that `daemon.backends` names for it."""
     simulation = settings.simulation
     found = backend("shapes", simulation.object_shape)
     shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
@@ -64,7 +64,7 @@ def shape_of(settings: Settings) -> Shape:
 
 
 def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
-    """A convex outline of 3 to 8 ``corners`` [n, 2] m, counter-clockwise; the object's shape.
+    """Return the shape of 3 to 8 convex ``corners`` [n, 2] m, counter-clockwise.
 
     It turns about its centre of mass, wherever the corners' origin lies. The integrals over it are
     closed forms of the triangles between the centre and each edge. Raises ValueError for an
@@ -95,12 +95,12 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
 
 def rectangle(simulation: SimulationSettings) -> Shape:
-    """A box of the settings' width and height."""
+    """Return a box of the settings' width and height."""
     return polygon(_trapezoid(simulation, 0.0), RECTANGLE)
 
 
 def wedge(simulation: SimulationSettings) -> Shape:
-    """Faces that lean by half the taper each, with the settings' width at half the height.
+    """Return faces that lean by half the taper each, with the settings' width at half the height.
 
     Raises ValueError where they meet; `profile.validation` finds that in profiles.
     """
@@ -115,14 +115,14 @@ def wedge(simulation: SimulationSettings) -> Shape:
 
 
 def disc(simulation: SimulationSettings) -> Shape:
-    """A disc of the settings' radius."""
+    """Return a disc of the settings' radius."""
     radius = simulation.object_radius
     square = radius * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
 
 
 def nothing(simulation: SimulationSettings) -> Shape:
-    """No object; its outline is the rectangle's."""
+    """Return the shape of no object; its outline is the rectangle's."""
     return polygon(_trapezoid(simulation, 0.0), NO_OBJECT)
 
 
@@ -138,6 +138,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _secants(t: FloatArray) -> FloatArray:
-    """Twice the integral of sec³ to the angle whose tangent is ``t``."""
+    """Return twice the integral of sec³ to the angle whose tangent is ``t``."""
     integral: FloatArray = t * np.sqrt(1.0 + t * t) + np.arcsinh(t)
     return integral

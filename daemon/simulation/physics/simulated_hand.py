@@ -152,7 +152,7 @@ class SimulatedHand:
         self._goal_current[joint] = goal_current
 
     def measured_current(self, joint: int) -> float:
-        """The motor current [A] that a servo's own sensor shows."""
+        """Return the motor current [A] that a servo's own sensor shows."""
         scale = self.measurement_faults[joint]("current", self.t)
         return scale * self.current.item(joint)
 
@@ -179,11 +179,11 @@ class SimulatedHand:
 
     @property
     def kept_samples(self) -> int:
-        """How many of the newest samples are kept."""
+        """Number of newest samples that are stored."""
         return len(self._rows)
 
     def sample(self, number: int) -> Sample:
-        """Sample ``number``, as long as no newer one takes its place.
+        """Return sample ``number``, valid until a newer one replaces it.
 
         Raises LookupError for one that is not taken yet or is overwritten.
         """
@@ -193,7 +193,7 @@ class SimulatedHand:
         return row
 
     def energy(self) -> float:
-        """Kinetic, elastic and gravitational energy of joints, tips and object [J]."""
+        """Return kinetic, elastic and gravitational energy of joints, tips and object [J]."""
         return self.plant.energy
 
     def _run(self, count: int) -> None:

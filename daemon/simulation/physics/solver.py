@@ -24,7 +24,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 
 @inner_kernel
 def joint_pivot(plant: Plant, joint: int, g: float) -> float:
-    """The matrix's entry of a joint by itself: inertia, friction, stop and motor."""
+    """Return the matrix's entry of a joint by itself: inertia, friction, stop and motor."""
     motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
     pivot: float = plant.parameters.joint_inertia + g * (
         plant.drag[joint] + g * (stop_stiffness(plant, joint) + motor)
@@ -34,7 +34,7 @@ def joint_pivot(plant: Plant, joint: int, g: float) -> float:
 
 @inner_kernel
 def entry(tip: TipContact, i: int, j: int, g: float) -> float:
-    """What a tip adds to the matrix at its coordinates ``i`` and ``j``."""
+    """Return a tip's contribution to the matrix at its coordinates ``i`` and ``j``."""
     total = 0.0
     for r in range(3):
         weight = g * (tip.damping[r] + g * tip.stiffness[r])
@@ -105,7 +105,7 @@ def solve(plant: Plant, k: Motion) -> None:
 
 @inner_kernel
 def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
-    """A tip's row ``r`` times the coordinates' ``rates``."""
+    """Return a tip's row ``r`` times the coordinates' ``rates``."""
     rate: float = (
         tip.rows[r, 0] * rates[finger]
         + tip.rows[r, 1] * rates[2]
@@ -201,7 +201,7 @@ def solve_full(plant: Plant, k: Motion) -> None:
 
 @inner_kernel
 def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
-    """An extra row times the coordinates' ``rates``."""
+    """Return an extra row times the coordinates' ``rates``."""
     rate: float = 0.0
     for j in range(5):
         rate += extra.row[j] * rates[j]

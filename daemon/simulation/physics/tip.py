@@ -59,7 +59,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer
-from softfinger.kinematics.contact.lookup import lookup_at, push_at, stiffness_ahead
+from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness_ahead
 
 D_MIN = 1e-9  # m, less is no contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
@@ -71,7 +71,7 @@ _BEFORE_RIM = 0.03  # of the radius, when the plate is parallel to the face: end
 
 @inner_kernel
 def fade(theta: float) -> tuple[float, float]:
-    """w(θ) and dw/dθ."""
+    """Return w(θ) and dw/dθ."""
     u = (abs(theta) - _FADE_FROM) / (_FADE_TO - _FADE_FROM)
     if u <= 0.0:
         return 1.0, 0.0
@@ -83,7 +83,7 @@ def fade(theta: float) -> tuple[float, float]:
 
 @inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
-    """Largest ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the largest ratio.
+    """Return largest ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the largest ratio.
 
     ζ is the shear measured from where T = 0.
     """
@@ -98,7 +98,7 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 @inner_kernel
 def clear_contact(tip: TipContact) -> None:
-    """A tip without contact; d, θ and the gain stay."""
+    """Clear a tip's contact; d, θ and the gain stay."""
     tip.force = 0.0
     tip.energy = 0.0
     tip.rim = 0.0
@@ -118,7 +118,7 @@ def clear_contact(tip: TipContact) -> None:
 
 @inner_kernel
 def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
-    """The law of the contact: forces, stiffness and losses of a ``tip`` along d, θ and d_t.
+    """Compute forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
     ``share`` is κ. Takes from the tip d, θ, reach, rates, slide, shear, spread and the rim; writes
     the rest but what is over the coordinates.
@@ -169,7 +169,7 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
             d_soft_d = 0.0
             d_soft_theta = 0.0
         force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(table, d_soft, tip.theta)
-        slope, slope_d, slope_theta = push_at(
+        slope, slope_d, slope_theta = normal_at(
             table, d_soft, tip.theta, (force, force_d, force_theta), tangent, inverse_cosine
         )
         scale = p.scale

@@ -19,7 +19,7 @@ from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, rende
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import average, parts
+from softfinger.kinematics.sensing.blur import average, pieces
 from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 
@@ -69,14 +69,14 @@ class Imperfections:
 
     @classmethod
     def of(cls, simulation: SimulationSettings) -> Imperfections:
-        """Those of the settings."""
+        """Return the imperfections of the settings."""
         values = simulation.model_dump()
         return cls(**{each.name: values[f"tactile_{each.name}"] for each in fields(cls)})
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """How a board counts: the pressure of a count, the largest one, the smallest that is sent.
+    """Range of a board: the pressure of a count, the largest one, the smallest that is sent.
 
     Below ``threshold`` it sends 0. Raises ValueError for values out of their range.
     """
@@ -131,7 +131,7 @@ class SensorModel:
         self._pressure = self._rendered = np.zeros(shape)
         cells = grid
         if flaws.blur > 0.0:
-            n_x, n_y = (min(parts(flaws.blur / pitch), _MOST_PARTS) for pitch in grid.pitches)
+            n_x, n_y = (min(pieces(flaws.blur / pitch), _MOST_PARTS) for pitch in grid.pitches)
             self._parts = n_x, n_y
             self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._parts)
             self._rendered = np.zeros(cells.shape)
@@ -139,7 +139,7 @@ class SensorModel:
         self._solid: SolidPressure | None = None
         if tip.physics == "solid":
             blurred = replace(grid, blur=flaws.blur)
-            self._solid = SolidPressure(tip, material, blurred.pictures(tip))
+            self._solid = SolidPressure(tip, material, blurred.images(tip))
         self._plane, self._curved = Rendering(), CurvedContact()
         for contact in (self._plane, self._curved):
             contact.grid.assign(cells.on(tip))
@@ -161,7 +161,7 @@ class SensorModel:
 
     @property
     def remembers(self) -> bool:
-        """What it reads depends on what pressed before, not on the present contact alone."""
+        """True if readings depend on earlier contacts, not on the present one alone."""
         return self._flaws.hysteresis > 0.0 or self._flaws.creep > 0.0
 
     def frame(
@@ -308,7 +308,7 @@ def drift(
 
 
 def crosstalk(signal: FloatArray, share: float, rows: FloatArray, cols: FloatArray) -> None:
-    """What every cell of each line reads too much: ``share`` of its line's mean signal.
+    """Add crosstalk to every cell of each line: ``share`` of its line's mean signal.
 
     Cells of a resistive matrix share their drive and sense lines, and current leaks along them.
     ``rows`` [rows] and ``cols`` [cols] take the lines' parts.

@@ -21,7 +21,7 @@ from softfinger.daemon.types import Frame
 
 
 def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
-    """The pressure sensor under one simulated tip."""
+    """Return the pressure sensor under one simulated tip."""
     simulation, tactile = settings.simulation, settings.tactile
     return SensorModel(
         make_grid(settings, finger),
@@ -36,7 +36,7 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """What something else than the hand's object does to a tip at an instant."""
+    """Touch of a tip by something else than the hand's object, at an instant."""
 
     d: float  # m
     theta: float  # rad
@@ -90,7 +90,7 @@ class SimulatedTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """The newest frame that has arrived, None before the first or when not open."""
+        """Return the newest frame that has arrived, None before the first or when not open."""
         now = self._clock.now()
         if self._open and self._arrivals.take(now):
             self._hand.advance(now)
@@ -98,7 +98,7 @@ class SimulatedTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """``frames`` that arrived since open, ``missed`` those that never came.
+        """Return ``frames`` that arrived since open, ``missed`` those that never came.
 
         ``resyncs`` and ``skipped_bytes`` stay 0.
         """
@@ -130,7 +130,7 @@ class SimulatedTactile:
         self._frame = Frame(seq=number + 1, t_sample=t, t_arrival=arrival, valid=True, data=data)
 
     def _counts(self, t: float) -> NDArray[np.uint16]:
-        """What the cells read at ``t`` [s], or the next of the frames that are repeated."""
+        """Return the cells' readings at ``t`` [s], or the next of the frames that are repeated."""
         last = round(self._faults("replay", t) / self._period)
         if last == 0 or not self._given:
             self._replayed = None

@@ -35,7 +35,7 @@ class BusRecorder:
         self._off_t: float | None = None
 
     def goal(self, address: int, value: int) -> None:
-        """A value for a register was on the wire."""
+        """Record a value for a register on the wire."""
         if address not in _WATCHED:
             return
         if address == reg.GOAL_CURRENT:
@@ -47,11 +47,11 @@ class BusRecorder:
             self._goals[address] = min(seen[0], value), max(seen[1], value)
 
     def refused(self) -> None:
-        """The servo refused a write that had a goal in it."""
+        """Record that the servo refused a write that had a goal in it."""
         self._refused += 1
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, goals: tuple[int, int]) -> None:
-        """Torque went on at time t with these goals (position, current) in force, in counts."""
+        """Record torque on at time t with these goals (position, current) in force, in counts."""
         position, current = goals
         self._torque_on += 1
         self._torque_t = self._last = t
@@ -62,26 +62,26 @@ class BusRecorder:
             self._farthest = max(self._farthest, away)
 
     def torque_off(self, t: float) -> None:
-        """Torque was switched off at time t."""
+        """Record torque off at time t."""
         self._off_t = t
 
     def heard(self, t: float, torque: bool) -> None:
-        """A packet that the servo understood went by at time t."""
+        """Record a packet at time t that the servo understood."""
         if torque and t - self._last > self._quiet:
             self._quiet = t - self._last
         self._last = t
 
     def fired(self, t: float) -> None:
-        """The bus watchdog stopped the motor."""
+        """Record that the bus watchdog stopped the motor."""
         self._fired += 1
         self._fired_t = t
 
     def goal_currents(self, joint: ServoJoint) -> list[tuple[float, float]]:
-        """The newest goal currents in their order: when each came [s], and how much [A]."""
+        """Return the newest goal currents in their order: when each came [s], and how much [A]."""
         return [(round(t, 6), joint.goal_current(value)) for t, value in self._currents]
 
     def report(self, t: float, joint: ServoJoint, torque: bool) -> dict[str, Any]:
-        """The record at time t, in SI and in the joint's sense, as JSON takes it."""
+        """Return the record at time t, in SI and in the joint's sense, as JSON takes it."""
         angles = [joint.goal_angle(each) for each in self._goals.get(reg.GOAL_POSITION, ())]
         currents = [joint.goal_current(each) for each in self._goals.get(reg.GOAL_CURRENT, ())]
         quiet = t - self._last

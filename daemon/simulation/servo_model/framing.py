@@ -45,7 +45,7 @@ _KNOWN: Final = 32  # requests remembered
 
 
 def frame(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A whole packet on the wire: header, stuffed body, length that counts the stuffing, CRC."""
+    """Return a whole packet on the wire: header, stuffed body, its stuffed length, CRC."""
     body = (bytes((instruction,)) + parameters).replace(HEADER, _STUFFED)
     length = len(body) + 2
     packet = _PREFIX + bytes((packet_id, length & 0xFF, length >> 8)) + body
@@ -53,12 +53,12 @@ def frame(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
 
 
 def status(packet_id: int, error: int, data: bytes = b"") -> bytes:
-    """A status packet."""
+    """Return a status packet."""
     return frame(packet_id, STATUS, bytes((error,)) + data)
 
 
 def fast_head(length: int) -> bytes:
-    """How the one reply to a fast group read begins."""
+    """Return how the one reply to a fast group read begins."""
     return _PREFIX + bytes((BROADCAST, length & 0xFF, length >> 8 & 0xFF, STATUS))
 
 
@@ -73,7 +73,7 @@ class Packet(NamedTuple):
 
 
 def _is_plain(data: bytes) -> bool:
-    """Whether it is one whole packet without stuffing, as nearly all are."""
+    """Return whether it is one whole packet without stuffing, as nearly all are."""
     return (
         10 <= len(data) <= MAX_LENGTH
         and data[:4] == _PREFIX
@@ -106,7 +106,7 @@ class PacketParser:
         self._last = 0.0
 
     def feed(self, data: bytes, t: float) -> list[Packet]:
-        """The packets that ``data``, arriving at time t [s], completes."""
+        """Return the packets that ``data``, arriving at time t [s], completes."""
         buffer = self._buffer
         if buffer and t - self._last > self.gap:
             self.dropped += len(buffer)
@@ -168,7 +168,7 @@ class PacketParser:
         return None
 
     def _header_within(self, end: int) -> int:
-        """Where an unstuffed FF FF FD stands in the body so far received, or -1."""
+        """Return where an unstuffed FF FF FD stands in the body so far received, or -1."""
         buffer = self._buffer
         at = buffer.find(HEADER, 7, end)
         while at >= 0:

@@ -46,7 +46,7 @@ class Item:
 
     @property
     def saved(self) -> bool:
-        """Whether the register is EEPROM."""
+        """True for a register in EEPROM."""
         return self.address < reg.RAM
 
 
@@ -63,7 +63,7 @@ def _gain(address: int, default: int) -> Item:
 
 
 def _items_of(model: ServoModel, firmware: int) -> list[Item]:
-    """All registers of that model and firmware, by address."""
+    """Return all registers of that model and firmware, by address."""
     low, high = model.voltage_min, model.voltage_max
     items = [
         _read_only(reg.MODEL_NUMBER, 2, model.number),
@@ -166,7 +166,7 @@ class ControlTable:
     # --- values ----------------------------------------------------------------------------------
 
     def get(self, address: int) -> int:
-        """Value of the item at that address."""
+        """Return value of the item at that address."""
         value: int = self._unpack[address](self.memory, address)[0]
         return value
 
@@ -185,13 +185,13 @@ class ControlTable:
             self._layouts.clear()
 
     def reset(self, keep: tuple[int, ...] = ()) -> None:
-        """Factory defaults everywhere but in the items at the addresses ``keep``."""
+        """Restore factory defaults everywhere but in the items at the addresses ``keep``."""
         for item in self.items:
             if item.address not in keep:
                 self.set(item.address, item.default)
 
     def reset_ram(self) -> None:
-        """RAM as after a power-up."""
+        """Restore the RAM as after a power-up."""
         for item in self.items:
             if not item.saved:
                 self.set(item.address, item.default)
@@ -199,18 +199,18 @@ class ControlTable:
     # --- reading ---------------------------------------------------------------------------------
 
     def holds(self, address: int, length: int) -> bool:
-        """Whether the span lies inside the table."""
+        """Return whether the span lies inside the table."""
         return length > 0 and address + length <= self.size
 
     def resolve(self, address: int) -> int:
-        """Where a byte really is: indirect data stands for the register its address names."""
+        """Return a byte's real address: indirect data stands for the register its address names."""
         pointer = self._indirect.get(address)
         if pointer is None:
             return address
         return self.memory[pointer] | self.memory[pointer + 1] << 8
 
     def read(self, address: int, length: int) -> bytes:
-        """The bytes of a span inside the table, indirect data resolved."""
+        """Return the bytes of a span inside the table, indirect data resolved."""
         end = address + length
         if end <= self._first_indirect:
             return bytes(self.memory[address:end])
@@ -218,7 +218,7 @@ class ControlTable:
         return bytes(memory[resolve(i)] for i in range(address, end))
 
     def reads(self, address: int, length: int, first: int, last: int) -> bool:
-        """Whether reading the span shows any byte of ``first`` … ``last``."""
+        """Return whether reading the span shows any byte of ``first`` … ``last``."""
         end = address + length
         if address <= last and end > first:
             return True
@@ -229,7 +229,7 @@ class ControlTable:
     # --- writing ---------------------------------------------------------------------------------
 
     def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        """What a write would do: (error, the items with their new values).
+        """Return the effect of a write: (error, the items with their new values).
 
         Every item must be written whole; one that is cut gives DATA_LENGTH, a read-only or
         undefined byte ACCESS, a value out of the item's own range DATA_RANGE. With an error
@@ -251,7 +251,7 @@ class ControlTable:
         return error, plan
 
     def values(self, address: int, data: bytes) -> dict[int, int]:
-        """The value of each register that a write has whole, allowed or not."""
+        """Return the value of each register that a write has whole, allowed or not."""
         places = [self.resolve(i) for i in range(address, min(address + len(data), self.size))]
         found = {}
         for i, place in enumerate(places):
@@ -263,7 +263,7 @@ class ControlTable:
         return found
 
     def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
-        """Which items a span writes, with their places in its data, or the error it makes."""
+        """Return the items that a span writes, with their offsets in its data, or the error."""
         layout = self._lay_out(address, length)
         if len(self._layouts) < _LAYOUTS:
             self._layouts[address, length] = layout
@@ -321,5 +321,5 @@ class ControlTable:
 
     @property
     def shut_down(self) -> bool:
-        """Whether a hardware error that the shutdown mask has keeps torque off."""
+        """True while a hardware error in the shutdown mask keeps torque off."""
         return bool(self.memory[reg.HARDWARE_ERROR_STATUS] & self.memory[reg.SHUTDOWN])

@@ -44,7 +44,7 @@ _CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
-    """EEPROM as the daemon needs it: no return delay, and the mode where the model has it."""
+    """Return an EEPROM as the daemon needs it: no return delay, and the model's mode."""
     needed = {reg.RETURN_DELAY_TIME: 0}
     return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
@@ -107,7 +107,7 @@ class EmulatedServo:
         return self._memory[reg.STATUS_RETURN_LEVEL]
 
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
-        """Whether it answers group reads from ``servo_id``."""
+        """Return whether it answers group reads from ``servo_id``."""
         memory = self._memory
         if memory[reg.ID] != servo_id or not memory[reg.STATUS_RETURN_LEVEL]:
             return False
@@ -120,7 +120,7 @@ class EmulatedServo:
 
     @property
     def torque_on(self) -> bool:
-        """Whether the motor is driven."""
+        """True while the motor is driven."""
         return bool(self._memory[reg.TORQUE_ENABLE])
 
     @property
@@ -128,18 +128,18 @@ class EmulatedServo:
         return self._memory[reg.OPERATING_MODE]
 
     def awake(self, t: float) -> bool:
-        """Whether it hears and answers at time t: neither silent nor rebooting."""
+        """Return whether it hears and answers at time t: neither silent nor rebooting."""
         return not self.silent and t >= self._boot_at
 
     # --- time ------------------------------------------------------------------------------
 
     def heard(self, t: float) -> None:
-        """An instruction packet went by: the bus watchdog starts anew."""
+        """Restart the bus watchdog: an instruction packet went by."""
         self._watched = t
         self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
 
     def next_event(self) -> float:
-        """When :meth:`act` next has something to do [s]."""
+        """Return when :meth:`act` next has something to do [s]."""
         due = self._next_step if self._next_step < self._next_sense else self._next_sense
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
@@ -176,7 +176,7 @@ class EmulatedServo:
     # --- instructions ----------------------------------------------------------------------
 
     def read(self, address: int, length: int, t: float) -> bytes | None:
-        """The bytes of a span, or None when it does not lie inside the table."""
+        """Return the bytes of a span, or None when it does not lie inside the table."""
         table = self.table
         if self.refuses or not table.holds(address, length):
             return None
@@ -212,7 +212,7 @@ class EmulatedServo:
         return framing.OK
 
     def reboot(self, t: float) -> None:
-        """Torque off, silence for REBOOT_TIME, then RAM as after power-up."""
+        """Switch torque off, be silent for REBOOT_TIME, then restore the RAM as after power-up."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
         self._next_step = math.inf
@@ -220,7 +220,7 @@ class EmulatedServo:
         self._next_sense = self._boot_at
 
     def factory_reset(self, option: bytes, t: float) -> int:
-        """Factory defaults (FF all, 01 keeps the ID, 02 the baud rate too), then a reboot."""
+        """Restore factory defaults (FF all, 01 keeps ID, 02 ID and baud rate), then reboot."""
         if len(option) != 1:
             return framing.DATA_LENGTH
         keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
@@ -247,7 +247,7 @@ class EmulatedServo:
         return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
-        """Its state, and the record of what it was sent."""
+        """Return the servo's state and the record of what it was sent."""
         ticks = self._memory[reg.BUS_WATCHDOG]
         return {
             "id": self.id,
@@ -261,11 +261,11 @@ class EmulatedServo:
         }
 
     def goal_currents(self) -> list[tuple[float, float]]:
-        """The newest goal currents on the wire: time [s] and value [A] of each."""
+        """Return the newest goal currents on the wire: time [s] and value [A] of each."""
         return self.recorder.goal_currents(self._joint)
 
     def fault(self, kind: str, t: float) -> None:
-        """One of SERVO_FAULTS. ``recover`` leaves a latched hardware error until a reboot."""
+        """Begin one of SERVO_FAULTS. ``recover`` leaves a latched hardware error until a reboot."""
         match kind:
             case "silent" | "answer":
                 self.silent = kind == "silent"

@@ -88,7 +88,7 @@ class ServoBus:
         factory: bool = False,
         t: float = 0.0,
     ) -> ServoBus:
-        """The settings' servos, one a joint, left first.
+        """Return the settings' servos, one a joint, left first.
 
         ``baud`` > 0 sets the servos to that rate, ``ids`` to others than the settings'; with
         ``factory`` all else is as the maker delivers it. Raises ValueError for a rate the model
@@ -133,17 +133,17 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """When a servo next does something by itself [s]; possibly too early, never too late."""
+        """Return when a servo next acts by itself [s]; possibly too early, never too late."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
 
     def feed(self, data: bytes, t: float, baud: int = 0) -> bytes:
-        """What the bus answers to ``data`` arriving at time t, all at once."""
+        """Return the bus' answer to ``data`` that arrives at time t, all at once."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """As :meth:`feed`, reply by reply with their delays. ``baud`` 0 is heard by every servo."""
+        """Return :meth:`feed`'s answers with their delays. ``baud`` 0 reaches all servos."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
@@ -181,7 +181,7 @@ class ServoBus:
                 servo.fault(kind, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
-        """Each servo's state, and the record of what it was sent."""
+        """Report each servo's state, and the record of what it was sent."""
         self.advance(t)
         return [servo.report(t) for servo in self.servos]
 
@@ -287,7 +287,7 @@ def _wanted(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], 
 def _write_each(
     items: Iterable[tuple[int, int, bytes]], servos: list[EmulatedServo], t: float
 ) -> None:
-    """What a group write asks of each servo: ID, address, data."""
+    """Write each servo's part of a group write: ID, address, data."""
     for servo_id, address, data in items:
         for servo in servos:
             if servo.id == servo_id:

@@ -83,7 +83,7 @@ class ServoJoint:
     # --- position ----------------------------------------------------------------------------
 
     def encoder(self) -> int:
-        """The encoder's count, over all turns."""
+        """Return the encoder's count, over all turns."""
         if self.stuck is not None:
             return self.stuck
         return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
@@ -95,7 +95,7 @@ class ServoJoint:
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
 
     def position(self) -> int:
-        """Present position in counts, as register 132 has it."""
+        """Return present position in counts, as register 132 has it."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
         memory = self._memory
         if memory[reg.DRIVE_MODE] & 1:
@@ -111,11 +111,11 @@ class ServoJoint:
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_angle(self, counts: int) -> float:
-        """Joint angle [rad] that a goal position means."""
+        """Return joint angle [rad] that a goal position means."""
         return self._angle(counts)
 
     def goal_current(self, counts: int) -> float:
-        """Current [A] that a goal current means, positive closing; in a bound its sign is void."""
+        """Return the current [A] of a goal current, positive closing; a bound's sign is void."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
@@ -139,14 +139,14 @@ class ServoJoint:
             profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
 
     def moves_by_itself(self) -> bool:
-        """Whether :meth:`follow` has work while torque is on."""
+        """Return whether :meth:`follow` has work while torque is on."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             return self.profile.busy
         return mode == reg.VELOCITY_MODE
 
     def follow(self) -> None:
-        """One STEP of whatever moves by itself."""
+        """Advance whatever moves by itself by one STEP."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             self.profile.step(STEP)
@@ -158,7 +158,7 @@ class ServoJoint:
     # --- plant -------------------------------------------------------------------------------
 
     def drive(self) -> None:
-        """Command the plant as the registers say."""
+        """Command the plant by the registers."""
         memory, table, joint = self._memory, self._table, self._joint
         mode = memory[reg.OPERATING_MODE]
         if not memory[reg.TORQUE_ENABLE]:
@@ -241,7 +241,7 @@ class Profile:
 
     @property
     def busy(self) -> bool:
-        """Whether the trajectory still moves towards its target."""
+        """True while the trajectory still moves towards its target."""
         return self.position != self.target or self.velocity != 0.0
 
     def hold(self, position: float) -> None:
@@ -299,16 +299,16 @@ class ServoHealth:
         self.recover()
 
     def recover(self) -> None:
-        """Cool, and the supply as it should be."""
+        """Cool the motor and restore the supply."""
         self.temperature = reg.AMBIENT
         self.voltage = self._model.supply
 
     def restart(self) -> None:
-        """As after a power-up: what was warm stays warm."""
+        """Restart as after a power-up: what was warm stays warm."""
         self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
-        """SENSE later: the bits of the hardware errors that there are now.
+        """Return, SENSE later, the bits of the hardware errors that there are now.
 
         ``current`` [A] flows; ``pressed``: it is at the configured limit.
         """
