@@ -66,8 +66,8 @@ class Watched:
     def mode(self) -> str:
         return self._daemon.loop.state.mode
 
-    def command(self, name: str, **numbers: float) -> None:
-        self._daemon.loop.command({"command": name, **numbers})
+    def command(self, name: str, **numbers: float) -> dict[str, Any]:
+        return self._daemon.loop.command({"command": name, **numbers})
 
     def grasp(self, force: float) -> None:
         """Arm and start to grasp."""

@@ -164,6 +164,18 @@ class HandClient(Generic[_Done]):
         """Turn the grasped object to ``angle`` [rad] in the hand's frame."""
         return self._carry_out("rotate", angle=angle)
 
+    def hold(self, force: float | None = None, angle: float | None = None) -> _Done:
+        """Send setpoints of a stream, at 50-100 Hz or as seldom as you like.
+
+        ``force`` [N] of each tip, ``angle`` [rad] of the object, or both. A hand that doesn't grip
+        yet grasps first. A turn is bounded by what the grip reaches, and goes at most at
+        ``control.rotate_speed``.
+        """
+        given = {"force": force, "angle": angle}
+        return self._carry_out(
+            "hold", **{key: value for key, value in given.items() if value is not None}
+        )
+
     def release(self) -> _Done:
         """Open."""
         return self._carry_out("release")

@@ -93,6 +93,11 @@ class Grip:
             return 0.0
         return 1.0 + min(speed * self._control.smooth_time / angle, 1.0)
 
+    @property
+    def turning(self) -> bool:
+        """True while the setpoint of the object's angle is on its way."""
+        return self._state.steering and self.angle.value != self.kept_angle
+
     def start(self, felt: float, force: float) -> None:
         """Take over from the approach with ``felt`` N on the tips, and go to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, felt)

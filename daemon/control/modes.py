@@ -35,6 +35,10 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
         {"force": False},
     ),
     "rotate": (GRIPPING, {"angle": True}),  # waits for the grip to hold
+    "hold": (  # setpoints of a stream; leaves a grip in its mode
+        frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING,
+        {"force": False, "angle": False},
+    ),
     "release": (_ON, {}),
     "set": (_ON, {"compliance": True}),
     "stop": (_ANY, {}),

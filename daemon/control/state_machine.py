@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.control.grip import Grip
-from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.control.modes import GRIPPING, Mode
 from softfinger.daemon.control.setpoint import JointSetpoints
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import HOLDING, OTHER, RAMPING, GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
@@ -22,10 +22,19 @@ _GRACE = 1.0  # s after the ramp's end in which a joint that friction holds may 
 _SETTLED_FORCE = 0.03  # share of the force target
 _SETTLED_ANGLE = 0.5 * math.pi / 180.0
 _SETTLED_FOR = 0.2  # s
+_FOLLOWED = 0.25  # share of a stream's force, within which a grip follows it
+_STEADY_FORCE = 0.02  # share, and …
+_STEADY_ANGLE = 2e-3  # … rad, within which setpoints may flicker without counting as new ones
 _TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
 _RAISED = 1.02  # of the force asked for, above which the grip is reported as raised
 _LOST_AFTER = 0.1  # s without contact in a grip
 _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
+
+
+def off_range(angle: float, low: float, high: float) -> str:
+    """Return what was found and expected of an angle [rad], in degrees and radians."""
+    found, least, most = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
+    return f"found {found} ({angle:.4g} rad), expected {least} to {most} ({low:.2f} to {high:.2f})"
 
 
 class Control:
@@ -46,6 +55,9 @@ class Control:
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
         self._joints = JointSetpoints(dt, smooth)
         self._next_angle: float | None = None  # rad to turn to once the grip holds
+        self._streamed = False  # the force is a stream's setpoint
+        self._still = False  # holding, and nothing but loads moves the joints
+        self._still_at = math.nan, math.nan  # force [N] and angle [rad] asked for then
         self._raised = False  # the grip is firmer than was asked for
         self._touching = [False, False]
         self._gripping = False
@@ -89,14 +101,19 @@ class Control:
         self._enter(Mode.MOVING)
 
     def grasp(self, force: float) -> None:
-        """Close until all fingers touch, then a mean tip force of ``force`` [N]."""
+        """Close until all fingers touch, then a mean tip force of ``force`` [N].
+
+        A hand that grips already goes to that force and stays in its mode.
+        """
+        self._streamed = False
         if self._gripping:
             self._grip.retarget(force)
-        else:
-            if self.mode is not Mode.GRASPING:
-                self._hold_here()
-                self._touching = [False, False]
-            self._force = force
+            self._unsettle()
+            return
+        if self.mode is not Mode.GRASPING:
+            self._hold_here()
+            self._touching = [False, False]
+        self._force = force
         self._enter(Mode.GRASPING)
 
     def rotate(self, angle: float) -> None:
@@ -107,6 +124,47 @@ class Control:
         self._grip.steer(self._pose.angle, angle)
         self._turn_ended = False
         self._enter(Mode.ROTATING)
+
+    def hold(self, force: float | None = None, angle: float | None = None) -> float | None:
+        """Take setpoints of a stream: a grip's ``force`` [N], the object's ``angle`` [rad].
+
+        A hand that doesn't grip yet grasps first, with ``force``. The setpoints go there at
+        `control.rotate_speed` and in `control.force_time`, smoothly whatever the stream. Return the
+        angle that is turned to, bounded by what this grip reaches; None where none is known yet.
+        """
+        if force is not None and not (self._gripping and force == self._grip.asked):
+            self.grasp(force)
+            self._streamed = True
+        if angle is None:
+            return None
+        if self.mode is Mode.GRASPING:
+            self._next_angle = angle
+            return None
+        low, high = self._turns()
+        angle = min(max(angle, low), high)
+        self._grip.steer(self._pose.angle, angle)
+        self._turn_ended = False
+        self._unsettle()
+        return angle
+
+    def _unsettle(self) -> None:
+        """What is asked for has changed: the grip is still again once it is there."""
+        force, angle = self._still_at
+        grip = self._grip
+        if self._still and not (
+            abs(grip.asked - force) < _STEADY_FORCE * force
+            and (math.isnan(grip.kept_angle) or abs(grip.kept_angle - angle) < _STEADY_ANGLE)
+        ):
+            self._still = False
+            self._waiting = 0.0
+
+    @property
+    def phase(self) -> int:
+        """The grip's phase, by which perception takes torques for what they tell."""
+        if self._still:
+            return HOLDING
+        turning = self.mode is Mode.ROTATING or self._grip.turning
+        return RAMPING if self.mode in GRIPPING and not turning else OTHER
 
     def set(self, compliance: float) -> None:
         """Set the angle by which the grip gives way to a torque [rad/(N·m)]."""
@@ -119,7 +177,7 @@ class Control:
         low, high = self._turns()
         if low <= angle <= high:
             return ""
-        return f"angle: found {angle:.4g} rad, expected {low:.2f} to {high:.2f} in this grip"
+        return f"angle: {off_range(angle, low, high)} in this grip"
 
     def _turns(self) -> tuple[float, float]:
         """The object's angles [rad] that this grip reaches within the tips' and joints' limits.
@@ -159,6 +217,7 @@ class Control:
             self.events.append(("warning", "rotate", text))
         self._rest_current = self._settings.safety.current_move
         self._waiting = self._lost = self._empty = 0.0
+        self._still = False
         if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
             self._gripping = False
 
@@ -250,7 +309,6 @@ class Control:
         return min(law.approach_current, pressed / law.torque_constant)
 
     def _hold(self, dt: float, goal: Goal) -> None:
-        holding = self.mode is Mode.HOLDING
         for contact in self._touched:
             if not contact.contact:
                 self._lose(dt, goal)
@@ -258,12 +316,12 @@ class Control:
         self._lost = 0.0
         if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
             self._is_empty(dt)
-        self._pull(self._grip.torques(self._reading, self._pose, holding), goal)
+        self._pull(self._grip.torques(self._reading, self._pose, self._still), goal)
         if self._grip.slipped or self._raised or self._grip.given != self._grip.asked:
             self._watch_slip()
-        if self.mode is Mode.ROTATING:
-            self._watch_turning()
-        if self.mode is Mode.GRASPING or self.mode is Mode.ROTATING:
+        if not self._still:
+            if self.mode is not Mode.GRASPING:
+                self._watch_turning()
             self._watch_settling(dt)
 
     def _pull(self, torques: tuple[float, float], goal: Goal) -> None:
@@ -334,11 +392,16 @@ class Control:
     def _watch_settling(self, dt: float) -> None:
         """Pass into holding once the force, or the angle while turning, has stayed at its goal."""
         grip, pose = self._grip, self._pose
-        if self.mode is Mode.ROTATING:
-            settled = abs(pose.angle - grip.kept_angle) < _SETTLED_ANGLE
-        else:
+        settled = self.mode is Mode.GRASPING or not (
+            abs(pose.angle - grip.kept_angle) >= _SETTLED_ANGLE
+        )
+        if self.mode is not Mode.ROTATING:
             # The mean, since what the object rubs on may take some force between the tips.
-            settled = abs(self._felt() - grip.given) < _SETTLED_FORCE * grip.given
+            wanted = grip.given
+            if self._streamed and self.mode is Mode.GRASPING:  # it may never rest
+                wanted = grip.force.value
+                settled = abs(wanted - grip.given) < _FOLLOWED * grip.given
+            settled = settled and abs(self._felt() - wanted) < _SETTLED_FORCE * grip.given
             settled = settled and not grip.shaking
         self._waiting = self._waiting + dt if settled else 0.0
         if self._waiting <= _SETTLED_FOR:
@@ -347,6 +410,8 @@ class Control:
             grip.steer(pose.angle, pose.angle)
         grip.begin_holding()
         self._enter(Mode.HOLDING)
+        self._still = True
+        self._still_at = grip.asked, grip.kept_angle
         if self._next_angle is None:
             return
         angle, self._next_angle = self._next_angle, None  # a turn that waited for the grip

@@ -239,6 +239,8 @@ class Loop:
                 self.emit("warning", "clients", self._server.notices.popleft())
         if self._task is not None:
             self._follow(self._task)
+        else:
+            self._requests.watch_silence()
         state.mode = control.mode
         breach = self._safety.judge(state)
         if breach is not None or self._safety.warnings or self._after_opening is not None:
@@ -249,7 +251,7 @@ class Loop:
             control.step(self.period, state.goal)
         if control.events or self.perception.events or self._reports:
             self._emit_events()
-        state.mode = control.mode
+        state.mode, state.phase = control.mode, control.phase
 
     def _emit_events(self) -> None:
         for events in (self.perception.events, self._control.events):

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
-from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
-from softfinger.daemon.control.state_machine import Control
+from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HELD, UNLEASED, Mode
+from softfinger.daemon.control.state_machine import Control, off_range
 from softfinger.daemon.errors import Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
@@ -74,7 +74,7 @@ class Lease:
     """
 
     def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
+        self.seconds = seconds
         self._owner = ""
         self._until = -math.inf
 
@@ -86,11 +86,18 @@ class Lease:
             owner = self._owner or "an unnamed client"
             raise Refused(f"{command.name}: {owner} commands the hand ({self._until - now:.1f} s)")
 
+    def lapses(self, now: float) -> str:
+        """Return, once, who has been silent for the whole lease; empty where nobody has."""
+        if not -math.inf < self._until <= now:
+            return ""
+        self._until = -math.inf
+        return self._owner or "the commander"
+
     def renew(self, command: Command, now: float) -> None:
         """Take or prolong the lease, once the command has been carried out."""
         if command.name not in UNLEASED:
             self._owner = command.client
-            self._until = now + self._seconds
+            self._until = now + self.seconds
 
 
 class Requests:
@@ -114,13 +121,14 @@ class Requests:
         self._torque = torque
         self._perception = perception
         self._emit = emit
-        self._handlers: dict[str, Callable[..., None]] = {
+        self._handlers: dict[str, Callable[..., float | None]] = {
             "arm": control.arm,
             "disarm": control.disarm,
             "tare": self._tare,
             "move": control.move,
             "grasp": control.grasp,
             "rotate": control.rotate,
+            "hold": control.hold,
             "release": control.release,
             "set": control.set,
             "clear": control.disarm,
@@ -143,27 +151,46 @@ class Requests:
             self._reopen(name)
         if reason := self._against(name, numbers):
             raise Refused(f"{name}: {reason}")
-        queued = name == "rotate" and control.mode is Mode.GRASPING
-        self._handlers[name](**numbers)
+        begins = control.mode not in GRIPPING
+        angle = self._handlers[name](**numbers)
         self._lease.renew(command, state.t)
         reply: dict[str, Any] = {"mode": control.mode.value}
-        if queued:
+        if angle is not None:
+            reply["angle"] = angle
+        if "angle" in numbers and control.mode is Mode.GRASPING:
             reply |= {"queued": name, "until": Mode.HOLDING.value}
-        elif name == "grasp" and (warning := self._envelope.warning(numbers["force"])):
+        grasps = name == "grasp" or (name == "hold" and begins)
+        if grasps and (warning := self._envelope.warning(numbers["force"])):
             reply["warning"] = warning
             self._emit("warning", "grasp", warning)
-        elif name == "disarm":
+        if name == "disarm":
             reply["torque_off"] = self._torque.off()
         elif name == "status":
             reply |= self._status()
         return reply
+
+    def watch_silence(self) -> None:
+        """Release or stop the hand, as the settings say, when its commander has fallen silent."""
+        action, control = self._settings.commands.on_silence, self._control
+        if action == "hold" or not (silent := self._lease.lapses(self._state.t)):
+            return
+        if action == "stop" and control.torque:
+            control.stop()
+            self._torque.off()
+        elif action == "release" and control.mode in GRIPPING | {Mode.MOVING}:
+            control.release()
+        else:
+            return
+        text = f"{silent} has been silent for {self._lease.seconds:g} s: {action}"
+        self._emit("warning", "silence", text)
 
     def _against(self, name: str, numbers: dict[str, float]) -> str:
         """What the state, the scene or the limits have against a command that is heard."""
         state, settings = self._state, self._settings
         if name in ("arm", "clear") and state.torque and not self._control.torque:
             return "the servos have not confirmed torque off yet: check their cable and their power"
-        judged = name in ("arm", "clear", "grasp")
+        begins = name == "hold" and self._control.mode not in GRIPPING
+        judged = name in ("arm", "clear", "grasp") or begins
         if judged and (cause := self._safety.cause(state, gripping=name != "arm")):
             return cause
         if name == "arm":
@@ -178,7 +205,9 @@ class Requests:
                 return "something touches a tip"
         elif name == "move":
             return self._against_move(numbers)
-        elif name == "grasp":
+        elif name == "hold" and not numbers:
+            return "force or angle is missing"
+        if name == "grasp" or begins:
             for perception in self._perception.fingers:
                 if perception.taring:
                     return "tare is still at work"
@@ -186,17 +215,20 @@ class Requests:
                 return "each finger needs a tactile sensor in this scene"
             if settings.servos.mode == "position":
                 return 'nothing bounds the current while servos.mode is "position"'
-            force = numbers.setdefault("force", settings.control.force_default)
+            numbers.setdefault("force", settings.control.force_default)
+        if "force" in numbers:
+            force = numbers["force"]
             low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
             if not low < force <= high:
                 return f"force: found {force:g} N, expected above {low:g} to {high:g}"
-        elif name == "rotate":
+        if "angle" in numbers:
             if len(settings.scene.fingers) < 2 or not settings.scene.object_model:
                 return "needs both fingers and the object model in the scene"
-            now = self._control.mode is not Mode.GRASPING
-            if now and (reason := self._control.why_not_turn(numbers["angle"])):
-                return reason
-        elif name == "set":
+            if self._control.mode in HELD:
+                reason = self._control.why_not_turn(numbers["angle"])
+                if name == "rotate" or not state.object.valid:
+                    return reason
+        if name == "set":
             compliance, (low, high) = numbers["compliance"], _COMPLIANCE
             if not low <= compliance <= high:
                 return f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
@@ -211,7 +243,7 @@ class Requests:
                 return f"this scene has no {name} finger"
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
-                return f"{name}: found {q:g} rad, expected {low:g} to {high:g}"
+                return f"{name}: {off_range(q, low, high)}"
         return ""
 
     def _tare(self) -> None:

@@ -51,7 +51,6 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
-_PHASES = {"grasping": kernels.RAMPING, "holding": kernels.HOLDING}
 _FAR = 0.25  # rad off its goal, a grip's joint takes all the current that it may
 
 
@@ -165,19 +164,17 @@ class ContactFilter:
             )
 
     def write_contacts(
-        self, t: float, contacts: list[Contact], pose: ObjectPose, mode: str = ""
+        self, t: float, contacts: list[Contact], pose: ObjectPose, phase: int = kernels.OTHER
     ) -> None:
         """Write the estimates of time ``t`` into contacts and pose.
 
-        ``mode``: the hand's, by which torques are taken for what they tell.
+        By the ``phase`` of a grip torques are taken for what they tell.
         """
         live = self._live
         pose.valid = live[0] and live[1] and self._with_object
         pose.angle = pose.width = 0.0
         if live[0] or live[1]:
-            left, right, angle, width = kernels.write_grasp(
-                self._state.array, *self._tables, _PHASES.get(mode, kernels.OTHER)
-            )
+            left, right, angle, width = kernels.write_grasp(self._state.array, *self._tables, phase)
             tips = left, right
             if pose.valid:
                 pose.angle, pose.width = angle, width

@@ -61,7 +61,7 @@ class Perception:
                 if each.repeats.long:
                     frame = replace(frame, valid=False)
                 self.filter.correct(each.finger, frame, each.estimate, state.contacts[each.finger])
-        self.filter.write_contacts(state.t, state.contacts, state.object, state.mode)
+        self.filter.write_contacts(state.t, state.contacts, state.object, state.phase)
 
 
 class Repeats:

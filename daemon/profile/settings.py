@@ -233,6 +233,7 @@ class CommandSettings(Section):
 
     address: str = COMMAND_ADDRESS  # tcp or ipc
     lease: Seconds = 2.0  # s a commander keeps the hand after its last command
+    on_silence: Literal["hold", "release", "stop"] = "hold"  # what the hand does then
     max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096  # bytes of a command
     per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is always heard
 

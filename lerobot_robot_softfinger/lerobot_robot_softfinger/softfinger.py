@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
-import math
 from typing import Any
 
 import numpy as np
@@ -13,12 +11,8 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
 from softfinger import Hand
-from softfinger.daemon.client import NoStream, Refused, TactileFrame
+from softfinger.daemon.client import NoStream, TactileFrame
 from softfinger.tools.recordings.features import IMAGES, JOINTS, STATE, image, observation
-
-FINEST = 0.1, 2e-3  # N and rad by which an action differs from the last, or is the same
-
-_log = logging.getLogger(__name__)
 
 
 class Softfinger(Robot):
@@ -71,7 +65,7 @@ class Softfinger(Robot):
         except BaseException:
             hand.close()
             raise
-        self._hand, self._armed, self._asked = hand, False, (math.nan, math.nan)
+        self._hand, self._armed, self._gripping = hand, False, False
 
     def _take(self, frame: TactileFrame) -> None:
         size, expected = (frame.rows, frame.cols), (self.config.rows, self.config.cols)
@@ -126,27 +120,14 @@ class Softfinger(Robot):
         return self._grip(numbers["grip.force"], numbers["grip.angle"])
 
     def _grip(self, force: float, angle: float) -> dict[str, float]:
-        """A command begins its ramp anew: only what differs is sent, a turn once the grip holds."""
-        state = self._hand.state()
-        if state.mode in ("disarmed", "fault"):
-            self._asked = math.nan, math.nan  # asked again, to be refused with the reason
-        asked_force, asked_angle = self._asked
         if force < self.config.least_force:
-            if asked_force != 0.0:
+            if self._gripping:
                 self._hand.release()
-            self._asked = 0.0, math.nan
-        elif not abs(force - asked_force) <= FINEST[0]:
-            if state.mode != "releasing":
-                self._hand.grasp(force)
-                self._asked = force, asked_angle
-        elif state.mode in ("holding", "rotating") and not abs(angle - asked_angle) <= FINEST[1]:
-            try:
-                self._hand.rotate(angle)
-            except Refused as refusal:  # how far it turns depends on the grip
-                _log.warning("%s", refusal)
-            else:
-                self._asked = asked_force, angle
-        force, angle = (0.0 if math.isnan(each) else each for each in self._asked)
+            self._gripping = False
+            return {"grip.force": 0.0, "grip.angle": 0.0}
+        if self._gripping or self._hand.state().mode != "releasing":
+            self._hand.hold(force, angle)
+            self._gripping = True
         return {"grip.force": force, "grip.angle": angle}
 
     @check_if_not_connected

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from softfinger.daemon.control.modes import HELD, Mode
+from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
@@ -30,7 +30,6 @@ FORCE = 6.0  # N, of the grip that is wanted
 REACH = 0.02  # rad that a joint's goal moves in a step at most
 FORCES = 1.0, 12.0  # N, what an action of -1 and of 1 asks the grip for, …
 ANGLE = 0.25  # rad, … and to what angle it turns the object
-FINEST = 0.1, 2e-3  # N and rad by which an action differs from the last, or is the same
 LOST = 0.03  # m off its first place: the object is lost
 _DEEP = 0.004  # m, to which the joints alone press into the object when an episode begins with it
 _PATIENCE = 3.0  # s
@@ -109,7 +108,6 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._task == "rotate":
             goal = float(self.np_random.uniform(-0.2, 0.2))
         self._goal = float((options or {}).get("goal", goal))
-        self._asked = 0.0, math.nan  # force and angle of the last commands
         self._push = 0.0
         self._loop.advance(0.1)
         self._command("arm")
@@ -143,7 +141,6 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         state = self._loop.state
         if self._by_law:
             self._command("grasp", force=FORCE)
-            self._asked = FORCE, math.nan
             self._until(lambda: state.mode == Mode.HOLDING)
             return
         reach, q = self._settings.hand.q_max, list(state.reading.q)
@@ -187,12 +184,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             return
         least, most = FORCES
         force, angle = least + 0.5 * (first + 1.0) * (most - least), ANGLE * second
-        if abs(force - self._asked[0]) > FINEST[0]:  # a command begins its ramp anew
-            self._command("grasp", force=force)
-            self._asked = force, math.nan
-        elif self._loop.state.mode in HELD and not abs(angle - self._asked[1]) <= FINEST[1]:
-            self._command("rotate", angle=angle)
-            self._asked = force, angle
+        self._command("hold", force=force, angle=angle)
 
     def _command(self, name: str, **numbers: float) -> None:
         try:

@@ -13,6 +13,7 @@ import pytest
 from softfinger.daemon.control.setpoint import JointSetpoints
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.perception.contact_filter_kernels import HOLDING
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.watched import Watched
@@ -140,7 +141,7 @@ def test_a_turn_asked_for_while_grasping_waits_for_the_grip() -> None:
     ("angle", "then", "text"),
     [
         (ANGLE, "release", "rotate: dropped, since the grasp ended in releasing"),
-        (1.2, "", "rotate: angle: found 1.2 rad, expected"),
+        (1.2, "", "rotate: angle: found 68.8° (1.2 rad), expected"),
     ],
 )
 def test_a_turn_that_can_not_come_is_told(angle: float, then: str, text: str) -> None:
@@ -349,3 +350,76 @@ def test_the_small_hand_grasps_and_turns() -> None:
         assert np.abs(seen.angle - ANGLE)[-250:].max() < math.radians(0.2)
         assert np.abs(seen.force - 1.0).max() < 0.1
         assert hand.mode == "holding"
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0])
+def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate: float) -> None:
+    with watched({}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        modes, off, forces = [], [], []
+        for k in range(int(6.0 * rate)):
+            t = k / rate
+            force = 10.0 + 3.0 * math.sin(2.0 * math.pi * 0.3 * t)
+            angle = 0.12 * math.sin(2.0 * math.pi * 0.4 * t)
+            hand.command("hold", force=force, angle=angle)
+            seen = hand.watch(1.0 / rate)
+            if t > 2.0:
+                modes.append(hand.mode)
+                off.append(seen.angle[-1] - angle)
+                forces.append(seen.force[-1].mean() / force)
+        assert set(modes) == {"holding"}
+        assert np.abs(off).max() < math.radians(1.5), "the setpoint's smoothing: 0.06 s"
+        assert np.abs(np.array(forces) - 1.0).max() < 0.04 + KNOWN
+        for k in range(int(rate)):  # at rest, but for a flicker
+            hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
+            hand.run(1.0 / rate)
+        assert not [event for event in hand.events if event[0] != "info"]
+        hand.plant.push(0.0, 13.0)
+        hand.watch(0.5)
+        assert hand.mode == "holding"
+        assert hand.plant.force.mean() > 15.0, "a sudden load is answered as ever"
+
+
+def test_setpoints_may_come_alone_and_are_bounded_or_refused() -> None:
+    with watched({}) as hand:
+        grasped(hand, 8.0)
+        with pytest.raises(Refused, match="hold: force or angle is missing"):
+            hand.command("hold")
+        with pytest.raises(Refused, match="hold: force: found 40 N"):
+            hand.command("hold", force=40.0)
+        assert 0.2 < hand.command("hold", angle=3.0)["angle"] < 0.5
+        hand.command("hold", angle=0.05)
+        hand.run(1.0)
+        assert hand.plant.object_pose[2] == pytest.approx(0.05, abs=4e-3)
+        hand.command("grasp", force=12.0)
+        assert hand.mode == "holding"
+        hand.run(1.0)
+        assert hand.plant.force.mean() == pytest.approx(12.0, rel=KNOWN)
+        hand.command("hold", force=6.0)
+        hand.run(3.0)
+        assert hand.plant.force.mean() == pytest.approx(6.0, rel=KNOWN)
+        assert hand.plant.object_pose[2] == pytest.approx(0.05, abs=4e-3)
+        assert hand.mode == "holding"
+        assert hand.control.phase == HOLDING
+
+
+@pytest.mark.parametrize(
+    ("action", "mode"), [("hold", "holding"), ("release", "armed"), ("stop", "disarmed")]
+)
+def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(
+    action: str, mode: str
+) -> None:
+    with watched({"commands": {"lease": 0.5, "on_silence": action}}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        for _ in range(40):
+            hand.command("hold", force=6.0)
+            hand.run(0.05)
+        assert hand.mode == "holding"
+        hand.run(2.0)
+        assert hand.mode == mode
+        told = [text for _, kind, text in hand.events if kind == "silence"]
+        assert told == (
+            [] if action == "hold" else [f"the commander has been silent for 0.5 s: {action}"]
+        )

@@ -86,7 +86,10 @@ def test_move_goes_where_it_is_told_within_the_limits(make: Make) -> None:
     command(daemon, "move", left=-0.2, right=-0.3)
     advance_to(daemon, "armed", 3.0)
     assert daemon.loop.state.reading.q == pytest.approx([-0.2, -0.3], abs=0.04)
-    with pytest.raises(Refused, match=r"move: left: found 5 rad, expected -0\.5 to 1"):
+    with pytest.raises(
+        Refused,
+        match=r"left: found 286\.5° \(5 rad\), expected -28\.6° to 57\.3° \(-0\.50 to 1\.00\)",
+    ):
         command(daemon, "move", left=5.0)
 
 
@@ -291,7 +294,9 @@ def test_the_state_tells_what_the_grip_goes_to(make: Make) -> None:
 
 def test_an_angle_beyond_the_grip_is_refused(make: Make) -> None:
     daemon = grasped(make(), 8.0)
-    with pytest.raises(Refused, match=r"found 0\.6 rad, expected -0\.\d\d to 0\.\d\d in this grip"):
+    with pytest.raises(
+        Refused, match=r"found 34\.4° \(0\.6 rad\), expected .*° to .*° \(-0\.\d\d to 0\.\d\d\) in"
+    ):
         command(daemon, "rotate", angle=0.6)
     found = re.search(r"to (0\.\d+)", refusal(daemon, "rotate", angle=2.0))
     assert found is not None

@@ -23,9 +23,9 @@ _UNITS = {  # that a number may carry, by its key; without one it is SI
     **dict.fromkeys(("angle", "left", "right"), _ANGLES),
 }
 _EPILOG = """\
-commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, move left=RAD right=RAD, release,
-set compliance=RAD/NM, stop, clear, status. Numbers are SI, or carry their unit: force=10N,
-angle=8deg or 8°.
+commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (setpoints of a
+stream), move left=RAD right=RAD, release, set compliance=RAD/NM, stop, clear, status. Numbers are
+SI, or carry their unit: force=10N, angle=8deg or 8°.
 Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was received,
 but the servos have not confirmed torque off yet."""
 
