@@ -47,7 +47,7 @@ class Commands(Protocol):
     def serve(self, handler: Handler) -> None:
         """Carry out through ``handler`` what is due at this tick."""
 
-    def begin_epoch(self) -> None:
+    def raise_fence(self) -> None:
         """Refuse all that has arrived until now, but for a stop."""
 
 
@@ -130,7 +130,7 @@ class Loop:
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         if self._server is not None:
-            self._server.begin_epoch()
+            self._server.raise_fence()
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -167,7 +167,7 @@ class Loop:
                 self.emit(*event)
             self._commanded = False
             if timing.tick_s > _STALL and self._server is not None:
-                self._server.begin_epoch()
+                self._server.raise_fence()
             done = self.tick(clock.now())
             deadline += self.period
             if done > deadline + clock.behind:
@@ -233,7 +233,7 @@ class Loop:
             self.command({"command": "stop"})
         if self._server is not None:
             if stopped:
-                self._server.begin_epoch()
+                self._server.raise_fence()
             self._server.serve(self.command)
             while self._server.notices:
                 self.emit("warning", "clients", self._server.notices.popleft())

@@ -6,6 +6,7 @@ one is refused, wherever it waits (see `gateway.request_queue`), but for a ``sta
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.wire.loop_link import ALWAYS, Link
+from softfinger.daemon.wire.loop_link import Link
 
 if TYPE_CHECKING:  # the gateway has no use for it
     from softfinger.daemon.wire.local_stop import LocalStop
@@ -23,7 +24,7 @@ Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
 PASSED = "came while the daemon stood still or was starting, or before a stop; send it again"
 
-_BEGUN_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
+_PAST_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
 _A_TICK = 2  # commands carried out at one, a stop not counted
 _VALUES = (str, int, float)  # and bool, which is an int
 
@@ -61,28 +62,28 @@ class CommandServer:
         while link.stops:
             stop = link.stops.popleft()
             reply = _carry_out(msgpack.unpackb(stop.packed), handler)
-            link.begin_epoch()  # before the answer, after which its client may go on
+            link.raise_fence()  # before the answer, after which its client may go on
             link.reply(stop.number, reply)
         for _ in range(_A_TICK):
-            while link.asked and link.asked[0].epoch not in (link.epoch, ALWAYS):
+            while link.asked and link.asked[0].came < link.past:
                 link.reply(link.asked.popleft().number, _refusal(PASSED))
             if not link.asked:
                 return
             ask = link.asked.popleft()
             link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
 
-    def begin_epoch(self) -> None:
+    def raise_fence(self) -> None:
         """What has arrived until now is refused: a stop, or the loop could not act."""
-        self._link.begin_epoch()
+        self._link.raise_fence()
 
     def _serve_local(self, local: LocalStop, handler: Handler) -> None:
         self._link.called = False
         if local.take():
             self._stopped = _carry_out({"command": "stop"}, handler)
-            self._link.begin_epoch()
-            self._answer_by = time.monotonic() + _BEGUN_WITHIN
+            self._link.raise_fence()
+            self._answer_by = time.monotonic() + _PAST_WITHIN
         if self._stopped is not None and (
-            self._link.begun == self._link.epoch or time.monotonic() > self._answer_by
+            self._link.past < math.inf or time.monotonic() > self._answer_by
         ):
             local.answer(self._stopped)
             self._stopped = None

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from softfinger.daemon.gateway.__main__ import open_server
 from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.command_server import CommandServer, Handler
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
+from tests.conftest import until
 
 
 class Served:
@@ -28,7 +30,6 @@ class Served:
         per_second: float = 1e6,
         ipc_mode: int = 0o600,
         keys: str = "",
-        places: int = 256,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.link = loop_link.Link()
@@ -37,7 +38,7 @@ class Served:
             stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
         )
         try:
-            self.service = open_server(theirs, config, places, now)
+            self.service = Server(theirs, config, now)
         except BaseException:
             ours.close()
             theirs.close()
@@ -45,7 +46,7 @@ class Served:
         self.link.offer(ours)
         self.publisher = Publisher(self.link)
         self.server = CommandServer(self.link)
-        self.settle()
+        until(lambda: [self.settle(), not commands or self.link.past < math.inf][1])
 
     def settle(self, times: int = 3) -> None:
         """Let the link carry what is on the way."""

@@ -40,7 +40,7 @@ class Script:
             except Refused:
                 self.refused += 1
 
-    def begin_epoch(self) -> None:
+    def raise_fence(self) -> None:
         pass
 
 

@@ -23,7 +23,6 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.command_server import decode
-from softfinger.daemon.wire.sockets import Listener
 from tests.conftest import until
 from tests.harness.gateway import Served
 
@@ -95,7 +94,7 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
 
 
 @pytest.mark.parametrize("under_way", [1, 4])  # the second request waits in the queue, or the link
-def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
+def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
     context: zmq.Context[Any],
     addresses: tuple[str, str],
     monkeypatch: pytest.MonkeyPatch,
@@ -112,7 +111,7 @@ def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
         asking.send(msgpack.packb({"command": "status"}))
         queue = served.service.requests
         until(lambda: [served.settle(1), len(served.link.asked) + queue._count == 2][1])
-        served.server.begin_epoch()
+        served.server.raise_fence()
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert "before a stop; send it again" in msgpack.unpackb(early.recv())["error"]
         until(lambda: [served.serve(echo), asking.poll(0)][1])
@@ -225,7 +224,7 @@ def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
         kind: list[dict[str, Any]] = []
 
         def all_answered() -> bool:
-            clock.sleep_until(clock.now() + 1e-3)  # one that floods is not read for a while
+            clock.sleep_until(clock.now() + 1e-3)
             served.serve(echo)
             flood.collect(replies)
             return served.server.refused_by_pace == 40 and quiet.collect(kind) == 3
@@ -255,7 +254,7 @@ def test_a_client_that_asks_again_and_again_is_answered_each_time(
         client.connect(addresses[1])
         told = []
         for k in range(12):
-            clock.sleep_until(0.06 * k)  # a refused one is not read for a while
+            clock.sleep_until(0.06 * k)
             client.send(msgpack.packb({"command": "status"}))
             until(lambda: [served.serve(echo), client.poll(0)][1])
             told.append(msgpack.unpackb(client.recv())["ok"])
@@ -289,7 +288,7 @@ def test_many_clients_that_ask_once_each_are_all_answered(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     context.set(zmq.MAX_SOCKETS, 2000)
-    with Served(commands=addresses[1], places=1000, now=VirtualClock().now) as served:
+    with Served(commands=addresses[1], now=VirtualClock().now) as served:
         flood = Flood(context, addresses[1], clients=600, each=1)
         replies: list[dict[str, Any]] = []
         until(lambda: [served.serve(echo), flood.collect(replies) >= 600][1])
@@ -312,7 +311,7 @@ def test_a_link_in_the_place_of_an_ipc_files_lock_is_not_followed(tmp_path: Path
     target = tmp_path / "target"
     (tmp_path / "c.lock").symlink_to(target)
     with pytest.raises(AddressError, match="symbolic links"):
-        Listener(f"ipc://{tmp_path}/c", "commands.address", 0o600)
+        Served(commands=f"ipc://{tmp_path}/c")
     assert not target.exists()
 
 
