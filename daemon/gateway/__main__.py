@@ -39,7 +39,7 @@ def main(words: list[str]) -> int:
 def _serve(end: socket.socket, config: Config) -> int:
     try:
         _be_bounded()
-        server = Server(end, config)
+        server = Server(end, config, longest_pause=bounds.PAUSE)
     except (AddressError, KeyFileError) as error:
         end.send(loop_link.FAILED + str(error).encode()[: loop_link.LARGEST // 2])
         return 1

@@ -17,6 +17,7 @@ DESCRIPTORS = 64  # that are not clients'
 CLIENTS = 256  # connections, of commands and stream together
 STALLED = 3.0  # s of processor time within one step after which the process is ended, …
 BLOCKED = 30.0  # … and of any time; a machine that is busy or stops it takes only such time
+PAUSE = 0.2  # s in which it read no requests, after which those that have come are too old
 
 # A connection
 HANDSHAKE = 2.0  # s in which a client has to have finished its handshake

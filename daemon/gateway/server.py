@@ -19,6 +19,7 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.endpoints import CommandEndpoint, StreamEndpoint
 from softfinger.daemon.gateway.request_queue import RequestQueue, Route
 from softfinger.daemon.wire import loop_link
+from softfinger.daemon.wire.command_server import Pauses
 from softfinger.daemon.wire.loop_link import Topics
 
 
@@ -56,13 +57,20 @@ class Server:
     """Serves clients until the loop hangs up: call `step` again and again."""
 
     def __init__(
-        self, end: socket.socket, config: Config, clock: Callable[[], float] = time.monotonic
+        self,
+        end: socket.socket,
+        config: Config,
+        clock: Callable[[], float] = time.monotonic,
+        longest_pause: float = math.inf,
     ) -> None:
         """Bind what ``config`` names; ``end`` is this end of the link.
+
+        After more than ``longest_pause`` [s] between two steps, what came meanwhile is refused.
 
         Raises AddressError, and KeyFileError where there are keys.
         """
         self._clock = clock
+        self._pauses = Pauses(longest_pause)
         self._end = end
         self.requests = RequestQueue(
             config.max_bytes, config.per_second, self._forward, self._answer
@@ -104,6 +112,8 @@ class Server:
             self._stream.read(now)
             wanted = self._stream.wanted
         if self._commands is not None:
+            if self._pauses.look():
+                self._commands.raise_fence()
             self._commands.read()
             self.requests.pump(self._clock())
             self._tell_past(self._commands.past)

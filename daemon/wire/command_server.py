@@ -29,12 +29,35 @@ _A_TICK = 2  # commands carried out at one, a stop not counted
 _VALUES = (str, int, float)  # and bool, which is an int
 
 
+class Pauses:
+    """Notices a standstill: a process that was stopped or starved, a machine that slept."""
+
+    def __init__(self, longest: float) -> None:
+        """``longest`` [s] between two looks is no pause."""
+        self._longest = longest
+        self._looked = -math.inf
+
+    def look(self) -> bool:
+        """Whether there was one since the last look, or this is the first."""
+        now = time.clock_gettime(time.CLOCK_BOOTTIME)  # goes on while the machine sleeps
+        paused = now - self._looked > self._longest
+        self._looked = now
+        return paused
+
+
 class CommandServer:
     """Answers requests that come over a link, and a stop that comes past it."""
 
-    def __init__(self, link: Link, local: LocalStop | None = None) -> None:
+    def __init__(
+        self, link: Link, local: LocalStop | None = None, longest_pause: float = math.inf
+    ) -> None:
+        """``longest_pause`` [s] between two calls of `serve` leaves what waits to be carried out.
+
+        After a longer one it is refused: nobody who sent it knows any more what it would do.
+        """
         self._link = link
         self._local = local
+        self._pauses = Pauses(longest_pause)
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
@@ -56,6 +79,7 @@ class CommandServer:
         It raises Refused with the reason.
         """
         link = self._link
+        self._notice_pause()
         link.look()
         if self._local is not None and (link.called or self._stopped is not None):
             self._serve_local(self._local, handler)
@@ -65,6 +89,7 @@ class CommandServer:
             link.raise_fence()  # before the answer, after which its client may go on
             link.reply(stop.number, reply)
         for _ in range(_A_TICK):
+            self._notice_pause()  # it may have been since the link was looked at
             while link.asked and link.asked[0].came < link.past:
                 link.reply(link.asked.popleft().number, _refusal(PASSED))
             if not link.asked:
@@ -72,9 +97,22 @@ class CommandServer:
             ask = link.asked.popleft()
             link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
 
-    def raise_fence(self) -> None:
-        """What has arrived until now is refused: a stop, or the loop could not act."""
+    def start(self) -> None:
+        """Refuse what has arrived until now, and be ready for what comes: waits, not for a tick."""
+        self._pauses.look()
+        self._link.look()
         self._link.raise_fence()
+        ready_by = time.monotonic() + _PAST_WITHIN
+        while self._link.past == math.inf and time.monotonic() < ready_by:
+            self._link.wait(_PAST_WITHIN)
+
+    def raise_fence(self) -> None:
+        """Refuse what has arrived until now, but for a stop."""
+        self._link.raise_fence()
+
+    def _notice_pause(self) -> None:
+        if self._pauses.look():
+            self._link.raise_fence()
 
     def _serve_local(self, local: LocalStop, handler: Handler) -> None:
         self._link.called = False

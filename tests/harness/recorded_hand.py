@@ -40,6 +40,9 @@ class Script:
             except Refused:
                 self.refused += 1
 
+    def start(self) -> None:
+        pass
+
     def raise_fence(self) -> None:
         pass
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 from collections.abc import Iterator
@@ -22,7 +23,8 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import decode
+from softfinger.daemon.wire import command_server
+from softfinger.daemon.wire.command_server import CommandServer, Pauses, decode
 from tests.conftest import until
 from tests.harness.gateway import Served
 
@@ -119,6 +121,58 @@ def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
         early.send(msgpack.packb({"command": "arm"}))
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert msgpack.unpackb(early.recv()) == {"ok": True, "heard": "arm"}
+
+
+@pytest.mark.parametrize("who", ["loop", "loop, between two commands", "gateway"])
+def test_what_came_before_the_end_of_a_pause_is_refused(
+    context: zmq.Context[Any],
+    addresses: tuple[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    who: str,
+) -> None:
+    clock = VirtualClock()
+    monkeypatch.setattr(command_server.time, "clock_gettime", lambda _: clock.now())
+    with Served(commands=addresses[1]) as served:
+        if who == "gateway":
+            served.service._pauses = Pauses(0.2)
+        else:
+            served.server = CommandServer(served.link, None, 0.2)
+        until(lambda: served.serve(echo) or served.link.past < math.inf)
+
+        def ask(name: str) -> zmq.Socket[Any]:
+            client = context.socket(zmq.REQ)
+            client.connect(addresses[1])
+            client.send(msgpack.packb({"command": name}))
+            return client
+
+        def told(client: zmq.Socket[Any]) -> Any:
+            until(lambda: [served.serve(echo), client.poll(0)][1])
+            return msgpack.unpackb(client.recv())
+
+        def pausing(request: dict[str, Any]) -> dict[str, Any]:
+            clock.sleep_until(clock.now() + 0.3)
+            return echo(request)
+
+        early = [ask("move"), ask("arm")]
+        until(
+            lambda: [served.service.step(0.0), served.link.look(), len(served.link.asked) == 2][2]
+        )
+        if who == "loop, between two commands":
+            served.serve(pausing)
+            assert [told(client)["ok"] for client in early] in ([True, False], [False, True])
+        else:
+            clock.sleep_until(clock.now() + 0.19)
+            if who == "gateway":
+                served.service.step(0.0)
+            served.server.serve(echo)
+            assert told(early[0])["ok"]
+            assert told(early[1])["ok"]
+            late = ask("arm")
+            if who == "loop":
+                until(lambda: [served.service.step(0.0), served.link.look(), served.link.asked][2])
+            clock.sleep_until(clock.now() + 0.3)
+            assert "stood still" in told(late)["error"]
+        assert told(ask("arm"))["ok"]
 
 
 def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
