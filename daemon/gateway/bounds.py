@@ -30,8 +30,8 @@ TELL_AGAIN = 0.1  # s between two times at which late subscribers are told what 
 KEYS_CHECKED = 0.5  # s between looks at the folder of keys
 
 # A stop, or another fence
-PURGE = 0.02  # s after it in which all requests but a status are refused, …
-LONGEST_PURGE = 0.25  # … and while there are any
+PURGE = 0.02  # s after it in which all requests but a status are refused, and on while they flood
+LONGEST_HELD = 0.25  # s that the stop's answer waits for that
 
 # Requests
 UNDER_WAY = 4  # that the loop has and hasn't answered; a stop goes beside them

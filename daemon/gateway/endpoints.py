@@ -1,7 +1,8 @@
 """The two addresses where clients come in: a ROUTER for commands, an XPUB for the stream.
 
-libzmq's own thread reads ahead of us, so what arrived before a stop is known by time alone: for a
-moment after it all requests are refused, and its own answer waits as long.
+libzmq's own thread reads ahead of us, so what arrived before a stop is known by time alone. After
+it all requests are refused for a moment, and on while they come thicker than clients may send them,
+as those do that have waited. The stop's own answer waits as long, within a bound.
 """
 
 from __future__ import annotations
@@ -85,8 +86,9 @@ class CommandEndpoint(Endpoint):
         self._requests = requests
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
         self.past = -math.inf
-        self._raised_at = 0.0
         self._empty = True  # at the last look
+        self._since = 0.0  # a fence was raised, or last looked at; since then …
+        self._came = 0  # … so many requests came that change something
         self._replies: list[list[bytes]] = []  # held back since …
         self._held_since = 0.0
         limit = bounds.FRAMES * config.max_bytes
@@ -95,18 +97,19 @@ class CommandEndpoint(Endpoint):
     def raise_fence(self) -> None:
         """Refuse what has arrived until now: it takes a moment to read that."""
         self.past = self._requests.past = math.inf
-        self._raised_at = self._clock()
+        self._since = self._clock()
+        self._came = 0
 
     def read(self) -> None:
         """Take in requests, for as long as others may wait."""
         began = self._clock()
-        if self.past == math.inf:
-            reading = began - self._raised_at
-            if reading > bounds.PURGE and (self._empty or reading > bounds.LONGEST_PURGE):
+        if self.past == math.inf and began - self._since > bounds.PURGE:
+            if self._empty and self._came <= bounds.ALL_RATE * bounds.PURGE:
                 self.past = self._requests.past = began
-                self._answer_held()
-            elif self._replies and began - self._held_since > bounds.LONGEST_PURGE:
-                self._answer_held()  # others stop without pause: what comes next is refused, too
+            self._since = began
+            self._came = 0
+        if self.past < math.inf or began - self._held_since > bounds.LONGEST_HELD:
+            self._answer_held()
         self._empty = False
         while (now := self._clock()) < began + bounds.TURN:
             parts = self._parts()
@@ -114,6 +117,7 @@ class CommandEndpoint(Endpoint):
                 self._empty = True
                 return
             *route, payload = (part.bytes for part in parts)
+            self._came += b"status" not in payload
             if len(route) < _PARTS:
                 client = self._client(route[0], self._admission.name(parts[-1]), now)
                 self._requests.take(client, route, payload, now)

@@ -36,12 +36,13 @@ class Scene:
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
+        self.reading = 0.4 * bounds.TURN  # s that a message takes: few at a look
         self.now = 0
         self.stopped_at = 0
 
     def read(self) -> list[zmq.Frame] | None:
         """In the place of libzmq's socket."""
-        self.pass_time(0.4 * bounds.TURN)
+        self.pass_time(self.reading)
         return self.arrived.popleft() if self.arrived else None
 
     def send(self, message: list[bytes]) -> None:
@@ -99,3 +100,33 @@ def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[s
                 scene.act("gateway")
                 scene.act("loop")
             assert scene.replies[asked:] == [{"ok": True}]
+
+
+def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop() -> None:
+    """Nothing waits at times, and still most of what arrived before is to come."""
+    with TemporaryDirectory() as folder:
+        scene = Scene(folder)
+        with (
+            patch.object(CommandEndpoint, "_parts", scene.read),
+            patch.object(CommandEndpoint, "_send", scene.send),
+            scene.served,
+        ):
+            scene.reading = 1e-5
+            scene.stopped_at = 2
+            scene.served.server.raise_fence()
+            for _ in range(500):
+                for client in range(20):
+                    scene.ask(client, command="arm", force=1.0)
+                while scene.arrived:
+                    scene.act("gateway")
+                scene.act("loop")
+            for _ in range(3):
+                scene.act("time")
+                scene.act("gateway")
+                scene.act("loop")
+            assert [reply["ok"] for reply in scene.replies] == [False] * 10_000
+            scene.ask(0, command="arm", force=1e9)
+            for _ in range(3):
+                scene.act("gateway")
+                scene.act("loop")
+            assert scene.replies[-1]["ok"]
