@@ -21,6 +21,7 @@ from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.wire import loop_link
 
 _STEPS = 0.5  # s between two words that it lives
+_TURN = 5e-4  # s that the authenticator waits for the interpreter while requests flood
 
 
 def main(words: list[str]) -> int:
@@ -43,6 +44,7 @@ def _serve(end: socket.socket, config: Config) -> int:
     except (AddressError, KeyFileError) as error:
         end.send(loop_link.FAILED + str(error).encode()[: loop_link.LARGEST // 2])
         return 1
+    sys.setswitchinterval(_TURN)
     end.send(loop_link.READY)
     lived = 0.0
     try:

@@ -25,6 +25,7 @@ Handler = Callable[[dict[str, Any]], dict[str, Any]]
 PASSED = "came while the daemon stood still or was starting, or before a stop; send it again"
 
 _PAST_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
+_ARMING = 0.2  # s that torque on may take in the rest of a tick
 _A_TICK = 2  # commands carried out at one, a stop not counted
 _VALUES = (str, int, float)  # and bool, which is an int
 
@@ -37,10 +38,13 @@ class Pauses:
         self._longest = longest
         self._looked = -math.inf
 
-    def look(self) -> bool:
-        """Whether there was one since the last look, or this is the first."""
+    def look(self, own_work: float = 0.0) -> bool:
+        """Whether there was one since the last look, or this is the first.
+
+        ``own_work`` [s] may have been spent at work meanwhile.
+        """
         now = time.clock_gettime(time.CLOCK_BOOTTIME)  # goes on while the machine sleeps
-        paused = now - self._looked > self._longest
+        paused = now - self._looked > self._longest + own_work
         self._looked = now
         return paused
 
@@ -58,6 +62,7 @@ class CommandServer:
         self._link = link
         self._local = local
         self._pauses = Pauses(longest_pause)
+        self._worked = False  # at the last tick
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
@@ -79,7 +84,8 @@ class CommandServer:
         It raises Refused with the reason.
         """
         link = self._link
-        self._notice_pause()
+        self._notice_pause(_ARMING if self._worked else 0.0)
+        self._worked = False
         link.look()
         if self._local is not None and (link.called or self._stopped is not None):
             self._serve_local(self._local, handler)
@@ -95,7 +101,10 @@ class CommandServer:
             if not link.asked:
                 return
             ask = link.asked.popleft()
-            link.reply(ask.number, _carry_out(msgpack.unpackb(ask.packed), handler))
+            reply = _carry_out(msgpack.unpackb(ask.packed), handler)
+            self._pauses.look()  # to reconnect the servos may take long, and is no pause
+            self._worked = True
+            link.reply(ask.number, reply)
 
     def start(self) -> None:
         """Refuse what has arrived until now, and be ready for what comes: waits, not for a tick."""
@@ -110,8 +119,8 @@ class CommandServer:
         """Refuse what has arrived until now, but for a stop."""
         self._link.raise_fence()
 
-    def _notice_pause(self) -> None:
-        if self._pauses.look():
+    def _notice_pause(self, own_work: float = 0.0) -> None:
+        if self._pauses.look(own_work):
             self._link.raise_fence()
 
     def _serve_local(self, local: LocalStop, handler: Handler) -> None:

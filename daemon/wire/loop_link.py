@@ -26,7 +26,7 @@ FIRST, LAST, KEEP = 1, 2, 4  # place of the piece; KEEP: sent again, after a res
 # From the gateway.
 READY = b"U"  # nothing: the sockets are bound
 FAILED = b"!"  # why they are not
-PAST = b"B"  # number of a fence, time from when on what comes came after it
+PAST = b"T"  # number of a fence, time from when on what comes came after it
 WANTED = b"W"  # topics that somebody subscribes to as bits, refused requests
 ASK = b"C"  # when it came, number, request
 NOTICE = b"N"  # a warning

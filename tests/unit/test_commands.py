@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import select
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,57 +124,89 @@ def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
         assert msgpack.unpackb(early.recv()) == {"ok": True, "heard": "arm"}
 
 
-@pytest.mark.parametrize("who", ["loop", "loop, between two commands", "gateway"])
+@pytest.fixture
+def standing(monkeypatch: pytest.MonkeyPatch) -> VirtualClock:
+    """The clock by which standstills are noticed."""
+    clock = VirtualClock()
+    monkeypatch.setattr(command_server.time, "clock_gettime", lambda _: clock.now())
+    return clock
+
+
+class Asking:
+    """A client with one request, which a served gateway and loop are to answer."""
+
+    def __init__(self, context: zmq.Context[Any], served: Served, address: str, name: str) -> None:
+        self._served = served
+        self._socket = context.socket(zmq.REQ)
+        self._socket.connect(address)
+        self._socket.send(msgpack.packb({"command": name}))
+
+    def told(self) -> dict[str, Any]:
+        until(lambda: [self._served.serve(echo), self._socket.poll(0)][1])
+        reply: dict[str, Any] = msgpack.unpackb(self._socket.recv())
+        return reply
+
+
+@pytest.mark.parametrize("where", ["tick", "look", "gateway"])
 def test_what_came_before_the_end_of_a_pause_is_refused(
     context: zmq.Context[Any],
     addresses: tuple[str, str],
+    standing: VirtualClock,
+    where: str,
     monkeypatch: pytest.MonkeyPatch,
-    who: str,
 ) -> None:
-    clock = VirtualClock()
-    monkeypatch.setattr(command_server.time, "clock_gettime", lambda _: clock.now())
     with Served(commands=addresses[1]) as served:
-        if who == "gateway":
+        door = served.service._commands
+        if where == "gateway":
             served.service._pauses = Pauses(0.2)
         else:
             served.server = CommandServer(served.link, None, 0.2)
-        door = served.service._commands
         until(lambda: served.serve(echo) or max(served.link.past, door.past) < math.inf)
-
-        def ask(name: str) -> zmq.Socket[Any]:
-            client = context.socket(zmq.REQ)
-            client.connect(addresses[1])
-            client.send(msgpack.packb({"command": name}))
-            return client
-
-        def told(client: zmq.Socket[Any]) -> Any:
-            until(lambda: [served.serve(echo), client.poll(0)][1])
-            return msgpack.unpackb(client.recv())
-
-        def pausing(request: dict[str, Any]) -> dict[str, Any]:
-            clock.sleep_until(clock.now() + 0.3)
-            return echo(request)
-
-        early = [ask("move"), ask("arm")]
-        until(
-            lambda: [served.service.step(0.0), served.link.look(), len(served.link.asked) == 2][2]
-        )
-        if who == "loop, between two commands":
-            served.serve(pausing)
-            assert [told(client)["ok"] for client in early] in ([True, False], [False, True])
+        early, late = (Asking(context, served, addresses[1], "arm") for _ in range(2))
+        standing.sleep_until(0.19)
+        assert early.told()["ok"]
+        assert late.told()["ok"]
+        served.serve(echo)  # nothing is carried out: no work at this tick
+        late = Asking(context, served, addresses[1], "arm")
+        if where != "gateway":
+            until(
+                lambda: [
+                    served.service.step(0.0),
+                    select.select([served.link._socket], [], [], 0)[0],
+                ][1]
+            )
+        look = served.link.look
+        if where == "look":
+            with monkeypatch.context() as patch:
+                patch.setattr(served.link, "look", lambda: look() or standing.sleep_until(0.5))
+                served.server.serve(echo)
         else:
-            clock.sleep_until(clock.now() + 0.19)
-            if who == "gateway":
-                served.service.step(0.0)
-            served.server.serve(echo)
-            assert told(early[0])["ok"]
-            assert told(early[1])["ok"]
-            late = ask("arm")
-            if who == "loop":
-                until(lambda: [served.service.step(0.0), served.link.look(), served.link.asked][2])
-            clock.sleep_until(clock.now() + 0.3)
-            assert "stood still" in told(late)["error"]
-        assert told(ask("arm"))["ok"]
+            standing.sleep_until(0.5)
+        assert "stood still" in late.told()["error"]
+        assert Asking(context, served, addresses[1], "arm").told()["ok"]
+
+
+def test_the_time_that_a_command_itself_takes_is_no_pause(
+    context: zmq.Context[Any], addresses: tuple[str, str], standing: VirtualClock
+) -> None:
+    def long(request: dict[str, Any]) -> dict[str, Any]:
+        standing.sleep_until(standing.now() + 5.0)
+        return echo(request)
+
+    with Served(commands=addresses[1]) as served:
+        served.server = CommandServer(served.link, None, 0.1)
+        until(lambda: served.serve(echo) or served.link.past < math.inf)
+        clear = Asking(context, served, addresses[1], "clear")
+        until(lambda: served.serve(long) or standing.now() > 4.0)
+        arm = Asking(context, served, addresses[1], "arm")
+        until(
+            lambda: [served.service.step(0.0), select.select([served.link._socket], [], [], 0)[0]][
+                1
+            ]
+        )
+        standing.sleep_until(standing.now() + 0.25)  # torque goes on in the rest of the tick
+        assert arm.told()["ok"]
+        assert clear.told()["ok"]
 
 
 def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
