@@ -11,18 +11,17 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway import bounds
+from softfinger.daemon.gateway.admission import StartAnew
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.endpoints import CommandEndpoint, StartAnew, StreamEndpoint
 from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.wire import loop_link
-from softfinger.daemon.wire.sockets import Listener
 
 _STEPS = 0.5  # s between two words that it lives
+_TURN = 5e-4  # s that the authenticator waits for the interpreter while requests flood
 
 
 def main(words: list[str]) -> int:
@@ -40,17 +39,20 @@ def main(words: list[str]) -> int:
 
 def _serve(end: socket.socket, config: Config) -> int:
     try:
-        server = open_server(end, config, _be_bounded(config))
+        _be_bounded()
+        server = Server(end, config, longest_pause=bounds.PAUSE)
     except (AddressError, KeyFileError) as error:
         end.send(loop_link.FAILED + str(error).encode()[: loop_link.LARGEST // 2])
         return 1
+    sys.setswitchinterval(_TURN)
     end.send(loop_link.READY)
     lived = 0.0
     try:
         while not server.over:
             server.step()
-            if server.now - lived > _STEPS:
-                lived = server.now
+            now = time.monotonic()
+            if now - lived > _STEPS:
+                lived = now
                 # Neither SIGPROF nor SIGALRM is handled: each ends it.
                 signal.setitimer(signal.ITIMER_PROF, bounds.STALLED)
                 signal.setitimer(signal.ITIMER_REAL, bounds.BLOCKED)
@@ -63,48 +65,11 @@ def _serve(end: socket.socket, config: Config) -> int:
     return 0
 
 
-def open_server(
-    end: socket.socket,
-    config: Config,
-    places: int,
-    clock: Callable[[], float] = time.monotonic,
-) -> Server:
-    """Bind what ``config`` names, for ``places`` clients.
-
-    Raises AddressError, and KeyFileError where there are keys.
-    """
-    server = Server(end, config, clock)
-    if config.keys:
-        from softfinger.daemon.gateway.keyed import open_endpoints  # which alone needs libzmq
-
-        open_endpoints(server, config)
-        return server
-    poller, requests, late = server.poller, server.requests, server.repeated.late
-    if config.stream:
-        listener = Listener(config.stream, config.stream_key, config.ipc_mode)
-        quarter = places // 4
-        server.add(StreamEndpoint(listener, poller, quarter, config.queue, config.topics, late))
-    if config.commands:
-        listener = Listener(config.commands, "commands.address", config.ipc_mode)
-        limit = bounds.FRAMES * config.max_bytes
-        server.add(CommandEndpoint(listener, poller, limit, places, requests))
-    return server
-
-
-def _be_bounded(config: Config) -> int:
-    """Bound memory, be the first to go when the system has none, and be no real-time process.
-
-    Returns how many clients there is room for.
-    """
+def _be_bounded() -> None:
+    """Bound memory, be the first to go when the system has none, and be no real-time process."""
     resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY, bounds.MEMORY))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    clients = bounds.CLIENTS + bounds.CLIENTS // 4
-    if config.keys:
-        clients = min(
-            bounds.KEYED_MEMORY // (bounds.KEYED_CONNECTION + bounds.KEYED_WAITING * config.queue),
-            bounds.KEYED_CLIENTS,
-        )
-    wanted = clients + bounds.DESCRIPTORS
+    wanted = bounds.CLIENTS + bounds.DESCRIPTORS
     if most != resource.RLIM_INFINITY:
         wanted = min(wanted, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
@@ -113,7 +78,6 @@ def _be_bounded(config: Config) -> int:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     except OSError:
         pass  # not worth doing without the hand
-    return (wanted - bounds.DESCRIPTORS) * 4 // 5
 
 
 if __name__ == "__main__":

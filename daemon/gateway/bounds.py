@@ -14,34 +14,24 @@ from softfinger.daemon.wire.loop_link import Topics
 # The process
 MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
 DESCRIPTORS = 64  # that are not clients'
-CLIENTS = 1024  # of the commands; a quarter as many of the stream
+CLIENTS = 256  # connections, of commands and stream together
 STALLED = 3.0  # s of processor time within one step after which the process is ended, …
 BLOCKED = 30.0  # … and of any time; a machine that is busy or stops it takes only such time
+PAUSE = 0.2  # s in which it read no requests, after which those that have come are too old
 
-# A connection without keys
+# A connection
 HANDSHAKE = 2.0  # s in which a client has to have finished its handshake
-ACCEPTED = 32  # connections taken at a time
-READ = 512  # bytes of one client at a time
-FRAMES = 4  # times commands.max_bytes, in one frame
+QUEUE = 64  # requests, answers or subscriptions of one client that wait in its socket
+FRAMES = 4  # times commands.max_bytes, in one part of a message
 PARTS = 2  # of a request: REQ's empty one and the request
-CONTROLS = 64.0  # subscriptions, pings and the like of a client at once, …
-CONTROL_RATE = 10.0  # … and a second
-SUBSCRIPTION = 64  # bytes of one
-REPLIES = 256 * 1024  # bytes of replies that a client leaves unread
-BACKLOG = 32 << 20  # bytes that wait for all subscribers, before the slowest is disconnected
-REST = 0.05  # s in which a client that floods is not read, …
-REST_EACH = 5e-4  # … longer by this for each other one
-
-# Connections with keys, which libzmq holds; it ends when it is out of memory
-KEYED_CLIENTS = 256
-KEYED_MEMORY = 48 << 20  # bytes for …
-KEYED_CONNECTION = 100_000  # bytes of each, and for each message that waits for it …
-KEYED_WAITING = 128  # … two of libzmq's records
-KEYED_QUEUE = 64  # requests of one client in its socket
-KEYED_SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
-PURGE = 0.02  # s after a stop in which all requests but a status are refused, …
-LONGEST_PURGE = 0.25  # … and while there are any
+SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
+SUBSCRIPTIONS = 64  # read at a time
+TELL_AGAIN = 0.1  # s between two times at which late subscribers are told what they missed
 KEYS_CHECKED = 0.5  # s between looks at the folder of keys
+
+# A stop, or another fence
+PURGE = 0.02  # s after it in which all requests but a status are refused, and on while they flood
+LONGEST_HELD = 0.25  # s that the stop's answer waits for that
 
 # Requests
 UNDER_WAY = 4  # that the loop has and hasn't answered; a stop goes beside them
@@ -52,11 +42,11 @@ LEAST_RATE = 2.0  # … but each may send so many
 OLDEST = 1.0  # s after which one that waits is too old to act upon
 LATE = 2.0  # s after which others need not wait for an answer of the loop, …
 LATE_ANSWERS = 64  # … of which the newest are still handed on when they come
-REFUSALS = 1  # that are answered at one read from a client that floods
+REST = 0.05  # s without a request after which a client that sent too many is heard again
 
 # Turns
 TEND = 0.01  # s between looks at what is due by the time
-TURN = 0.004  # s of publishing, of serving clients or of reading requests with keys, before others
+TURN = 0.004  # s of publishing or of reading requests, before others
 FROM_LOOP = 64  # packets of the loop taken at a time
 UNSENT = 1000  # of them that wait to be sent; the oldest are dropped
 LARGEST = 64 << 20  # bytes of a message that comes in pieces

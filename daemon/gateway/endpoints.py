@@ -1,302 +1,196 @@
-"""The addresses where clients without keys come in: their connections, accepted within bounds.
+"""The two addresses where clients come in: a ROUTER for commands, an XPUB for the stream.
 
-Where there is no place for one that comes, one that has not finished its handshake leaves, or of
-the commanders the one that has been silent longest.
+libzmq's own thread reads ahead of us, so what arrived before a stop is known by time alone. After
+it all requests are refused for a moment, and on while they come thicker than clients may send them,
+as those do that have waited. The stop's own answer waits as long, within a bound.
 """
 
 from __future__ import annotations
 
-import select
-import socket
-import time
-from collections import deque
+import math
+from collections import OrderedDict
 from collections.abc import Callable
-from functools import partial
-from typing import Generic, TypeVar
+from typing import Any
 
-from softfinger.daemon.errors import SoftfingerError
+import zmq
+
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.connections import CommandConnection, Connection, StreamConnection
-from softfinger.daemon.gateway.request_queue import RequestQueue
-from softfinger.daemon.gateway.zmtp import frame
-from softfinger.daemon.wire.loop_link import Topics
-from softfinger.daemon.wire.sockets import Listener
+from softfinger.daemon.gateway.addresses import Address
+from softfinger.daemon.gateway.admission import Admission
+from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.request_queue import Client, RequestQueue
 
-_Connection = TypeVar("_Connection", bound=Connection)
+_NOW = int(zmq.NOBLOCK)
+_PARTS = bounds.PARTS + 1  # and the client's route
+
 Late = Callable[[int], list[tuple[int, bytes]]]
-
-_READY = 64  # descriptors asked for at once
-
-
-class Poller:
-    """Waits for descriptors and calls what each was given."""
-
-    def __init__(self) -> None:
-        self._epoll = select.epoll()
-        self._calls: dict[int, Callable[[int], None]] = {}
-        self._due: deque[tuple[int, int, Callable[[int], None]]] = deque()
-
-    def watch(self, fd: int, events: int, call: Callable[[int], None]) -> None:
-        """Call ``call`` with what happened, whenever something does."""
-        self._calls[fd] = call
-        self._epoll.register(fd, events)
-
-    def change(self, fd: int, events: int) -> None:
-        self._epoll.modify(fd, events)
-
-    def forget(self, fd: int) -> None:
-        del self._calls[fd]
-        self._epoll.unregister(fd)
-
-    def step(self, seconds: float, most: float) -> None:
-        """Wait for ``seconds`` at most, and call for ``most`` s; the rest is called next time."""
-        if not self._due:
-            for fd, events in self._epoll.poll(seconds, _READY):
-                self._due.append((fd, events, self._calls[fd]))
-        until = time.monotonic() + most
-        while self._due:
-            fd, events, call = self._due.popleft()
-            if self._calls.get(fd) is call:  # else it was forgotten meanwhile
-                call(events)
-            if time.monotonic() > until:
-                return
-
-    def close(self) -> None:
-        self._epoll.close()
-
-
-class StartAnew(SoftfingerError):
-    """All connections are to end, and clients to come in again. The message says why."""
 
 
 class Endpoint:
-    """An address where clients come in. ``now`` is the server's time [s].
-
-    ``epoch`` is the newest, ``begun`` that of requests which come from now on: the newest once
-    nothing can come any more that arrived before it.
-    """
-
-    now = 0.0
-    epoch = 0
-    begun = 0
-    wanted = 0  # topics that somebody subscribes to, as bits
-
-    @property
-    def backlog(self) -> int:
-        """Bytes that wait for subscribers."""
-        return 0
-
-    def publish(self, topic: int, message: bytes) -> None:
-        """One message to all who want its topic."""
-
-    def tend(self) -> None:
-        """Do what is due by the time."""
-
-    def begin_epoch(self, epoch: int) -> None:
-        """Requests that arrived before are not to be given this epoch."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        raise NotImplementedError
-
-
-class PlainEndpoint(Endpoint, Generic[_Connection]):
-    """A listening socket and its connections."""
-
-    CONNECTION: type[_Connection]
-
-    def __init__(self, listener: Listener, poller: Poller, limit: int, places: int) -> None:
-        """``limit`` bounds a frame [bytes], ``places`` the connections."""
-        self._listener = listener
-        self._poller = poller
-        self.limit = limit
-        self._places = places
-        self._connections: dict[int, _Connection] = {}  # those first that were silent longest
-        self._handshakes: dict[Connection, float] = {}  # until when, in the order they came
-        self._resting: deque[tuple[float, Connection]] = deque()
-        self._older = 0  # that wait to be accepted, and came before the present epoch
-        poller.watch(listener.fileno(), select.EPOLLIN, lambda _: self.accept())
-
-    def _leaves(self) -> Connection | None:
-        """Who leaves so that another may come; None: nobody."""
-        return next(iter(self._handshakes), None)
-
-    def _begin(self) -> None:
-        self._older = 0
-        self.begun = self.epoch
-
-    def accept(self) -> None:
-        """Take in connections that wait."""
-        for _ in range(bounds.ACCEPTED):
-            try:
-                accepted, _ = self._listener.accept()
-            except BlockingIOError:
-                self._begin()
-                return
-            except OSError:  # it has gone already, or the system has no descriptor left
-                return
-            epoch = self.begun
-            if self._older:
-                self._older -= 1
-                if not self._older:
-                    self._begin()
-            if len(self._connections) >= self._places:
-                leaving = self._leaves()
-                if leaving is None:
-                    accepted.close()
-                    continue
-                self.disconnect(leaving)
-            accepted.setblocking(False)
-            if accepted.family != socket.AF_UNIX:
-                accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection = self.CONNECTION(self, accepted, epoch)
-            if connection.alive:
-                self._connections[connection.fd] = connection
-                self._handshakes[connection] = self.now + bounds.HANDSHAKE
-                serve = partial(self._serve, connection)
-                self._poller.watch(connection.fd, connection.events, serve)
-
-    def _serve(self, connection: Connection, events: int) -> None:
-        if events & select.EPOLLOUT and connection.alive:
-            connection.flush()
-        if events & ~select.EPOLLOUT and connection.alive:
-            connection.read(self.now)
-        if connection.alive and connection.tired and not connection.resting:
-            connection.resting = True
-            rest = max(bounds.REST, bounds.REST_EACH * len(self._resting))
-            self._resting.append((self.now + rest, connection))
-            self.watch(connection)
-
-    def finished_handshake(self, connection: Connection) -> None:
-        """It need not leave for another any more."""
-        self._handshakes.pop(connection, None)
-
-    def watch(self, connection: Connection) -> None:
-        """What a connection waits for has changed."""
-        if self._connections.get(connection.fd) is connection:
-            self._poller.change(connection.fd, connection.events)
-
-    def disconnect(self, connection: Connection) -> None:
-        if not connection.alive:
-            return
-        connection.alive = False
-        if self._connections.pop(connection.fd, None) is not None:
-            self._poller.forget(connection.fd)
-        self._handshakes.pop(connection, None)
-        connection.socket.close()
-
-    def tend(self) -> None:
-        """End handshakes that took too long, and rests."""
-        if self.begun != self.epoch:
-            self.accept()
-        while self._handshakes:
-            connection, until = next(iter(self._handshakes.items()))
-            if until > self.now:
-                break
-            self.disconnect(connection)
-        while self._resting and self._resting[0][0] <= self.now:
-            _, connection = self._resting.popleft()
-            connection.resting = False
-            self.watch(connection)
-
-    def begin_epoch(self, epoch: int) -> None:
-        """Who has nothing waiting is in it; the others once all of that has been read."""
-        self.epoch = epoch
-        self._older = self._listener.waiting()
-        if not self._older:
-            self._begin()
-        self.accept()
-        for connection in list(self._connections.values()):
-            connection.join_epoch()
-
-    def close(self) -> None:
-        self._poller.forget(self._listener.fileno())
-        self._listener.close()
-        for connection in list(self._connections.values()):
-            self.disconnect(connection)
-
-
-class CommandEndpoint(PlainEndpoint[CommandConnection]):
-    """Where requests come in."""
-
-    CONNECTION = CommandConnection
+    """A bound socket."""
 
     def __init__(
-        self, listener: Listener, poller: Poller, limit: int, places: int, requests: RequestQueue
+        self, admission: Admission, kind: int, address: str, key: str, config: Config, limit: int
     ) -> None:
-        self.requests = requests
-        super().__init__(listener, poller, limit, places)
+        """``key`` is the setting that names the address, ``limit`` bounds a message's part.
 
-    def _leaves(self) -> Connection | None:
-        return super()._leaves() or next(iter(self._connections.values()), None)
+        Raises AddressError.
+        """
+        self.socket: zmq.Socket[Any] = admission.context.socket(kind)
+        # These hold only for connections made after they were set, so before bind.
+        self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LAST_WORDS))
+        self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
+        queue = config.queue if kind == zmq.XPUB else bounds.QUEUE
+        self.socket.setsockopt(zmq.SNDHWM, queue)
+        self.socket.setsockopt(zmq.RCVHWM, bounds.QUEUE)
+        self.socket.setsockopt(zmq.IPV6, int("[" in address))
+        admission.guard(self.socket)
+        try:
+            self._address = Address(self.socket, address, key, config.ipc_mode)
+        except BaseException:
+            self.socket.close()
+            raise
 
-    def take(self, connection: CommandConnection, envelope: bytes, payload: bytes) -> None:
-        fd = connection.fd
-        self._connections[fd] = self._connections.pop(fd)  # it was silent for the shortest time
-        self.requests.take(connection, envelope, payload, self.now)
+    def _parts(self) -> list[zmq.Frame] | None:
+        """The next message's first few parts; None when there is none."""
+        found: list[zmq.Frame] = []
+        try:
+            while not found or found[-1].more:
+                found[_PARTS:] = [self.socket.recv(_NOW, copy=False)]
+        except zmq.Again:
+            return None
+        return found
+
+    def close(self) -> None:
+        self.socket.close()
+        self._address.close()
 
 
-class StreamEndpoint(PlainEndpoint[StreamConnection]):
-    """Where subscribers come in."""
+class CommandEndpoint(Endpoint):
+    """Where requests come in, and answers go out.
 
-    CONNECTION = StreamConnection
+    After a fence it reads what may have come before; `past` is the time from when on all that
+    comes came after it.
+    """
 
     def __init__(
         self,
-        listener: Listener,
-        poller: Poller,
-        places: int,
-        queue: int,
-        topics: Topics,
-        late: Late,
+        admission: Admission,
+        config: Config,
+        requests: RequestQueue,
+        clock: Callable[[], float],
     ) -> None:
-        """``queue`` messages wait for one subscriber.
+        """Raises AddressError."""
+        self._clock = clock
+        self._admission = admission
+        self._requests = requests
+        self._clients: OrderedDict[bytes, Client] = OrderedDict()
+        self.past = -math.inf
+        self._empty = True  # at the last look
+        self._since = 0.0  # a fence was raised, or last looked at; since then …
+        self._came = 0  # … so many requests came that change something
+        self._replies: list[list[bytes]] = []  # held back since …
+        self._held_since = 0.0
+        limit = bounds.FRAMES * config.max_bytes
+        super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
-        ``late`` gives what a late subscriber to these topics (as bits) gets.
+    def raise_fence(self) -> None:
+        """Refuse what has arrived until now: it takes a moment to read that."""
+        self.past = self._requests.past = math.inf
+        self._since = self._clock()
+        self._came = 0
+
+    def read(self) -> None:
+        """Take in requests, for as long as others may wait."""
+        began = self._clock()
+        if self.past == math.inf and began - self._since > bounds.PURGE:
+            if self._empty and self._came <= bounds.ALL_RATE * bounds.PURGE:
+                self.past = self._requests.past = began
+            self._since = began
+            self._came = 0
+        if self.past < math.inf or began - self._held_since > bounds.LONGEST_HELD:
+            self._answer_held()
+        self._empty = False
+        while (now := self._clock()) < began + bounds.TURN:
+            parts = self._parts()
+            if parts is None:
+                self._empty = True
+                return
+            *route, payload = (part.bytes for part in parts)
+            self._came += b"status" not in payload
+            if len(route) < _PARTS:
+                client = self._client(route[0], self._admission.name(parts[-1]), now)
+                self._requests.take(client, route, payload, now)
+
+    def _client(self, identity: bytes, name: str, now: float) -> Client:
+        client = self._clients.get(identity)
+        if client is None:
+            client = self._clients[identity] = self._requests.new_client(name, now)
+            if len(self._clients) > bounds.CLIENTS:
+                self._clients.popitem(last=False)
+        return client
+
+    def answer(self, route: list[bytes], reply: bytes) -> None:
+        """Send a reply, once what came before a fence has been read."""
+        message = [*route, reply]
+        if self.past < math.inf:
+            self._send(message)
+            return
+        if not self._replies:
+            self._held_since = self._clock()
+        self._replies.append(message)
+
+    def _answer_held(self) -> None:
+        replies, self._replies = self._replies, []
+        for reply in replies:
+            self._send(reply)
+
+    def _send(self, message: list[bytes]) -> None:
+        try:
+            self.socket.send_multipart(message, _NOW)
+        except zmq.ZMQError:
+            pass  # the client has gone
+
+
+class StreamEndpoint(Endpoint):
+    """Where subscribers come in."""
+
+    def __init__(self, admission: Admission, config: Config, late: Late) -> None:
+        """``late`` gives what late subscribers to these topics (as bits) are told.
+
+        Raises AddressError.
         """
-        self._names = tuple(name.encode() for name in topics.names)
-        self.matching = topics.matching
-        self.queue = queue
+        self._names = tuple(name.encode() for name in config.topics.names)
+        self._matching = config.topics.matching
         self._late = late
-        super().__init__(listener, poller, bounds.SUBSCRIPTION, places)
+        self._prefixes: set[bytes] = set()
+        self._came_late = 0  # topics that are to be told again, as bits …
+        self._tell_at = 0.0  # … then
+        self.wanted = 0  # topics that somebody subscribes to, as bits
+        limit = bounds.SUBSCRIPTION
+        super().__init__(admission, zmq.XPUB, config.stream, config.stream_key, config, limit)
+        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
 
-    def _leaves(self) -> Connection | None:
-        idle = (each for each in self._connections.values() if not each.topics)
-        return super()._leaves() or next(idle, None)
-
-    def subscribed(self, connection: StreamConnection, before: int) -> None:
-        """A subscriber wants other topics now than ``before``, as bits."""
-        self._update_wanted()
-        late = self._late(connection.topics & ~before)
-        if late:
-            connection.publish(b"".join(self._on_wire(topic, message) for topic, message in late))
-
-    def _update_wanted(self) -> None:
-        self.wanted = 0
-        for connection in self._connections.values():
-            self.wanted |= connection.topics
-
-    @property
-    def backlog(self) -> int:
-        return sum(connection.waiting for connection in self._connections.values())
+    def read(self, now: float) -> None:
+        """Learn who came and went; tell all again what those who came have missed."""
+        for _ in range(bounds.SUBSCRIPTIONS):
+            parts = self._parts()
+            if parts is None:
+                break
+            change = parts[0].bytes
+            matching = self._matching(change[1:])
+            if change[:1] == b"\1" and matching:
+                self._prefixes.add(change[1:])
+                self._came_late |= matching
+            elif change[:1] == b"\0":
+                self._prefixes.discard(change[1:])
+        self.wanted = self._matching(*self._prefixes)
+        if self._came_late and now >= self._tell_at:
+            for topic, message in self._late(self._came_late):
+                self.publish(topic, message)
+            self._came_late = 0
+            self._tell_at = now + bounds.TELL_AGAIN
 
     def publish(self, topic: int, message: bytes) -> None:
-        bit = 1 << topic
-        wire = self._on_wire(topic, message)
-        backlog = 0
-        for connection in list(self._connections.values()):
-            if connection.topics & bit:
-                connection.publish(wire)
-            backlog += connection.waiting
-        while backlog > bounds.BACKLOG:
-            slowest = max(self._connections.values(), key=lambda each: each.waiting)
-            backlog -= slowest.waiting
-            self.disconnect(slowest)
-
-    def _on_wire(self, topic: int, message: bytes) -> bytes:
-        return frame(self._names[topic], more=True) + frame(message)
-
-    def disconnect(self, connection: Connection) -> None:
-        super().disconnect(connection)
-        if connection.topics:
-            self._update_wanted()
+        """One message to all who want its topic; a slow one's is dropped."""
+        self.socket.send_multipart((self._names[topic], message), _NOW)

@@ -5,17 +5,18 @@ else few are on their way to the loop at a time; the rest waits here, where ever
 and none more than its share. A client that sends more than it may a second is refused until it
 pauses. Nothing here reads or sends.
 
-Each request carries the epoch that its connection was in when it was read. The loop counts epochs
-up, with every stop and whenever it could not act for a while, and carries out requests of the
-present one alone; a connection comes into it only once nothing is left in it that arrived before.
-A ``status`` changes nothing and is answered in any epoch.
+Each request carries the time at which it came. The loop raises a fence with every stop, and
+whenever it could not act for a while. What came before `RequestQueue.past` is refused: the time at
+which all had been read that may have come before the fence. A ``status`` changes nothing, and is
+answered whenever it came.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import msgpack
 
@@ -24,70 +25,38 @@ from softfinger.daemon.gateway import bounds
 from softfinger.daemon.wire.command_server import PASSED, decode
 from softfinger.daemon.wire.loop_link import ALWAYS
 
+Route = list[bytes]  # to a client: what ROUTER put before its request
+
 _NUMBERS = 1 << 30  # that requests are distinguished by
 _FULL = "too many commands wait already"
 _OLD = "waited too long for its turn; send it again"
 
 
-class Client(Protocol):
-    """Somebody who asks. ``pace`` counts what it sends."""
+class Client:
+    """Somebody who asks: so many requests a second, of which one second's worth at once."""
 
-    alive: bool
-    pace: Pace
+    __slots__ = ("_behind", "_left", "_then", "name", "stops")
 
-    @property
-    def name(self) -> str:
-        """By its key; empty without."""
-
-    @property
-    def epoch(self) -> int:
-        """Of which its connection is."""
-
-    def answer(self, envelope: Any, reply: bytes) -> None:
-        """Send the reply to one of its requests, unless it has gone."""
-
-
-class Allowance:
-    """So many a second, and a burst at once."""
-
-    __slots__ = ("_left", "_then")
-
-    def __init__(self, burst: float, now: float = 0.0) -> None:
-        self._left = burst
+    def __init__(self, name: str, per_second: float, now: float) -> None:
+        """``name`` is by its key; empty without."""
+        self.name = name
+        self.stops = False  # a stop of its waits for the loop
+        self._behind = False  # it sent too much, and has not paused since
+        self._left = per_second
         self._then = now
 
-    def take(self, per_second: float, burst: float, now: float) -> bool:
-        """Count one more; False when it is too many."""
-        left = min(self._left + (now - self._then) * per_second, burst) - 1.0
+    def floods(self, per_second: float, now: float) -> bool:
+        """Count one more request; True when it is too many, or it has not paused since."""
+        passed = now - self._then
+        left = min(self._left + passed * per_second, per_second) - 1.0
         self._left = max(left, 0.0)
         self._then = now
-        return left >= 0.0
-
-
-class Pace(Allowance):
-    """What a client may still send: so many a second, of which one second's worth at once."""
-
-    __slots__ = ("behind", "refusals", "stopped")
-
-    def __init__(self, per_second: float, now: float) -> None:
-        super().__init__(per_second, now)
-        self.behind = False  # it sent too much, and has not paused since
-        self.begin_read()
-
-    @property
-    def tired(self) -> bool:
-        """It sent too much at this read: it is not to be read for a while."""
-        return self.stopped or self.refusals > 0
-
-    def begin_read(self) -> None:
-        """Some more of what it sent is going to be taken."""
-        self.refusals = 0  # at this read
-        self.stopped = False  # it sent a stop in a flood
+        self._behind = left < 0.0 or (self._behind and passed < bounds.REST)
+        return self._behind
 
 
 class _Request(NamedTuple):
-    envelope: Any
-    epoch: int
+    route: Route
     came: float
     packed: bytes
 
@@ -96,55 +65,58 @@ class RequestQueue:
     """The requests of all clients on their way to the loop, and the replies on their way back."""
 
     def __init__(
-        self, max_bytes: int, per_second: float, forward: Callable[[bool, int, int, bytes], bool]
+        self,
+        max_bytes: int,
+        per_second: float,
+        forward: Callable[[bool, float, int, bytes], bool],
+        answer: Callable[[Route, bytes], None],
     ) -> None:
-        """``forward`` gives the loop a request: whether it is a stop, epoch, number, packed map.
+        """``forward`` gives the loop a request: whether it is a stop, came, number, packed map.
 
-        It returns False when there is no room.
+        It returns False when there is no room. ``answer`` sends a reply.
         """
         self._max_bytes = max_bytes
         self._per_second = per_second
         self._forward = forward
+        self._answer = answer
         self._number = 1
         self._waiting: dict[Client, deque[_Request]] = {}  # the next client's turn is first
         self._count = 0  # of them
-        self._stops: list[tuple[Client, Any]] = []
+        self._stops: list[tuple[Client, Route]] = []
         self._active: set[Client] = set()  # who has sent something in this second
         self._share_until = 0.0
-        self._asked: dict[int, tuple[list[tuple[Client, Any]], float]] = {}
-        self._late: dict[int, list[tuple[Client, Any]]] = {}  # the oldest first
+        self._asked: dict[int, tuple[list[Route], float]] = {}
+        self._late: dict[int, list[Route]] = {}  # the oldest first
         self._stop = 0  # the number of the stop that the loop has
-        self.epoch = 0
+        self.past = -math.inf
         self.refused = 0  # because too many came
 
-    def new_pace(self, now: float) -> Pace:
-        """The pace of a new client."""
-        return Pace(self._per_second, now)
+    def new_client(self, name: str, now: float) -> Client:
+        return Client(name, self._per_second, now)
 
-    def take(self, client: Client, envelope: Any, payload: bytes, now: float) -> None:
+    def take(self, client: Client, route: Route, payload: bytes, now: float) -> None:
         """One message of a client: it waits for its turn, or is refused."""
-        pace, rate = client.pace, self._shared(client, now)
-        pace.behind = not pace.take(rate, rate, now) or pace.behind
-        if pace.behind and (pace.stopped or b"stop" not in payload):
-            self._refuse_flood(client, envelope)
+        flood = client.floods(self._shared(client, now), now)
+        if flood and (client.stops or b"stop" not in payload):
+            self._refuse_flood(route)
             return
         try:
             if len(payload) > self._max_bytes:
                 raise Refused(f"message of {len(payload)} bytes; at most {self._max_bytes}")
             request = decode(payload)
         except Refused as refusal:
-            _refuse(client, envelope, str(refusal))
+            self._refuse(route, str(refusal))
             return
         if client.name:
             request["client"] = client.name
         if request["command"] == "stop":
-            self._stops.append((client, envelope))
-            pace.stopped = pace.behind
-        elif pace.behind:
-            self._refuse_flood(client, envelope)
+            self._stops.append((client, route))
+            client.stops = True
+        elif flood:
+            self._refuse_flood(route)
         else:
-            epoch = ALWAYS if request["command"] == "status" else client.epoch
-            self._queue(client, _Request(envelope, epoch, now, msgpack.packb(request)))
+            came = ALWAYS if request["command"] == "status" else now
+            self._queue(client, _Request(route, came, msgpack.packb(request)))
 
     def _shared(self, client: Client, now: float) -> float:
         """What each client may send in a second: less when many send."""
@@ -154,11 +126,12 @@ class RequestQueue:
         self._active.add(client)
         return min(self._per_second, max(bounds.ALL_RATE / len(self._active), bounds.LEAST_RATE))
 
-    def _refuse_flood(self, client: Client, envelope: Any) -> None:
+    def _refuse(self, route: Route, error: str) -> None:
+        self._answer(route, msgpack.packb({"ok": False, "error": error}))
+
+    def _refuse_flood(self, route: Route) -> None:
         self.refused += 1
-        client.pace.refusals += 1
-        if client.pace.refusals <= bounds.REFUSALS:
-            _refuse(client, envelope, f"too many commands: at most {self._per_second:g} a second")
+        self._refuse(route, f"too many commands: at most {self._per_second:g} a second")
 
     def _queue(self, client: Client, request: _Request) -> None:
         queued = self._waiting.get(client)
@@ -166,7 +139,7 @@ class RequestQueue:
             self._waiting[client] = queued = deque()
         elif len(queued) >= bounds.WAITING_EACH or self._count >= bounds.WAITING:
             self.refused += 1
-            _refuse(client, request.envelope, _FULL)
+            self._refuse(request.route, _FULL)
             return
         queued.append(request)
         self._count += 1
@@ -180,20 +153,20 @@ class RequestQueue:
             self._give_way(number)
         if self._stops and not self._stop:
             packed = msgpack.packb({"command": "stop", "client": self._stops[0][0].name})
-            self._stop = self._ask(self._stops, self.epoch, packed, now, stop=True)
+            self._stop = self._ask([route for _, route in self._stops], now, packed, now, stop=True)
             if self._stop:
+                for client, _ in self._stops:
+                    client.stops = False
                 self._stops = []
         while self._waiting and len(self._asked) < bounds.UNDER_WAY + bool(self._stop):
             client, queued = next(iter(self._waiting.items()))
-            request = queued[0]
-            if request.epoch not in (self.epoch, ALWAYS):
-                _refuse(client, request.envelope, PASSED)
-            elif now - request.came > bounds.OLDEST:
-                _refuse(client, request.envelope, _OLD)
-            elif client.alive:
-                target = [(client, request.envelope)]
-                if not self._ask(target, request.epoch, request.packed, now):
-                    return
+            route, came, packed = queued[0]
+            if came < self.past:
+                self._refuse(route, PASSED)
+            elif now - came > bounds.OLDEST:
+                self._refuse(route, _OLD)
+            elif not self._ask([route], came, packed, now):
+                return
             queued.popleft()
             self._count -= 1
             del self._waiting[client]
@@ -201,19 +174,14 @@ class RequestQueue:
                 self._waiting[client] = queued  # behind all others
 
     def _ask(
-        self,
-        targets: list[tuple[Client, Any]],
-        epoch: int,
-        packed: bytes,
-        now: float,
-        stop: bool = False,
+        self, routes: list[Route], came: float, packed: bytes, now: float, stop: bool = False
     ) -> int:
         """The number that the request was given; 0 when there was no room."""
         number = self._number
-        if not self._forward(stop, epoch, number, packed):
+        if not self._forward(stop, came, number, packed):
             return 0
         self._number = number % _NUMBERS + 1
-        self._asked[number] = (targets, now)
+        self._asked[number] = (routes, now)
         return number
 
     def _give_way(self, number: int) -> None:
@@ -228,13 +196,5 @@ class RequestQueue:
         """The loop's answer to request ``number``."""
         if number in self._asked:
             self._give_way(number)
-        for client, envelope in self._late.pop(number, ()):
-            client.answer(envelope, reply)
-
-    def begin_epoch(self, epoch: int) -> None:
-        """What waits is refused at its turn; what is read from now on has its client's epoch."""
-        self.epoch = epoch
-
-
-def _refuse(client: Client, envelope: Any, error: str) -> None:
-    client.answer(envelope, msgpack.packb({"ok": False, "error": error}))
+        for route in self._late.pop(number, ()):
+            self._answer(route, reply)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import select
+import math
 import socket
 import time
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import msgpack
+import zmq
 
 from softfinger.daemon.gateway import bounds
+from softfinger.daemon.gateway.admission import Admission
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.endpoints import Endpoint, Poller
-from softfinger.daemon.gateway.request_queue import RequestQueue
+from softfinger.daemon.gateway.endpoints import CommandEndpoint, StreamEndpoint
+from softfinger.daemon.gateway.request_queue import RequestQueue, Route
 from softfinger.daemon.wire import loop_link
+from softfinger.daemon.wire.command_server import Pauses
 from softfinger.daemon.wire.loop_link import Topics
 
 
@@ -52,54 +57,79 @@ class Server:
     """Serves clients until the loop hangs up: call `step` again and again."""
 
     def __init__(
-        self, end: socket.socket, config: Config, clock: Callable[[], float] = time.monotonic
+        self,
+        end: socket.socket,
+        config: Config,
+        clock: Callable[[], float] = time.monotonic,
+        longest_pause: float = math.inf,
     ) -> None:
-        """``end`` is this end of the link. Endpoints are added by `add`."""
+        """Bind what ``config`` names; ``end`` is this end of the link.
+
+        After more than ``longest_pause`` [s] between two steps, what came meanwhile is refused.
+
+        Raises AddressError, and KeyFileError where there are keys.
+        """
         self._clock = clock
-        self.poller = Poller()
-        self.requests = RequestQueue(config.max_bytes, config.per_second, self._forward)
-        self.repeated = Repeated(config.topics)
+        self._pauses = Pauses(longest_pause)
         self._end = end
-        self._endpoints: list[Endpoint] = []
+        self.requests = RequestQueue(
+            config.max_bytes, config.per_second, self._forward, self._answer
+        )
+        self._repeated = Repeated(config.topics)
         self._reported = b""  # wanted topics and refused requests, as the loop knows them
-        self._begun = 0  # the epoch, as the loop knows it
+        self._fence = 0
+        self._told_past = -math.inf  # as the loop knows it
         self._unsent: deque[bytes] = deque(maxlen=bounds.UNSENT)
         self._pieces = bytearray()
-        self._tend_at = 0.0
-        self.now = 0.0
         self.over = False
-        self.poller.watch(end.fileno(), select.EPOLLIN, lambda _: self._take_packets())
-
-    def add(self, endpoint: Endpoint) -> None:
-        """Serve those who come in there."""
-        self._endpoints.append(endpoint)
+        folder = Path(config.keys) if config.keys else None
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._admission = Admission(self._context, folder)
+        self._stream: StreamEndpoint | None = None
+        self._commands: CommandEndpoint | None = None
+        self._poller = zmq.Poller()
+        self._poller.register(end, zmq.POLLIN)
+        try:
+            if config.stream:
+                self._stream = StreamEndpoint(self._admission, config, self._repeated.late)
+                self._poller.register(self._stream.socket, zmq.POLLIN)
+            if config.commands:
+                self._commands = CommandEndpoint(self._admission, config, self.requests, clock)
+                self._poller.register(self._commands.socket, zmq.POLLIN)
+        except BaseException:
+            self._close_sockets()
+            raise
 
     def step(self, seconds: float = bounds.TEND) -> None:
         """Wait for the loop or a client for so long at most, and serve them."""
-        self._set_time()
-        self.poller.step(0.0 if self._unsent else seconds, bounds.TURN)
+        self._poller.poll(0 if self._unsent else int(1e3 * seconds))
+        now = self._clock()
+        self._admission.look(now)
         self._take_packets()
         self._publish_some()
-        now = self._set_time()
-        if now >= self._tend_at:
-            self._tend_at = now + bounds.TEND
-            for endpoint in self._endpoints:
-                endpoint.tend()
-        self.requests.pump(now)
-        begun = min((endpoint.begun for endpoint in self._endpoints), default=0)
-        if begun != self._begun and self._send(loop_link.BEGUN + loop_link.EPOCHS.pack(begun)):
-            self._begun = begun
-        wanted = max((endpoint.wanted for endpoint in self._endpoints), default=0)
+        wanted = 0
+        if self._stream is not None:
+            self._stream.read(now)
+            wanted = self._stream.wanted
+        if self._commands is not None:
+            if self._pauses.look():
+                self._commands.raise_fence()
+            self._commands.read()
+            self.requests.pump(self._clock())
+            self._tell_past(self._commands.past)
         report = loop_link.WANTED + loop_link.WANTS.pack(wanted, self.requests.refused)
         if report != self._reported and self._send(report):
             self._reported = report
 
-    def _set_time(self) -> float:
-        now = self._clock()
-        for endpoint in self._endpoints:
-            endpoint.now = now
-        self.now = now
-        return now
+    def _tell_past(self, past: float) -> None:
+        if past < math.inf and past != self._told_past:
+            packet = loop_link.PAST + loop_link.FENCE_PAST.pack(self._fence, past)
+            if self._send(packet):
+                self._told_past = past
+
+    def _answer(self, route: Route, reply: bytes) -> None:
+        if self._commands is not None:
+            self._commands.answer(route, reply)
 
     def _send(self, packet: bytes) -> bool:
         try:
@@ -111,9 +141,9 @@ class Server:
             return False
         return True
 
-    def _forward(self, stop: bool, epoch: int, number: int, packed: bytes) -> bool:
+    def _forward(self, stop: bool, came: float, number: int, packed: bytes) -> bool:
         kind = loop_link.STOP if stop else loop_link.ASK
-        return self._send(kind + loop_link.ASKED.pack(epoch, number) + packed)
+        return self._send(kind + loop_link.ASKED.pack(came, number) + packed)
 
     def _take_packets(self) -> None:
         for _ in range(bounds.FROM_LOOP):
@@ -131,11 +161,10 @@ class Server:
                 self._unsent.append(packet)  # replies behind it must not wait for its sending
             elif kind == loop_link.REPLY:
                 self.requests.reply(loop_link.NUMBER.unpack_from(packet, 1)[0], packet[5:])
-            elif kind == loop_link.EPOCH:
-                epoch = loop_link.EPOCHS.unpack_from(packet, 1)[0]
-                self.requests.begin_epoch(epoch)
-                for endpoint in self._endpoints:
-                    endpoint.begin_epoch(epoch)
+            elif kind == loop_link.FENCE:
+                (self._fence,) = loop_link.NUMBER.unpack_from(packet, 1)
+                if self._commands is not None:
+                    self._commands.raise_fence()
 
     def _publish_some(self) -> None:
         """Send what the loop published, for as long as clients may wait."""
@@ -160,20 +189,22 @@ class Server:
                 return
             message = bytes(self._pieces)
             self._pieces.clear()
-        again = self.repeated.add(topic, message)
-        for endpoint in self._endpoints:
+        again = self._repeated.add(topic, message)
+        if self._stream is not None:
             # Subscribers may have come back before the loop has: they get its last events, too.
-            endpoint.publish(topic, again if flags & loop_link.KEEP else message)
+            self._stream.publish(topic, again if flags & loop_link.KEEP else message)
 
     def close(self) -> None:
         """Let subscribers take what waits, for a moment, and disconnect all."""
         deadline = time.monotonic() + bounds.LAST_WORDS
-        self.poller.forget(self._end.fileno())
         self._end.close()
         while self._unsent and time.monotonic() < deadline:
             self._publish_some()
-        while any(each.backlog for each in self._endpoints) and time.monotonic() < deadline:
-            self.poller.step(0.01, bounds.TURN)
-        for endpoint in self._endpoints:
-            endpoint.close()
-        self.poller.close()
+        self._close_sockets()
+
+    def _close_sockets(self) -> None:
+        for endpoint in (self._stream, self._commands):
+            if endpoint is not None:
+                endpoint.close()
+        self._admission.stop()
+        self._context.term()

@@ -34,6 +34,8 @@ from softfinger.kinematics.contact.table import ContactTable
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
+_PAUSE = 0.2  # s in which the loop took no commands, after which those that wait are too old
+
 
 class Daemon:
     """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
@@ -101,7 +103,10 @@ class Daemon:
         self._closers.append(gateway.close)
         local = LocalStop(commands.address)
         self._closers.append(local.close)
-        return Publisher(gateway.link), CommandServer(gateway.link, local)
+        # Servos that their own watchdog has stopped are another hand than the one commanded.
+        watchdog = 0.0 if self.settings.simulated else self.settings.servos.watchdog
+        server = CommandServer(gateway.link, local, min(_PAUSE, watchdog or _PAUSE))
+        return Publisher(gateway.link), server
 
     def _make_hand(self, cache: Path | None, on_event: EventSink | None) -> SimulatedHand | None:
         """The simulated hand, where a backend wants one.

@@ -30,8 +30,6 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-_STALL = 0.2  # s of the machine without a tick after which waiting commands are too old
-
 
 class Commands(Protocol):
     """Where commands come from: `wire.command_server.CommandServer`, or a recording."""
@@ -47,7 +45,10 @@ class Commands(Protocol):
     def serve(self, handler: Handler) -> None:
         """Carry out through ``handler`` what is due at this tick."""
 
-    def begin_epoch(self) -> None:
+    def start(self) -> None:
+        """Refuse all that has arrived until now; what comes from then on is carried out."""
+
+    def raise_fence(self) -> None:
         """Refuse all that has arrived until now, but for a stop."""
 
 
@@ -130,7 +131,7 @@ class Loop:
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         if self._server is not None:
-            self._server.begin_epoch()
+            self._server.start()
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)
@@ -166,8 +167,6 @@ class Loop:
             if event is not None:
                 self.emit(*event)
             self._commanded = False
-            if timing.tick_s > _STALL and self._server is not None:
-                self._server.begin_epoch()
             done = self.tick(clock.now())
             deadline += self.period
             if done > deadline + clock.behind:
@@ -233,7 +232,7 @@ class Loop:
             self.command({"command": "stop"})
         if self._server is not None:
             if stopped:
-                self._server.begin_epoch()
+                self._server.raise_fence()
             self._server.serve(self.command)
             while self._server.notices:
                 self.emit("warning", "clients", self._server.notices.popleft())

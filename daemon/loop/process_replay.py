@@ -172,7 +172,10 @@ class _Commands:
                 pass  # carried out when it was recorded: the comparison will show it
         self.waiting = []
 
-    def begin_epoch(self) -> None:
+    def start(self) -> None:
+        pass
+
+    def raise_fence(self) -> None:
         pass
 
     def close(self) -> None:

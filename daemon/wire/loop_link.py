@@ -1,7 +1,7 @@
 """The socket pair between the loop and the gateway: packets both ways, and the loop's end of it.
 
 Each packet is one message of a Unix socket that never blocks the loop. What goes out when there is
-no room is dropped and counted, but for replies and epochs, which wait for the next tick; the kernel
+no room is dropped and counted, but for replies and fences, which wait for the next tick; the kernel
 bounds what is on the way, and the gateway bounds what it sends to what the loop has answered.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import select
 import socket
 import struct
@@ -19,24 +20,24 @@ from typing import Any, NamedTuple
 # From the loop. A message too long for one packet comes in pieces.
 PUBLISH = b"P"  # topic's index, flags, piece of the message
 REPLY = b"R"  # number, reply
-EPOCH = b"E"  # epoch
+FENCE = b"F"  # number: what came before this is not to be carried out
 FIRST, LAST, KEEP = 1, 2, 4  # place of the piece; KEEP: sent again, after a restart
 
 # From the gateway.
 READY = b"U"  # nothing: the sockets are bound
 FAILED = b"!"  # why they are not
-BEGUN = b"B"  # epoch that all connections are in, or will be once they have been read
+PAST = b"T"  # number of a fence, time from when on what comes came after it
 WANTED = b"W"  # topics that somebody subscribes to as bits, refused requests
-ASK = b"C"  # epoch, number, request
+ASK = b"C"  # when it came, number, request
 NOTICE = b"N"  # a warning
 STOP = b"S"  # as ASK: a stop, which goes before all else
 
 NUMBER = struct.Struct("<I")
-EPOCHS = struct.Struct("<Q")
+FENCE_PAST = struct.Struct("<Id")
 WANTS = struct.Struct("<IQ")
-ASKED = struct.Struct("<QI")
+ASKED = struct.Struct("<dI")
 
-ALWAYS = 2**64 - 1  # the epoch of a request that changes nothing, answered in any
+ALWAYS = math.inf  # when a request came that changes nothing, which no fence holds back
 
 ANEW = 3  # exit status of a gateway that is to be started again, and has given the reason
 
@@ -44,10 +45,11 @@ LARGEST = 65_536  # bytes of a packet
 _PIECE = 60_000
 _ROOM = 1 << 20  # bytes that may be on the way; the kernel may allow less
 _LOOK = 16  # packets taken in at a tick
-_WAITING = 64  # replies and epochs that wait for room
+_WAITING = 64  # replies and fences that wait for room
 _OURS, _OTHER = 0, 1  # of the descriptors that are looked at
 _NOTICES = 20
 _PATIENCE = 2.0  # s for room on the way to a new gateway
+_FENCES = 1 << 32  # that are told apart
 _EVENTS = 50  # events that a gateway is given anew
 
 # The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
@@ -75,9 +77,9 @@ class Topics:
 
 
 class Ask(NamedTuple):
-    """A request that the gateway has checked."""
+    """A request that the gateway has checked. ``came`` is the machine's monotonic time [s]."""
 
-    epoch: int
+    came: float
     number: int
     packed: bytes
 
@@ -115,8 +117,7 @@ class Link:
     """The loop's end. One thread, the loop's, may call it, but for `offer`."""
 
     def __init__(self) -> None:
-        self.epoch = 0
-        self.begun = 0  # the epoch that the gateway has come to
+        self.past = math.inf  # what came earlier came before the fence; infinite until that is read
         self.wanted = 0  # topics as bits
         self.refused = 0  # requests that the gateway refused because too many came
         self.lost = 0  # messages of the stream that found no room
@@ -124,6 +125,7 @@ class Link:
         self.stops: deque[Ask] = deque()
         self.notices: deque[str] = deque(maxlen=_NOTICES)  # the gateway's warnings
         self.lasting: list[bytes] = []  # packets that every gateway is sent before it is offered
+        self._fence = 0
         self._socket: socket.socket | None = None
         self._offered: socket.socket | None = None
         self._waiting: deque[bytes] = deque(maxlen=_WAITING)
@@ -177,25 +179,27 @@ class Link:
     def _take(self, packet: bytes) -> None:
         kind = packet[:1]
         if kind in (ASK, STOP):
-            epoch, number = ASKED.unpack_from(packet, 1)
-            ask = Ask(epoch, number, packet[1 + ASKED.size :])
+            came, number = ASKED.unpack_from(packet, 1)
+            ask = Ask(came, number, packet[1 + ASKED.size :])
             (self.stops if kind == STOP else self.asked).append(ask)
-        elif kind == BEGUN:
-            (self.begun,) = EPOCHS.unpack_from(packet, 1)
+        elif kind == PAST:
+            fence, past = FENCE_PAST.unpack_from(packet, 1)
+            if fence == self._fence:
+                self.past = past
         elif kind == NOTICE:
             self.notices.append(packet[1:].decode())
         elif kind == WANTED:
             self.wanted, self.refused = WANTS.unpack_from(packet, 1)
 
     def _adopt(self) -> None:
-        """Use a new gateway's socket, and give it the epoch and the last events."""
+        """Use a new gateway's socket, and give it a fence and the last events."""
         self._disconnect()
         self._socket, self._offered = self._offered, None
         assert self._socket is not None
         self._polled[_OURS].fd = self._socket.fileno()
         for packet in self._last_events:
             self._send(packet)
-        self.begin_epoch()
+        self.raise_fence()
 
     def _disconnect(self) -> None:
         if self._socket is not None:
@@ -207,10 +211,11 @@ class Link:
         self.stops.clear()
         self._waiting.clear()
 
-    def begin_epoch(self) -> None:
+    def raise_fence(self) -> None:
         """From now on requests that came before are not to be carried out."""
-        self.epoch += 1
-        self._waiting.append(EPOCH + EPOCHS.pack(self.epoch))
+        self._fence = (self._fence + 1) % _FENCES
+        self.past = math.inf
+        self._waiting.append(FENCE + NUMBER.pack(self._fence))
         self._send_waiting()
 
     def reply(self, number: int, reply: bytes) -> None:

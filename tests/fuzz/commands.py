@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import msgpack
 import zmq
@@ -105,21 +106,6 @@ def some_message(rng: random.Random) -> bytes:
     return packed if kind < 0.35 else mutated(rng, packed)
 
 
-class _Asker:
-    """A client of the gateway without a connection."""
-
-    alive = True
-    name = ""
-
-    def __init__(self, served: Served) -> None:
-        self.epoch = served.service.requests.epoch
-        self.pace = served.service.requests.new_pace(served.service.now)
-        self.replies: list[dict[str, Any]] = []
-
-    def answer(self, envelope: None, reply: bytes) -> None:
-        self.replies.append(msgpack.unpackb(reply))
-
-
 class CommandTarget:
     """A hand on the virtual clock behind a real command server, asked directly and by its socket.
 
@@ -135,8 +121,6 @@ class CommandTarget:
         self.folder = TemporaryDirectory()
         address = f"ipc://{self.folder.name}/commands"
         self.served = Served(commands=address, max_bytes=_MAX_BYTES)
-        self.served.server.begin_epoch()
-        self.served.settle()
         self.context: zmq.Context[Any] = zmq.Context()
         self.client = self.context.socket(zmq.DEALER)
         self.client.connect(address)
@@ -167,13 +151,17 @@ class CommandTarget:
         raise AssertionError("no reply")
 
     def _directly(self, message: bytes) -> dict[str, Any]:
-        asker = _Asker(self.served)
-        self.served.service.requests.take(asker, None, message, self.served.service.now)
-        for _ in range(3):
-            self.served.serve(self.loop.command)
-            if asker.replies:
-                break
-        (reply,) = asker.replies
+        queue, replies = self.served.service.requests, []
+        with patch.object(
+            queue, "_answer", lambda _, reply: replies.append(msgpack.unpackb(reply))
+        ):
+            now = time.monotonic()
+            queue.take(queue.new_client("", now), [], message, now)
+            for _ in range(3):
+                self.served.serve(self.loop.command)
+                if replies:
+                    break
+        (reply,) = replies
         return reply
 
     def _check(self) -> None:

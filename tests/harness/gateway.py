@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from softfinger.daemon.gateway.__main__ import open_server
+from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.command_server import CommandServer, Handler
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
+from tests.conftest import until
 
 
 class Served:
@@ -28,8 +32,7 @@ class Served:
         per_second: float = 1e6,
         ipc_mode: int = 0o600,
         keys: str = "",
-        places: int = 256,
-        now: Callable[[], float] = time.monotonic,
+        clock: VirtualClock | None = None,
     ) -> None:
         self.link = loop_link.Link()
         ours, theirs = loop_link.pair()
@@ -37,7 +40,7 @@ class Served:
             stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
         )
         try:
-            self.service = open_server(theirs, config, places, now)
+            self.service = Server(theirs, config, time.monotonic if clock is None else clock.now)
         except BaseException:
             ours.close()
             theirs.close()
@@ -45,7 +48,16 @@ class Served:
         self.link.offer(ours)
         self.publisher = Publisher(self.link)
         self.server = CommandServer(self.link)
+        self._clock = clock
         self.settle()
+        until(lambda: not commands or self._is_open())
+
+    def _is_open(self) -> bool:
+        """Whether what comes now is carried out."""
+        if self._clock is not None:
+            self._clock.sleep_until(self._clock.now() + bounds.PURGE)
+        self.settle()
+        return self.link.past < math.inf
 
     def settle(self, times: int = 3) -> None:
         """Let the link carry what is on the way."""

@@ -40,7 +40,10 @@ class Script:
             except Refused:
                 self.refused += 1
 
-    def begin_epoch(self) -> None:
+    def start(self) -> None:
+        pass
+
+    def raise_fence(self) -> None:
         pass
 
 

@@ -17,8 +17,7 @@ import zmq.auth
 from softfinger.daemon.client import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
-from softfinger.daemon.gateway.endpoints import StartAnew
-from softfinger.daemon.gateway.keyed import Keys
+from softfinger.daemon.gateway.admission import Admission, StartAnew
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import Inline, until
 from tests.harness.daemon_process import Running
@@ -128,7 +127,7 @@ def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
     def no_descriptor_left(path: Path) -> NoReturn:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
 
-    keys = Keys(context, folder)
+    keys = Admission(context, folder)
     clients = folder / "server" / "clients"
     try:
         monkeypatch.setattr(zmq.auth, "load_certificate", no_descriptor_left)
@@ -154,7 +153,6 @@ class Guarded:
     def __init__(self, addresses: tuple[str, str], folder: Path) -> None:
         self.served = Served(*addresses, keys=str(folder))
         self.heard: list[dict[str, Any]] = []
-        until(lambda: [self.step(), self.served.service._endpoints[-1].begun == 1][1])
 
     def step(self) -> None:
         self.served.publisher.event(0.0, 0.0, "info", "test", "told")
@@ -287,7 +285,7 @@ def test_who_stops_is_answered_while_others_stop_without_pause(
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.server.begin_epoch()  # as each stop does
+        guarded.served.server.raise_fence()  # as each stop does
         guarded.step()
         return stopper.poll(0)
 

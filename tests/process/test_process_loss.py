@@ -13,7 +13,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
+import zmq
 
 from softfinger.daemon.simulation.emulator.folder import send_words
 from tests.conftest import until
@@ -177,6 +179,28 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig: Rig) -> None:
     assert not rig.send("clear")["ok"]
     assert daemon.end() == 1
     assert "ended with a fault" in "".join(daemon.lines)
+
+
+def test_a_command_sent_while_the_daemon_stands_still_is_not_carried_out(
+    rig: Rig, context: zmq.Context[zmq.Socket[bytes]]
+) -> None:
+    daemon = rig.start()
+    client = context.socket(zmq.REQ)
+    client.connect(rig.commands)
+
+    def told(name: str) -> Any:
+        client.send(msgpack.packb({"command": name}))
+        return msgpack.unpackb(client.recv())
+
+    for _ in range(8):
+        assert not told("status")["torque"]
+        stood_still = rig.report()["t"] + 0.5
+        daemon.process.send_signal(signal.SIGSTOP)
+        client.send(msgpack.packb({"command": "arm"}))
+        until(lambda at=stood_still: rig.report()["t"] > at)
+        daemon.process.send_signal(signal.SIGCONT)
+        assert "stood still" in msgpack.unpackb(client.recv())["error"]
+    until(lambda: told("arm")["ok"])
 
 
 def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig: Rig) -> None:

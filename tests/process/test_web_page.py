@@ -18,7 +18,6 @@ import pytest
 import zmq
 
 from softfinger.daemon.client.command_client import send
-from softfinger.daemon.gateway.endpoints import StreamEndpoint
 from softfinger.daemon.wire.keys import load_client, make_keys
 from softfinger.daemon.wire.loop_link import Topics
 from tests.conftest import own_addresses, until
@@ -145,9 +144,6 @@ def test_a_web_page_is_not_heard(
     guarded: bool,
 ) -> None:
     heard: list[Any] = []
-    monkeypatch.setattr(
-        StreamEndpoint, "subscribed", lambda *subscription: heard.append(subscription)
-    )
     monkeypatch.setattr(Topics, "matching", lambda _, *prefixes: heard.extend(prefixes) or 0)
     folder = tmp_path / "keys"
     if guarded:

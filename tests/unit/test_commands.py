@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import select
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,8 +24,8 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import decode
-from softfinger.daemon.wire.sockets import Listener
+from softfinger.daemon.wire import command_server
+from softfinger.daemon.wire.command_server import CommandServer, Pauses, decode
 from tests.conftest import until
 from tests.harness.gateway import Served
 
@@ -95,7 +97,7 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
 
 
 @pytest.mark.parametrize("under_way", [1, 4])  # the second request waits in the queue, or the link
-def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
+def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
     context: zmq.Context[Any],
     addresses: tuple[str, str],
     monkeypatch: pytest.MonkeyPatch,
@@ -112,7 +114,7 @@ def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
         asking.send(msgpack.packb({"command": "status"}))
         queue = served.service.requests
         until(lambda: [served.settle(1), len(served.link.asked) + queue._count == 2][1])
-        served.server.begin_epoch()
+        served.server.raise_fence()
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert "before a stop; send it again" in msgpack.unpackb(early.recv())["error"]
         until(lambda: [served.serve(echo), asking.poll(0)][1])
@@ -120,6 +122,91 @@ def test_what_came_before_an_epoch_is_refused_and_what_comes_after_is_not(
         early.send(msgpack.packb({"command": "arm"}))
         until(lambda: [served.serve(echo), early.poll(0)][1])
         assert msgpack.unpackb(early.recv()) == {"ok": True, "heard": "arm"}
+
+
+@pytest.fixture
+def standing(monkeypatch: pytest.MonkeyPatch) -> VirtualClock:
+    """The clock by which standstills are noticed."""
+    clock = VirtualClock()
+    monkeypatch.setattr(command_server.time, "clock_gettime", lambda _: clock.now())
+    return clock
+
+
+class Asking:
+    """A client with one request, which a served gateway and loop are to answer."""
+
+    def __init__(self, context: zmq.Context[Any], served: Served, address: str, name: str) -> None:
+        self._served = served
+        self._socket = context.socket(zmq.REQ)
+        self._socket.connect(address)
+        self._socket.send(msgpack.packb({"command": name}))
+
+    def told(self) -> dict[str, Any]:
+        until(lambda: [self._served.serve(echo), self._socket.poll(0)][1])
+        reply: dict[str, Any] = msgpack.unpackb(self._socket.recv())
+        return reply
+
+
+@pytest.mark.parametrize("where", ["tick", "look", "gateway"])
+def test_what_came_before_the_end_of_a_pause_is_refused(
+    context: zmq.Context[Any],
+    addresses: tuple[str, str],
+    standing: VirtualClock,
+    where: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with Served(commands=addresses[1]) as served:
+        door = served.service._commands
+        if where == "gateway":
+            served.service._pauses = Pauses(0.2)
+        else:
+            served.server = CommandServer(served.link, None, 0.2)
+        until(lambda: served.serve(echo) or max(served.link.past, door.past) < math.inf)
+        early, late = (Asking(context, served, addresses[1], "arm") for _ in range(2))
+        standing.sleep_until(0.19)
+        assert early.told()["ok"]
+        assert late.told()["ok"]
+        served.serve(echo)  # nothing is carried out: no work at this tick
+        late = Asking(context, served, addresses[1], "arm")
+        if where != "gateway":
+            until(
+                lambda: [
+                    served.service.step(0.0),
+                    select.select([served.link._socket], [], [], 0)[0],
+                ][1]
+            )
+        look = served.link.look
+        if where == "look":
+            with monkeypatch.context() as patch:
+                patch.setattr(served.link, "look", lambda: look() or standing.sleep_until(0.5))
+                served.server.serve(echo)
+        else:
+            standing.sleep_until(0.5)
+        assert "stood still" in late.told()["error"]
+        assert Asking(context, served, addresses[1], "arm").told()["ok"]
+
+
+def test_the_time_that_a_command_itself_takes_is_no_pause(
+    context: zmq.Context[Any], addresses: tuple[str, str], standing: VirtualClock
+) -> None:
+    def long(request: dict[str, Any]) -> dict[str, Any]:
+        standing.sleep_until(standing.now() + 5.0)
+        return echo(request)
+
+    with Served(commands=addresses[1]) as served:
+        served.server = CommandServer(served.link, None, 0.1)
+        until(lambda: served.serve(echo) or served.link.past < math.inf)
+        clear = Asking(context, served, addresses[1], "clear")
+        until(lambda: served.serve(long) or standing.now() > 4.0)
+        arm = Asking(context, served, addresses[1], "arm")
+        until(
+            lambda: [served.service.step(0.0), select.select([served.link._socket], [], [], 0)[0]][
+                1
+            ]
+        )
+        standing.sleep_until(standing.now() + 0.25)  # torque goes on in the rest of the tick
+        assert arm.told()["ok"]
+        assert clear.told()["ok"]
 
 
 def test_no_daemon_is_told_by_a_time_out(addresses: tuple[str, str]) -> None:
@@ -218,20 +305,20 @@ def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     clock = VirtualClock()
-    with Served(commands=addresses[1], per_second=20.0, now=clock.now) as served:
+    with Served(commands=addresses[1], per_second=20.0, clock=clock) as served:
         flood = Flood(context, addresses[1], clients=1, each=60)
         quiet = Flood(context, addresses[1], clients=1, each=3)
         replies: list[dict[str, Any]] = []
         kind: list[dict[str, Any]] = []
 
         def all_answered() -> bool:
-            clock.sleep_until(clock.now() + 1e-3)  # one that floods is not read for a while
+            clock.sleep_until(clock.now() + 1e-3)
             served.serve(echo)
             flood.collect(replies)
             return served.server.refused_by_pace == 40 and quiet.collect(kind) == 3
 
         until(all_answered)
-        until(lambda: [served.serve(echo), flood.collect(replies) > 20][1])
+        until(lambda: [served.serve(echo), flood.collect(replies) == 60][1])
         assert sum(reply["ok"] for reply in replies) == 20
         assert {reply.get("error") for reply in replies if not reply["ok"]} == {
             "too many commands: at most 20 a second"
@@ -250,12 +337,12 @@ def test_a_client_that_asks_again_and_again_is_answered_each_time(
 ) -> None:
     """Whoever waits for its answer would wait for ever if it got none."""
     clock = VirtualClock()
-    with Served(commands=addresses[1], per_second=5.0, now=clock.now) as served:
+    with Served(commands=addresses[1], per_second=5.0, clock=clock) as served:
         client = context.socket(zmq.REQ)
         client.connect(addresses[1])
         told = []
         for k in range(12):
-            clock.sleep_until(0.06 * k)  # a refused one is not read for a while
+            clock.sleep_until(0.06 * k)
             client.send(msgpack.packb({"command": "status"}))
             until(lambda: [served.serve(echo), client.poll(0)][1])
             told.append(msgpack.unpackb(client.recv())["ok"])
@@ -289,7 +376,7 @@ def test_many_clients_that_ask_once_each_are_all_answered(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
     context.set(zmq.MAX_SOCKETS, 2000)
-    with Served(commands=addresses[1], places=1000, now=VirtualClock().now) as served:
+    with Served(commands=addresses[1], clock=VirtualClock()) as served:
         flood = Flood(context, addresses[1], clients=600, each=1)
         replies: list[dict[str, Any]] = []
         until(lambda: [served.serve(echo), flood.collect(replies) >= 600][1])
@@ -312,7 +399,7 @@ def test_a_link_in_the_place_of_an_ipc_files_lock_is_not_followed(tmp_path: Path
     target = tmp_path / "target"
     (tmp_path / "c.lock").symlink_to(target)
     with pytest.raises(AddressError, match="symbolic links"):
-        Listener(f"ipc://{tmp_path}/c", "commands.address", 0o600)
+        Served(commands=f"ipc://{tmp_path}/c")
     assert not target.exists()
 
 

@@ -175,7 +175,6 @@ class Wire:
             self._gateway.close()
             raise RecordingError(str(error)) from None
         self._link = self._gateway.link
-        self._link.begin_epoch()
 
     def subscribed(self, seconds: float) -> bool:
         """Wait so many seconds, or until the subscribers change; whether there are any."""
