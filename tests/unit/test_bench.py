@@ -169,6 +169,7 @@ def test_a_failed_campaign_is_no_success(
         (["campaign", "faults", "--plot", "x.png"], "campaigns have no picture"),
         (["campaign", "faults", "--emulate"], "--emulate: faults has no such cases"),
         (["campaign", "witnesses", "--emulate", "--only", "push"], "no case of witnesses"),
+        (["tick", "--full"], "--full: only reflex has it"),
         (["tick", "--against", "/nowhere.json"], "no figures of `bench --json`"),
     ],
 )

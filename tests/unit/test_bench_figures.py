@@ -12,10 +12,18 @@ from softfinger.daemon.profile.load import checked
 from softfinger.kinematics.contact.closed_form import closed_form
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.benchmarks import accuracy, contact, control, estimator, growth, scenes
+from softfinger.tools.benchmarks import (
+    accuracy,
+    contact,
+    control,
+    estimator,
+    growth,
+    reflex,
+    scenes,
+)
 from softfinger.tools.benchmarks.contact import LAW, MODULUS, TIP
 from softfinger.tools.benchmarks.estimator import LINEAR, NOISE
-from softfinger.tools.benchmarks.reflex import reaction
+from softfinger.tools.benchmarks.reflex import Overload
 from softfinger.tools.benchmarks.rigs import merged
 
 
@@ -146,16 +154,27 @@ def test_a_saving_is_told_from_chance() -> None:
     assert one["±"] == pytest.approx(1.2533 * np.sqrt(2.0 / 400), rel=0.3)
 
 
-def test_the_reaction_is_the_first_goal_of_both_that_is_a_quarter_more() -> None:
-    times = [0.99, 1.0, 1.006, 1.008, 1.010, 1.012]
-    left = list(zip(times, (0.40, 0.42, 0.60, 0.50, 0.52, 0.53), strict=True))
-    right = list(zip(times, (-0.41, -0.41, -0.30, -0.50, -0.52, -0.40), strict=True))
+def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said() -> None:
+    held = reflex.overloaded({}, 0.0, 13.0, 1)
+    assert 0.0 < held.answer < 0.022
+    assert 0.0 < held.slid < 0.02
+    assert not held.lost
+    weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}
+    lost = reflex.overloaded(weak, 0.0, 18.0, 1)
+    assert lost.lost
+    assert 0.0 <= lost.said < 1.0
 
-    def report(*servos: list[tuple[float, float]]) -> dict:
-        """A hand whose object was pushed at 1 s and slipped at 1.004 s."""
-        found = [{"goal_currents": each} for each in servos]
-        return {"object": {"pushed": 1.0, "slipped": 1.004}, "servos": found}
 
-    # 0.82 A before, whatever the bounds' sign; 0.90 and 1.00 A are not a quarter more.
-    assert math.isclose(reaction(report(left, right)), 0.006)
-    assert reaction(report(left[:4], right[:4])) == math.inf
+def test_overloads_are_summed_up() -> None:
+    found = [
+        Overload(0.010, 0.004, lost=False),
+        Overload(math.inf, 0.030, lost=True, said=0.15),
+        Overload(math.nan, 0.001, lost=False),
+    ]
+    row = reflex.row("r", found)
+    assert (row["median"], row["unanswered"], row["slid mm"]) == (10.0, 1, 4.0)
+    assert row["held %"] == pytest.approx(200.0 / 3.0)
+    assert row["said ms"] == 150.0
+    nothing = reflex.row("r", found[2:])
+    assert "median" not in nothing
+    assert math.isnan(nothing["said ms"])

@@ -25,7 +25,7 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys",
     "startup": "start to the first published state, memory",
     "control": "what each grip law leaves of an object's angle",
-    "reflex": "from a slip's onset to the servos' bytes",
+    "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
     "scenes": "what each thing that a scene skips saves, a tick and at the first start",
     "growth": "cost and error against cells, subscribers, sensors, rate",
 }
@@ -64,6 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
     )
+    parser.add_argument("--full", action="store_true", help="all loads of 'reflex', not a few")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw them (extra 'plot')")
     parser.add_argument(
@@ -131,7 +132,8 @@ def _measured(
             measure = module.measure_emulated if arguments.emulate else module.measure
             tables = measure(arguments.trials, arguments.only)
         else:
-            tables = _module(name).measure(brief=arguments.brief or not arguments.names)
+            more = {"full": True} if arguments.full else {}
+            tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
     except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
@@ -191,6 +193,8 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
     """What can be refused before anything is measured. Raises ValueError."""
     if not names:
         raise ValueError(f"'{_CAMPAIGN}' alone, expected one of {', '.join(texts)} after it")
+    if arguments.full and (texts is CAMPAIGNS or names != ["reflex"]):
+        raise ValueError("--full: only reflex has it")
     for name in names:
         if name not in texts:
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""

@@ -135,6 +135,17 @@ class VirtualGrip:
                 answered = min(answered, state.t)
         return answered - onset if onset < math.inf else math.nan
 
+    def along(self) -> list[float]:
+        """Each tip's place along the object's faces, from their middle [m]."""
+        x, y, angle = self.hand.object_pose.tolist()
+        sine, cosine = math.sin(angle), math.cos(angle)
+        tips = (self.hand.plant.fingers[k] for k in range(2))
+        return [(tip.y - y) * cosine - (tip.x - x) * sine for tip in tips]
+
+    def between(self) -> bool:
+        """Whether the object is between the tips: both press on it."""
+        return min(self.hand.force.tolist()) > 0.0 and not self.hand.on_other_tip.any()
+
     def _slips(self) -> bool:
         most = _SLIPS * self.settings.simulation.tip_friction
         tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
