@@ -250,12 +250,14 @@ class Control:
         return min(law.approach_current, pressed / law.torque_constant)
 
     def _hold(self, dt: float, goal: Goal) -> None:
-        holding = self.mode is Mode.HOLDING
         for contact in self._touched:
             if not contact.contact:
                 self._lose(dt, goal)
                 return
+        if self._lost > 0.0 and self.mode is Mode.HOLDING:
+            self._enter(Mode.GRASPING)  # the force is built up again: what moves joints is no load
         self._lost = 0.0
+        holding = self.mode is Mode.HOLDING
         if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
             self._is_empty(dt)
         self._pull(self._grip.torques(self._reading, self._pose, holding), goal)

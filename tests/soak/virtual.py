@@ -572,7 +572,8 @@ class Soak:
         asked = max(each for _, each in self._asked)
         raised = asked + min(control.grip_raise_max, control.grip_raise_share * asked)
         loaded = t < self._loaded_t + _REMEMBERED
-        bound = _TOO_MUCH * asked
+        friction = control.joint_friction / self.settings.hand.finger_length
+        bound = _TOO_MUCH * asked + 2.0 * friction  # that is given, and that holds
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_SHARE * most))
         name = RAISED if loaded else LIED if self._lie else CALM
