@@ -17,7 +17,6 @@ from softfinger.tools.benchmarks.witnesses import (
     SETTLES,
     GripTrial,
     WitnessCase,
-    honest,
     measure,
     trial,
 )
@@ -108,11 +107,3 @@ def test_a_finger_is_drawn_and_what_it_measures_may_be_named(monkeypatch) -> Non
     found = [trial(case, seed) for seed in range(1, 5)]
     assert {each.false for each in found} == {("left_current",), ("right_current",)}
     assert all(each.held for each in found)
-
-
-def test_an_honest_hour_has_all_that_hands_do(monkeypatch) -> None:
-    monkeypatch.setattr(witnesses, "_PIECE", 30.0)
-    row = honest(2)
-    assert row["name"] == "honest hour: 1 min"
-    assert min(row[what] for what in ("grips", "loads", "turns", "new forces")) > 0
-    assert row["met"] == 2

@@ -30,7 +30,6 @@ MEASUREMENTS = {
     "growth": "cost and error against cells, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
-    "accuracy": "the estimator over its whole range against the Cramér-Rao bound, ten minutes",
     "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
@@ -55,11 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
-    )
-    parser.add_argument(
-        "--emulate",
-        action="store_true",
-        help="some cases of a campaign through `softfinger emulate`, in real time (witnesses)",
     )
     parser.add_argument(
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
@@ -128,9 +122,7 @@ def _measured(
     before, tables = yardsticks(), []
     try:
         if campaign:
-            module = _module(name)
-            measure = module.measure_emulated if arguments.emulate else module.measure
-            tables = measure(arguments.trials, arguments.only)
+            tables = _module(name).measure(arguments.trials, arguments.only)
         else:
             more = {"full": True} if arguments.full else {}
             tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
@@ -199,13 +191,8 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
         if name not in texts:
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
-        if texts is CAMPAIGNS:
-            module = _module(name)
-            cases = getattr(module, "EMULATED", ()) if arguments.emulate else module.NAMES
-            if not cases:
-                raise ValueError(f"--emulate: {name} has no such cases")
-            if not any(arguments.only in case for case in cases):
-                raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
+        if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
+            raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
     if arguments.plot:
         from softfinger.tools.extras import MissingExtra
         from softfinger.tools.style import settings

@@ -15,10 +15,8 @@ import numpy as np
 
 from softfinger.daemon.types import Goal
 from softfinger.tools.benchmarks.measuring import Report, figure
-from softfinger.tools.benchmarks.rigs import merged
+from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
 from softfinger.tools.watched import Watched
-
-Sections = dict[str, dict[str, Any]]
 
 _FORCE = 10.0  # N
 _ASKEW = math.radians(5.0)
@@ -27,24 +25,18 @@ _FOUND = 5.0  # s from the command to grasp on, when the object's angle is read
 _STEERED = "energy, steered to 0"  # by its measured angle
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
 _RELAXING: Sections = {"simulation": {"tip_creep_time": 20.0, "tip_micro_slip": True}}
-_SOLID: Sections = {
-    "tip": {"physics": "solid"},
-    "material": {"law": "constant", "modulus": 0.15e6},
-    "estimator": {"free_gain": False},
-    "safety": {"d_max": 0.008},
-}
 # Settings of `control`, tips, aim for what is left [°].
 WAYS: dict[str, tuple[dict[str, Any], Sections, float | None]] = {
     "equal torques (blind)": (EQUAL_TORQUES, {}, None),
     "equal torques, tips that relax": (EQUAL_TORQUES, _RELAXING, None),
-    "equal torques, solid tips": (EQUAL_TORQUES, _SOLID, None),
+    "equal torques, solid tips": (EQUAL_TORQUES, SOLID, None),
     "position alone": ({"grip_raise_max": 0.0}, {}, None),
     "two-phased": ({}, {}, None),
     "energy": ({}, {}, None),
     _STEERED: ({}, {}, 0.2),
     "upright (blind)": ({"law": "upright"}, {}, 0.5),
     "upright, tips that relax": ({"law": "upright"}, _RELAXING, 0.5),
-    "upright, solid tips": ({"law": "upright"}, _SOLID, 0.5),
+    "upright, solid tips": ({"law": "upright"}, SOLID, 0.5),
 }
 
 
