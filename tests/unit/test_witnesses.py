@@ -49,14 +49,14 @@ def test_what_is_false_reaches_the_hand_and_the_force_is_the_plants() -> None:
         true = []
         for _ in range(100):
             grip.loop.advance(grip.loop.period)
-            true.append(0.25 * max(grip.hand.force.tolist()))
+            true.append(0.25 * max(grip.plant.force.tolist()))
         assert watch.peak == max(true)
-        left, right = grip.hand.measurement_faults
+        left, right = grip.plant.measurement_faults
         begin = grip.state.t - 0.2
         assert left("gain", begin + 0.15) == pytest.approx(0.75)
         assert right("current", begin) == 2.0
         reading = grip.state.reading.current
-        assert reading[1] == pytest.approx(2.0 * grip.hand.current[1], rel=0.02)
+        assert reading[1] == pytest.approx(2.0 * grip.plant.current[1], rel=0.02)
 
 
 def test_a_watch_measures_forces_times_and_places() -> None:

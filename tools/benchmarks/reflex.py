@@ -98,7 +98,7 @@ def overloaded(settings: Sections, standing: float, overload: float, seed: int) 
             raise RuntimeError(f"the hand does not hold: {state.mode} {state.fault}")
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
         for k in range(_STEPS):
-            grip.hand.load(push=standing * (k + 1) / _STEPS)
+            grip.plant.load(push=standing * (k + 1) / _STEPS)
             loop.advance(_RISES / _STEPS)
         loop.advance(_STANDS)
         begin, slid, gone, said = fmean(grip.along()), 0.0, math.inf, math.inf

@@ -208,7 +208,7 @@ def trial(case: WitnessCase, seed: int) -> GripTrial:
                 watch.asked = case.then
                 grip.command("grasp", force=case.then)
             loop.advance(case.comes + _LOOK)
-        events = [(t - begin, kind) for t, kind in grip.events if t >= begin]
+        events = [(t - begin, kind) for t, kind in grip.alarms if t >= begin]
         found.see(watch, state.mode, state.fault_name, events)
     return found
 
