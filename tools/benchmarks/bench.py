@@ -26,7 +26,7 @@ MEASUREMENTS = {
     "startup": "start to the first published state, memory",
     "control": "what each grip law leaves of an object's angle",
     "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
-    "scenes": "what each thing that a scene skips saves, a tick and at the first start",
+    "scenes": "what each thing that a scene skips saves a tick",
     "growth": "cost and error against cells, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
