@@ -115,7 +115,6 @@ class FaultyServos:
         self._must = must
         self._rise = settings.safety.current_rate / settings.loop.rate
         self._current = [0.0, 0.0]
-        self._hardware = [0, 0]
         self.fault = ""
         self.finger = 0
         self.last_good = -math.inf
