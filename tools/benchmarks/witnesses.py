@@ -1,8 +1,8 @@
 """Campaign: what a grip is measured by goes wrong, and the plant says what the grip does then.
 
-Each case is a grip with a false measurement, an odd tip or a load; each trial of it draws from a
-seed of its own noise, instants, the finger, the object's mass and an error of the joints' torque
-constant. They run on virtual time, so nothing depends on the machine.
+Each case is a grip with a false measurement or an odd tip; each trial of it draws from a seed of
+its own noise, instants, the finger, the object's mass and an error of the joints' torque constant.
+They run on virtual time, so nothing depends on the machine.
 """
 
 from __future__ import annotations
@@ -31,21 +31,16 @@ _WITNESS = "witness."  # how the kinds of events begin that name a false measure
 # Aims: forces over what was asked for; times [s].
 SETTLES = "settled at 0.8 … 1.2, not raised"
 BOUNDED = "≤ 50 ms above 1.3, named ≤ 0.3 s"
-ANSWERED = "answered ≤ 22 ms"
 _SETTLED = (0.8, 1.2)
 _TOO_LONG = 0.05  # above 1.3
 _NAMED = 0.3  # since it is wrong by half of what it comes to
-_ANSWER = 0.022  # since the slip's onset
 _LOST = 0.010  # m
 
 # A trial's course [s].
 _GRIP = 2.5  # until the hand holds, at most
 _REST = 1.2  # held in peace
 _LOOK = 5.0  # looked at after what comes has come
-_LOOK_ANSWER = 1.0
 _REPEATED = 1.0  # of repeated frames, before another force is asked for
-_BORNE = {"push": 2.0 * 0.6, "twist": 0.6 * 0.040}  # N, N·m a N of grip: by both tips' friction
-_SLIPPING = (1.17, 1.5)  # of that
 
 _SENSORS = ("left_sensor", "right_sensor")
 # A scale of 127.5 kPa, as boards have it, and not the simulated sensor's of 262 kPa.
@@ -56,8 +51,8 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 class WitnessCase:
     """One kind of grip.
 
-    ``words`` are faults as `softfinger emulate --fault` takes them, with ``{side}`` for a finger
-    and ``{load}`` for a drawn number; they begin when the hand holds, or before the grasp.
+    ``words`` are faults as `softfinger emulate --fault` takes them, with ``{side}`` for a finger;
+    they begin when the hand holds, or before the grasp.
     """
 
     name: str
@@ -68,7 +63,6 @@ class WitnessCase:
     comes: float = 0.0  # s in which it comes
     before: bool = False
     then: float = 0.0  # N asked for after a while
-    loads: tuple[float, float] = (0.0, 0.0)  # between which `{load}` lies
     settings: Sections = field(default_factory=dict)
 
 
@@ -109,10 +103,6 @@ def _cases(force: float) -> Iterator[WitnessCase]:
         lies = partial(settles, words=f"gain={gain}", false=_SENSORS, settings=SOLID)
         yield lies(f"solid tips, both sensors, gain {gain:g} from the start", before=True)
         yield lies(f"solid tips, both sensors, gain {gain:g} at once")
-    for kind, borne in _BORNE.items():
-        low, high = (share * borne * force for share in _SLIPPING)
-        words = f"{kind}={{load}}"
-        yield WitnessCase(f"{kind} that slips", ANSWERED, force, words, loads=(low, high))
 
 
 CASES = tuple(
@@ -130,7 +120,6 @@ class GripTrial:
     settled: float = math.nan  # mean of both tips at the end; NaN when they were let go
     peak: float = 0.0  # of either tip
     above: float = 0.0
-    answer: float = math.nan
     slid: float = 0.0  # m
     end: str = ""  # fault or mode
     events: list[tuple[float, str]] = field(default_factory=list)
@@ -157,7 +146,6 @@ class GripTrial:
             "raised": case.aim == SETTLES and any(kind == "slip" for _, kind in self.events),
             "too strong": case.aim == BOUNDED and self.above > _TOO_LONG,
             "not named": case.aim == BOUNDED and named > _NAMED,
-            "no answer": case.aim == ANSWERED and self.answer > _ANSWER,
         }
         return [why for why, true in wrong.items() if true]
 
@@ -165,7 +153,7 @@ class GripTrial:
 def measure(trials: int | None = None, only: str = "") -> list[Report]:
     """A table for each aim, of the cases whose name ``only`` is found in."""
     trials, reports = trials or _TRIALS, []
-    for aim in (SETTLES, BOUNDED, ANSWERED):
+    for aim in (SETTLES, BOUNDED):
         rows = []
         for case in CASES:
             if case.aim == aim and only in case.name:
@@ -185,7 +173,9 @@ def measure(trials: int | None = None, only: str = "") -> list[Report]:
 def trial(case: WitnessCase, seed: int) -> GripTrial:
     """One grip of a case."""
     chance = random.Random(f"{case.name} {seed}")
-    found, words = drawn(case, chance)
+    side = chance.choice(FINGERS)
+    found = GripTrial(tuple(name.format(side=side) for name in case.false))
+    words = case.words.format(side=side)
     with VirtualGrip(seed, chance, case.settings) as grip:
         loop, state = grip.loop, grip.state
         if case.before:
@@ -198,33 +188,22 @@ def trial(case: WitnessCase, seed: int) -> GripTrial:
         loop.advance(_REST + chance.uniform(0.0, 0.02))
         if words and not case.before:
             watch, begin = grip.watched(case.force), state.t
-        if case.aim == ANSWERED:
-            found.answer = grip.answer(words, _LOOK_ANSWER)
-        else:
-            if not case.before:
-                grip.begin(words)
-            if case.then:
-                loop.advance(_REPEATED)
-                watch.asked = case.then
-                grip.command("grasp", force=case.then)
-            loop.advance(case.comes + _LOOK)
+            grip.begin(words)
+        if case.then:
+            loop.advance(_REPEATED)
+            watch.asked = case.then
+            grip.command("grasp", force=case.then)
+        loop.advance(case.comes + _LOOK)
         events = [(t - begin, kind) for t, kind in grip.alarms if t >= begin]
         found.see(watch, state.mode, state.fault_name, events)
     return found
-
-
-def drawn(case: WitnessCase, chance: random.Random) -> tuple[GripTrial, str]:
-    """A trial's finger and load: what may be named, and the case's words with them."""
-    side, load = chance.choice(FINGERS), f"{chance.uniform(*case.loads):.3f}"
-    found = GripTrial(tuple(name.format(side=side) for name in case.false))
-    return found, case.words.format(side=side, load=load)
 
 
 def summary(case: WitnessCase, found: Sequence[GripTrial]) -> Row:
     """A case's row: median and extremes of its trials, what was missed, and when events came."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
-    row: Row = {
+    return {
         "name": case.name,
         "met": sum(not each for each in missed),
         "trials": len(found),
@@ -235,12 +214,6 @@ def summary(case: WitnessCase, found: Sequence[GripTrial]) -> Row:
         "above ms": 1e3 * max(each.above for each in found),
         "slid mm": 1e3 * median(each.slid for each in found),
         "lost": sum(each.slid > _LOST for each in found),
-    }
-    if case.aim == ANSWERED:
-        answers = [1e3 * each.answer for each in found if not math.isnan(each.answer)]
-        row["answer ms"] = median(answers) if answers else None
-        row["answer ms at most"] = max(answers, default=None)
-    return row | {
         "named": _firsts([each.named(True) for each in found]),
         "named wrongly": _firsts([each.named(False) for each in found]),
         "missed": _counts(why for each in missed for why in each),
